@@ -1,0 +1,176 @@
+"""Every error specshield raises, as one tree.
+
+SpecshieldError
+├── InputError                  what the caller gave is wrong; nothing was changed
+│   ├── FormulaError            STL text that does not parse, or names nothing declares
+│   │   └── HorizonError        a horizon over the limit
+│   ├── FragmentError           a formula outside what a policy can be made for
+│   ├── SampleError             samples or signals that are missing, too short, NaN or infinite
+│   ├── MapError                a map, house or region that cannot be read
+│   ├── RobotError              an unknown or impossible robot
+│   ├── PoseError               a pose outside the map, in collision, or not finite
+│   ├── LogitsError             wrong number, NaN, +inf or all null
+│   ├── PolicyError             weights or a card that do not fit their task
+│   ├── InfeasibleStart         no action from the initial pose has a satisfying future
+│   ├── Unsupported             an accepted word whose power this build lacks
+│   └── BodyTooLarge            a request body over the limit
+├── NotFound                    no such map, policy, session or page
+├── Conflict                    the request disagrees with what is stored
+│   ├── HistoryGap              poses that do not join what the server has (`expected_t`)
+│   ├── HistoryConflict         poses that overlap the stored ones and differ
+│   ├── StepConflict            a step already decided, sent again with other content
+│   ├── SessionFinished         a step after the end
+│   ├── SessionExists           a session id already taken
+│   └── InUse                   a policy that sessions still use
+├── Unauthorized                a missing or wrong API key
+├── TrainingUnavailable         no worker is there to train
+├── StoreError                  the trajectory store cannot be reached
+├── ServerError                 the server failed; what it knows is in its log
+└── TransportError              the client could not reach the server
+    └── TransportTimeout        no answer in time
+
+`type` is the stable word that a problem document (RFC 9457) carries; `details` its extra members.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+
+class SpecshieldError(Exception):
+    """Base of the tree. `path` names the field at fault, `got` what it held, `expected` what is valid."""
+
+    type: ClassVar[str] = "error"
+
+    def __init__(
+        self, message: str, *, path: str | None = None, got: Any = None, expected: str | None = None, **details: Any
+    ) -> None:
+        super().__init__(message)
+        self.message = message
+        self.path = path
+        self.got = got
+        self.expected = expected
+        self.details: dict[str, Any] = details
+
+    def at(self, path: str) -> SpecshieldError:
+        """The same error, its path put below `path`: 'formula' at 'spec' is 'spec.formula'."""
+        self.path = path if self.path is None else f"{path}.{self.path}"
+        return self
+
+
+class InputError(SpecshieldError):
+    type = "invalid-input"
+
+
+class FormulaError(InputError):
+    """`position` (0-based offset into the text) is in `details`."""
+
+    type = "invalid-formula"
+
+
+class HorizonError(FormulaError):
+    type = "horizon-too-long"
+
+
+class FragmentError(InputError):
+    type = "outside-fragment"
+
+
+class SampleError(InputError):
+    type = "invalid-samples"
+
+
+class MapError(InputError):
+    type = "invalid-map"
+
+
+class RobotError(InputError):
+    type = "invalid-robot"
+
+
+class PoseError(InputError):
+    type = "invalid-pose"
+
+
+class LogitsError(InputError):
+    type = "invalid-logits"
+
+
+class PolicyError(InputError):
+    type = "invalid-policy"
+
+
+class InfeasibleStart(InputError):
+    type = "infeasible-start"
+
+
+class Unsupported(InputError):
+    type = "unsupported"
+
+
+class BodyTooLarge(InputError):
+    type = "body-too-large"
+
+
+class NotFound(SpecshieldError):
+    type = "not-found"
+
+
+class Conflict(SpecshieldError):
+    type = "conflict"
+
+
+class HistoryGap(Conflict):
+    type = "history-gap"
+
+
+class HistoryConflict(Conflict):
+    type = "history-conflict"
+
+
+class StepConflict(Conflict):
+    type = "step-conflict"
+
+
+class SessionFinished(Conflict):
+    type = "session-finished"
+
+
+class SessionExists(Conflict):
+    type = "session-exists"
+
+
+class InUse(Conflict):
+    type = "in-use"
+
+
+class Unauthorized(SpecshieldError):
+    type = "unauthorized"
+
+
+class TrainingUnavailable(SpecshieldError):
+    type = "training-unavailable"
+
+
+class StoreError(SpecshieldError):
+    type = "store-unavailable"
+
+
+class ServerError(SpecshieldError):
+    type = "internal-error"
+
+
+class TransportError(SpecshieldError):
+    type = "transport-error"
+
+
+class TransportTimeout(TransportError):
+    type = "transport-timeout"
+
+
+def tree(root: type[SpecshieldError] = SpecshieldError) -> Iterator[type[SpecshieldError]]:
+    """`root` and everything below it, parents first."""
+    yield root
+    for child in root.__subclasses__():
+        yield from tree(child)
