@@ -1,0 +1,1 @@
+"""The floor: which cells are taken, named areas, and distances."""

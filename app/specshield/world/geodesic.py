@@ -1,0 +1,96 @@
+"""Distance along free space: the solution of |grad d| = 1 by fast marching (Sethian, 1996)."""
+
+from __future__ import annotations
+
+import heapq
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+EXACT_WITHIN = (
+    12  # cells around the goal where straight lines are used: a point source is where upwinding errs most
+)
+
+
+def geodesic_distance(
+    free: NDArray[np.bool_], goal: NDArray[np.bool_], resolution: float
+) -> NDArray[np.float64]:
+    """Metres from each cell centre to the nearest goal cell's centre through free cells. [height, width].
+
+    free, goal: bool[height, width]; goal cells that are not free do not count. 0 in the goal, inf where it
+    cannot be reached. Free cells that touch only at a corner are not connected. First-order upwind, so never
+    short by more than rounding and long by about 2 %, near corners half a cell more.
+    """
+    goal = np.ascontiguousarray(goal & free)
+    blocked = np.zeros((free.shape[0] + 1, free.shape[1] + 1), dtype=np.int64)
+    blocked[1:, 1:] = np.cumsum(np.cumsum(~free, axis=0), axis=1)
+    result: NDArray[np.float64] = _march(np.ascontiguousarray(free), goal, blocked) * resolution
+    return result
+
+
+@numba.njit(cache=True, nogil=True)
+def _march(free, goal, blocked):  # type: ignore[no-untyped-def]
+    h, w = free.shape
+    distance = np.full((h, w), np.inf)
+    done = np.zeros((h, w), dtype=np.bool_)
+    for i in range(h):
+        for j in range(w):
+            if goal[i, j]:
+                distance[i, j] = 0.0
+                inner = 0 < i < h - 1 and 0 < j < w - 1
+                if inner and goal[i - 1, j] and goal[i + 1, j] and goal[i, j - 1] and goal[i, j + 1]:
+                    continue  # its neighbours are nearer to everything
+                _straight_lines(i, j, blocked, distance)
+    heap = [(0.0, -1)]
+    for i in range(h):
+        for j in range(w):
+            if distance[i, j] < np.inf:
+                heapq.heappush(heap, (distance[i, j], i * w + j))
+    while len(heap) > 0:
+        _, cell = heapq.heappop(heap)
+        i, j = cell // w, cell % w
+        if cell < 0 or done[i, j]:
+            continue
+        done[i, j] = True
+        for di, dj in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            y, x = i + di, j + dj
+            if 0 <= y < h and 0 <= x < w and free[y, x] and not done[y, x]:
+                update = _upwind(distance, done, y, x)
+                if update < distance[y, x]:
+                    distance[y, x] = update
+                    heapq.heappush(heap, (update, y * w + x))
+    return distance
+
+
+@numba.njit(cache=True, nogil=True)
+def _straight_lines(i, j, blocked, distance):  # type: ignore[no-untyped-def]
+    """Exact distances from goal cell (i, j) to nearby cells, where the whole rectangle between is free."""
+    h, w = distance.shape
+    for y in range(max(0, i - EXACT_WITHIN), min(h, i + EXACT_WITHIN + 1)):
+        for x in range(max(0, j - EXACT_WITHIN), min(w, j + EXACT_WITHIN + 1)):
+            d = math.sqrt(float((y - i) ** 2 + (x - j) ** 2))
+            if d > EXACT_WITHIN or d >= distance[y, x]:
+                continue
+            top, bottom, right, left = max(i, y) + 1, min(i, y), max(j, x) + 1, min(j, x)
+            if blocked[top, right] - blocked[bottom, right] - blocked[top, left] + blocked[bottom, left] == 0:
+                distance[y, x] = d
+
+
+@numba.njit(cache=True, nogil=True)
+def _upwind(distance, done, i, j):  # type: ignore[no-untyped-def]
+    """d with (d - a)^2 + (d - b)^2 = 1 over the smaller settled neighbour of each axis, or min + 1."""
+    h, w = distance.shape
+    a = b = np.inf
+    if i > 0 and done[i - 1, j]:
+        a = distance[i - 1, j]
+    if i < h - 1 and done[i + 1, j]:
+        a = min(a, distance[i + 1, j])
+    if j > 0 and done[i, j - 1]:
+        b = distance[i, j - 1]
+    if j < w - 1 and done[i, j + 1]:
+        b = min(b, distance[i, j + 1])
+    if abs(a - b) >= 1.0:  # inf - inf cannot be: some neighbour is settled
+        return min(a, b) + 1.0
+    return (a + b + math.sqrt(2.0 - (a - b) ** 2)) / 2.0

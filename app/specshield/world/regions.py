@@ -1,0 +1,298 @@
+"""Named areas of the floor, and the signed distance to their boundary: positive inside, in metres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from specshield.errors import MapError
+from specshield.world import checks
+
+MAX_VERTICES = 1000
+MAX_MEMBERS = 1000
+CIRCLE, RECTANGLE, POLYGON = 0, 1, 2
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Circle:
+    """center (x, y) and radius in metres, radius > 0."""
+
+    center: Point
+    radius: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "center", checks.numbers(self.center, 2, "center"))
+        object.__setattr__(self, "radius", checks.number(self.radius, "radius"))
+        if self.radius <= 0:
+            raise MapError(
+                "a circle's radius has to be positive", path="radius", got=self.radius, expected="> 0"
+            )
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Along the map's axes: lower-left and upper-right corners (x, y) in metres, min < max."""
+
+    min: Point
+    max: Point
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "min", checks.numbers(self.min, 2, "min"))
+        object.__setattr__(self, "max", checks.numbers(self.max, 2, "max"))
+        if not (self.min[0] < self.max[0] and self.min[1] < self.max[1]):
+            raise MapError(
+                "a rectangle's min has to be below its max on both axes",
+                path="max", got=list(self.max), expected=f"x > {self.min[0]:g} and y > {self.min[1]:g}",
+            )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """vertices (x, y) in metres, at least 3, in either sense; edges may not touch or cross each other."""
+
+    vertices: tuple[Point, ...]
+
+    def __post_init__(self) -> None:
+        if not checks.is_list(self.vertices) or not 3 <= len(self.vertices) <= MAX_VERTICES:
+            got = len(self.vertices) if checks.is_list(self.vertices) else self.vertices
+            raise MapError(
+                "a polygon is a list of vertices",
+                path="vertices",
+                got=got,
+                expected=f"3 to {MAX_VERTICES} of [x, y]",
+            )
+        vertices = tuple(checks.numbers(v, 2, f"vertices[{i}]") for i, v in enumerate(self.vertices))
+        object.__setattr__(self, "vertices", vertices)
+        first, second = _crossing_edges(np.array(vertices))
+        if first >= 0:
+            raise MapError(
+                f"the polygon's edges {first} and {second} (counted by first vertex) touch or cross",
+                path="vertices", got=[first, second], expected="a simple polygon, no vertex repeated",
+            )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Union:
+    """Everything inside any member. Its signed distance is the largest of its members': exact outside and
+    inside members that touch no other, a lower bound of the true depth where they overlap or touch."""
+
+    members: tuple[Circle | Rectangle | Polygon, ...]
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.members) <= MAX_MEMBERS:
+            raise MapError(
+                "a union needs members",
+                path="members",
+                got=len(self.members),
+                expected=f"1 to {MAX_MEMBERS} regions",
+            )
+        object.__setattr__(self, "members", tuple(self.members))
+
+
+Region = Circle | Rectangle | Polygon | Union
+
+
+def signed_distance(region: Region, points: ArrayLike) -> NDArray[np.float64]:
+    """Metres to the region's boundary, positive inside. points [..., 2] in the map frame, result [...]."""
+    array = np.asarray(points, dtype=np.float64)
+    flat = np.ascontiguousarray(array.reshape(-1, 2))
+    result: NDArray[np.float64] = _distances(*pack_regions([region]), flat).reshape(array.shape[:-1])
+    return result
+
+
+class PackedRegions(NamedTuple):
+    """Regions as flat arrays for compiled code.
+
+    starts: int64[regions + 1], region i has the parts starts[i]:starts[i + 1].
+    kinds: int64[parts], CIRCLE, RECTANGLE or POLYGON.
+    offsets: int64[parts + 1], part p has the numbers data[offsets[p]:offsets[p + 1]].
+    data: float64, in metres: circle x, y, radius; rectangle xmin, ymin, xmax, ymax; polygon x, y, x, y, ...
+    """
+
+    starts: NDArray[np.int64]
+    kinds: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    data: NDArray[np.float64]
+
+
+def pack_regions(regions: Sequence[Region]) -> PackedRegions:
+    starts, kinds, offsets, data = [0], [], [0], list[float]()
+    for region in regions:
+        for part in region.members if isinstance(region, Union) else (region,):
+            if isinstance(part, Circle):
+                kinds.append(CIRCLE)
+                data += [*part.center, part.radius]
+            elif isinstance(part, Rectangle):
+                kinds.append(RECTANGLE)
+                data += [*part.min, *part.max]
+            else:
+                kinds.append(POLYGON)
+                data += [c for vertex in part.vertices for c in vertex]
+            offsets.append(len(data))
+        starts.append(len(kinds))
+    return PackedRegions(
+        np.array(starts, dtype=np.int64),
+        np.array(kinds, dtype=np.int64),
+        np.array(offsets, dtype=np.int64),
+        np.array(data, dtype=np.float64),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def region_distance(i, starts, kinds, offsets, data, x, y):  # type: ignore[no-untyped-def]
+    """Signed distance of the point (x, y) to packed region i, metres, positive inside."""
+    best = -np.inf
+    for part in range(starts[i], starts[i + 1]):
+        begin, end = offsets[part], offsets[part + 1]
+        if kinds[part] == CIRCLE:
+            d = data[begin + 2] - math.sqrt((x - data[begin]) ** 2 + (y - data[begin + 1]) ** 2)
+        elif kinds[part] == RECTANGLE:
+            dx = min(x - data[begin], data[begin + 2] - x)
+            dy = min(y - data[begin + 1], data[begin + 3] - y)
+            d = -math.sqrt(dx * dx + dy * dy) if dx < 0.0 and dy < 0.0 else min(dx, dy)
+        else:
+            d = _polygon_distance(data, begin, end, x, y)
+        best = max(best, d)
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _polygon_distance(data, begin, end, x, y):  # type: ignore[no-untyped-def]
+    """Nearest edge for the size, the parity of edges crossed going right for the sign."""
+    inside = False
+    nearest = np.inf
+    x1, y1 = data[end - 2], data[end - 1]
+    for k in range(begin, end, 2):
+        x2, y2 = data[k], data[k + 1]
+        ex, ey = x2 - x1, y2 - y1
+        along = ((x - x1) * ex + (y - y1) * ey) / (ex * ex + ey * ey)
+        along = min(max(along, 0.0), 1.0)
+        dx, dy = x - (x1 + along * ex), y - (y1 + along * ey)
+        nearest = min(nearest, dx * dx + dy * dy)
+        if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / ey * ex:
+            inside = not inside
+        x1, y1 = x2, y2
+    return math.sqrt(nearest) if inside else -math.sqrt(nearest)
+
+
+@numba.njit(cache=True, nogil=True)
+def _distances(starts, kinds, offsets, data, points):  # type: ignore[no-untyped-def]
+    out = np.empty(points.shape[0])
+    for k in range(points.shape[0]):
+        out[k] = region_distance(0, starts, kinds, offsets, data, points[k, 0], points[k, 1])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _side(ax, ay, bx, by, cx, cy):  # type: ignore[no-untyped-def]
+    """1, 0 or -1: c is left of, on or right of the line from a to b."""
+    cross = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    return (cross > 0.0) - (cross < 0.0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _crossing_edges(v):  # type: ignore[no-untyped-def]
+    """The first two edges of a closed polygon v[n, 2] that share a point they should not, or (-1, -1)."""
+    n = v.shape[0]
+    for i in range(n):
+        a, b = v[i], v[(i + 1) % n]
+        if a[0] == b[0] and a[1] == b[1]:
+            return i, (i + 1) % n
+        for j in range(i + 1, n):
+            c, d = v[j], v[(j + 1) % n]
+            abc, abd = _side(a[0], a[1], b[0], b[1], c[0], c[1]), _side(a[0], a[1], b[0], b[1], d[0], d[1])
+            cda, cdb = _side(c[0], c[1], d[0], d[1], a[0], a[1]), _side(c[0], c[1], d[0], d[1], b[0], b[1])
+            if j == i + 1 or (
+                i == 0 and j == n - 1
+            ):  # neighbours share a vertex: wrong only if one folds back
+                back = (b[0] - a[0]) * (d[0] - c[0]) + (b[1] - a[1]) * (d[1] - c[1]) < 0.0
+                if abc == 0 and abd == 0 and back:
+                    return i, j
+                continue
+            apart = (
+                max(a[0], b[0]) < min(c[0], d[0])
+                or max(c[0], d[0]) < min(a[0], b[0])
+                or max(a[1], b[1]) < min(c[1], d[1])
+                or max(c[1], d[1]) < min(a[1], b[1])
+            )
+            if not apart and abc * abd <= 0 and cda * cdb <= 0:
+                return i, j
+    return -1, -1
+
+
+def region_from_json(spec: Any, path: str) -> Region:
+    """A region of the HTTP contract; MapError with the member's path below `path`.
+
+    {"type": "circle", "center": [x, y], "radius"}, {"type": "rectangle", "min": [x, y], "max": [x, y]},
+    {"type": "polygon", "vertices": [[x, y], ...]}, {"type": "union", "members": [the others, ...]}.
+    """
+    spec = checks.mapping(spec, path)
+    kind = checks.member(spec, "type", path)
+    fields = {
+        "circle": ("center", "radius"),
+        "rectangle": ("min", "max"),
+        "polygon": ("vertices",),
+        "union": ("members",),
+    }
+    if not isinstance(kind, str) or kind not in fields:
+        raise MapError(
+            f"{path} is no known kind of region",
+            path=f"{path}.type",
+            got=kind,
+            expected="one of " + ", ".join(fields),
+        )
+    if extra := sorted(set(map(str, spec)) - {"type", *fields[kind]}):
+        raise MapError(
+            f"a {kind} has no member {extra[0]!r}",
+            path=f"{path}.{extra[0]}", got=extra[0], expected="type, " + ", ".join(fields[kind]),
+        )  # fmt: skip
+    values = [checks.member(spec, field, path) for field in fields[kind]]
+    if kind == "union":
+        return _union_from_json(values[0], path)
+    made = {"circle": Circle, "rectangle": Rectangle, "polygon": Polygon}[kind]
+    try:
+        region: Region = made(*values)
+    except MapError as error:
+        error.at(path)
+        raise
+    return region
+
+
+def _union_from_json(members: Any, path: str) -> Union:
+    if not checks.is_list(members) or not 1 <= len(members) <= MAX_MEMBERS:
+        raise MapError(
+            "a union is a list of regions",
+            path=f"{path}.members",
+            got=members,
+            expected=f"1 to {MAX_MEMBERS} regions",
+        )
+    parts: list[Circle | Rectangle | Polygon] = []
+    for i, spec in enumerate(members):
+        where = f"{path}.members[{i}]"
+        if isinstance(spec, Mapping) and spec.get("type") == "union":
+            raise MapError(
+                "unions do not nest", path=where, got="union", expected="circle, rectangle or polygon"
+            )
+        part = region_from_json(spec, where)
+        assert not isinstance(part, Union)
+        parts.append(part)
+    return Union(tuple(parts))
+
+
+def region_to_json(region: Region) -> dict[str, Any]:
+    """The JSON that region_from_json reads back as an equal region."""
+    if isinstance(region, Circle):
+        return {"type": "circle", "center": list(region.center), "radius": region.radius}
+    if isinstance(region, Rectangle):
+        return {"type": "rectangle", "min": list(region.min), "max": list(region.max)}
+    if isinstance(region, Polygon):
+        return {"type": "polygon", "vertices": [list(vertex) for vertex in region.vertices]}
+    return {"type": "union", "members": [region_to_json(member) for member in region.members]}
