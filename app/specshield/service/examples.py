@@ -1,0 +1,60 @@
+"""Requests for the docs page. Sent in this order to a fresh server, each of them works."""
+
+from __future__ import annotations
+
+from typing import Any
+
+PROBLEM = {
+    "type": "history-gap",
+    "title": "History gap",
+    "status": 409,
+    "detail": "the poses begin at step 9; the server has those before step 7",
+    "path": "poses",
+    "got": 9,
+    "expected": "poses from step 7 or earlier up to step 9",
+    "expected_t": 7,
+}
+
+SPEC_REQUEST: dict[str, Any] = {
+    "formula": "F[0,60] (Charger1 or Charger2) and G[0,150] not Forbidden",
+    "regions": {
+        "Charger1": {"type": "circle", "center": [1.0, 2.0], "radius": 0.6},
+        "Charger2": {"type": "rectangle", "min": [4.0, 1.0], "max": [5.0, 2.0]},
+        "Forbidden": {"type": "polygon", "vertices": [[2.0, 2.0], [3.0, 2.0], [2.5, 3.0]]},
+    },
+}
+
+GRID_MAP: dict[str, Any] = {
+    "format": "occupancy_grid",
+    "info": {
+        "resolution": 1.0,
+        "width": 5,
+        "height": 4,
+        "origin": {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}},
+    },
+    "data": [0] * 12 + [100, -1] + [0] * 6,
+}
+
+MAP_YAML = "image: map.pgm\nresolution: 0.05\norigin: [0.0, 0.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
+
+POLICY: dict[str, Any] = {
+    "map_id": "case1",
+    "robot": "stretch",
+    "spec": {
+        "formula": "F[0,60] Goal",
+        "regions": {"Goal": {"type": "circle", "center": [2.0, 2.0], "radius": 0.6}},
+    },
+    "method": "dqn",
+    "seed": 0,
+}
+
+SESSION: dict[str, Any] = {"id": "example", "policy_id": "case1", "initial_pose": [2.0, 2.0, 0.0], "seed": 7}
+
+STEP: dict[str, Any] = {
+    "t": 0,
+    "poses": [[2.0, 2.0, 0.0]],
+    "logits": [2.0, 0.5, 0.5, -1.0, -4.0, None, 0.0, 0.0, *[None] * 12],
+    "main_task_done": False,
+}
+
+CLOSE: dict[str, Any] = {"t": 1, "poses": [[2.2, 2.0, 0.0]]}

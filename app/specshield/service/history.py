@@ -1,0 +1,61 @@
+"""Joining what a caller sends of a trajectory with what the server has of it (pure)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from specshield.errors import HistoryConflict, HistoryGap, PoseError
+
+TOLERANCE = 1e-6  # m or rad
+Poses = npt.NDArray[np.float64]
+
+
+def join(stored: Poses, t: int, poses: Poses) -> Poses:
+    """The poses to add to `stored` so that it reaches step t; empty where it does already.
+
+    stored: [n, 3], x_0 .. x_{n-1}, in [m, m, rad].  poses: [k, 3], x_{t-k+1} .. x_t.
+    What both hold has to agree within `TOLERANCE` (theta modulo 2 pi); the stored value is the one kept.
+    Raises HistoryGap (`expected_t`: the first pose that is missing), HistoryConflict, PoseError.
+    """
+    length = len(stored)
+    first = t - len(poses) + 1
+    if first < 0:
+        raise PoseError(
+            f"{len(poses)} poses end at step {t}: more than there have been",
+            path="poses",
+            got=len(poses),
+            expected=f"1 to {t + 1} poses, the last of them x_{t}",
+        )
+    if first > length:
+        raise HistoryGap(
+            f"the poses begin at step {first}; the server has those before step {length}",
+            path="poses",
+            got=first,
+            expected=f"poses from step {length} or earlier up to step {t}",
+            expected_t=length,
+        )
+    overlap = min(length, t + 1) - first
+    differs = np.flatnonzero(np.any(~agree(stored[first : first + overlap], poses[:overlap]), axis=1))
+    if len(differs):
+        row = int(differs[0])
+        raise HistoryConflict(
+            f"the pose of step {first + row} is not the one stored",
+            path=f"poses[{row}]",
+            got=poses[row].tolist(),
+            expected=f"{stored[first + row].tolist()} within {TOLERANCE:g}",
+            t=first + row,
+            stored=stored[first + row].tolist(),
+        )
+    return poses[overlap:]
+
+
+def agree(a: Poses, b: Poses) -> npt.NDArray[np.bool_]:
+    """Element by element, for [..., 3] poses: equal within `TOLERANCE`, headings modulo 2 pi."""
+    difference: Any = np.abs(a - b)
+    turn = np.mod(difference[..., 2], 2 * math.pi)
+    difference[..., 2] = np.minimum(turn, 2 * math.pi - turn)
+    return np.asarray(difference <= TOLERANCE)

@@ -1,0 +1,158 @@
+"""Errors as problem documents (RFC 9457). One table gives each branch of the tree its HTTP status."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+
+from specshield import errors
+from specshield.errors import InputError, SpecshieldError
+
+MEDIA_TYPE = "application/problem+json"
+log = logging.getLogger("specshield")
+
+STATUS: Mapping[type[SpecshieldError], int] = {
+    errors.BodyTooLarge: 413,
+    errors.InputError: 422,
+    errors.NotFound: 404,
+    errors.MethodNotAllowed: 405,
+    errors.Conflict: 409,
+    errors.Unauthorized: 401,
+    errors.LimitReached: 429,
+    errors.TrainingUnavailable: 503,
+    errors.StoreError: 503,
+    SpecshieldError: 500,
+}
+
+# A field that fails its schema gets the type that its meaning would: clients branch on one word, not two.
+FIELD_ERRORS: Mapping[str, type[InputError]] = {
+    "logits": errors.LogitsError,
+    "poses": errors.PoseError,
+    "initial_pose": errors.PoseError,
+    "signals": errors.SampleError,
+    "robot": errors.RobotError,
+    "formula": errors.FormulaError,
+}
+
+
+def status_of(error: SpecshieldError) -> int:
+    return next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+
+
+def document(error: SpecshieldError) -> dict[str, Any]:
+    """The problem document: type, title, status, detail, then path, got, expected and the error's own members."""
+    body: dict[str, Any] = {
+        "type": error.type,
+        "title": error.type.replace("-", " ").capitalize(),
+        "status": status_of(error),
+        "detail": error.message,
+    }
+    if error.path is not None:
+        body |= {"path": error.path, "got": plain(error.got)}
+    elif error.got is not None:
+        body["got"] = plain(error.got)
+    if error.expected is not None:
+        body["expected"] = error.expected
+    return body | {name: plain(value) for name, value in error.details.items()}
+
+
+def plain(value: Any, room: int = 400) -> Any:
+    """`value` as finite JSON of bounded size; what is neither is shown as text."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    try:
+        text = json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError, RecursionError):
+        text = value if isinstance(value, str) else f"{value!r:.{room}}"
+        return text[:room]
+    return value if len(text) <= room else text[:room] + "…"
+
+
+def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -> Response:
+    status = status_of(error)
+    extra = dict(headers or {})
+    if status == 401:
+        extra["WWW-Authenticate"] = "Bearer"
+    if status == 503:
+        extra["Retry-After"] = "1"
+    return Response(json.dumps(document(error)), status, extra, media_type=MEDIA_TYPE)
+
+
+def from_validation(found: Sequence[Mapping[str, Any]], body: Any) -> InputError:
+    """One error for everything a schema refused: the first in its own words, all of them in `errors`."""
+    listed = [
+        {"path": _path(item["loc"], body), "got": plain(item.get("input")), "expected": _expected(item)} for item in found[:20]
+    ]
+    first = listed[0]
+    if found[0]["type"] == "json_invalid":
+        reason = found[0].get("ctx", {}).get("error", "")
+        return InputError(f"the body is not JSON: {reason}", position=found[0]["loc"][-1], expected="a JSON object")
+    kind = next((FIELD_ERRORS[part] for part in re.split(r"[.\[]", first["path"]) if part in FIELD_ERRORS), InputError)
+    message = f"{first['path'] or 'the body'}: {first['expected']}"
+    return kind(message, path=first["path"], got=first["got"], expected=first["expected"], errors=listed)
+
+
+def _expected(item: Mapping[str, Any]) -> str:
+    text = str(item["msg"]).removeprefix("Value error, ")
+    return {"extra_forbidden": "no such field", "missing": "this field is required"}.get(item["type"], text)
+
+
+def _path(location: Sequence[str | int], body: Any) -> str:
+    """'poses[0][2]'. Names that pydantic puts in for the branch of a union are not part of the body: left out."""
+    parts, here = [], body
+    source, *rest = location
+    for part in rest:
+        if isinstance(here, Mapping) and part in here:
+            here = here[part]
+        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+            here = here[part]
+        elif part != rest[-1]:
+            continue
+        elif not isinstance(here, Mapping) and source == "body":
+            continue
+        parts.append(f"[{part}]" if isinstance(part, int) else f".{part}")
+    return "".join(parts).removeprefix(".")
+
+
+def install(app: FastAPI) -> None:
+    """Every way an answer can go wrong ends in `response`."""
+
+    async def known(request: Request, error: Exception) -> Response:
+        assert isinstance(error, SpecshieldError)
+        if status_of(error) >= 500:
+            log.warning("%s %s: %s", request.method, request.url.path, error.message, exc_info=error)
+        return response(error)
+
+    async def invalid(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        return response(from_validation(error.errors(), error.body))
+
+    async def http(request: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)
+        path = request.url.path
+        if error.status_code == 404:
+            return response(errors.NotFound(f"there is no {path} here", got=path, expected="a path listed at /docs"))
+        if error.status_code == 405:
+            allowed = (error.headers or {}).get("Allow", "")
+            message = f"{request.method} is not for {path}"
+            return response(
+                errors.MethodNotAllowed(message, got=request.method, expected=allowed or "another method"), error.headers
+            )
+        return response(InputError(str(error.detail)))
+
+    async def unknown(request: Request, error: Exception) -> Response:
+        # The traceback goes to the log: starlette raises the error again after this answer.
+        return response(errors.ServerError("the server failed on this request; its log says more"))
+
+    app.add_exception_handler(SpecshieldError, known)
+    app.add_exception_handler(RequestValidationError, invalid)
+    app.add_exception_handler(HTTPException, http)
+    app.add_exception_handler(Exception, unknown)
