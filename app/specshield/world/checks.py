@@ -15,50 +15,59 @@ def number(value: Any, path: str, low: float = -LIMIT, high: float = LIMIT) -> f
     """`value` as a float in [low, high]. Booleans, strings, NaN and infinities are errors."""
     wrong_type = isinstance(value, bool) or not isinstance(value, int | float)
     if wrong_type or not low <= value <= high or not math.isfinite(value):
-        raise MapError(
-            f"{path} is not a usable number",
-            path=path,
-            got=value,
-            expected=f"a number from {low:g} to {high:g}",
-        )
+        raise wrong("number", path, value, f"a number from {low:g} to {high:g}")
     return float(value)
 
 
 def integer(value: Any, path: str, low: int, high: int) -> int:
     """`value` as an int in [low, high]; 3.0 is not one."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise MapError(
-            f"{path} is not a usable integer",
-            path=path,
-            got=value,
-            expected=f"an integer from {low} to {high}",
-        )
+        raise wrong("integer", path, value, f"an integer from {low} to {high}")
     return value
 
 
 def numbers(value: Any, length: int, path: str) -> tuple[float, ...]:
     """`value` as that many finite floats."""
-    if not is_list(value) or len(value) != length:
-        raise MapError(
-            f"{path} is not a list of {length} numbers", path=path, got=value, expected=f"{length} numbers"
-        )
-    return tuple(number(v, f"{path}[{i}]") for i, v in enumerate(value))
+    return tuple(number(v, f"{path}[{i}]") for i, v in enumerate(items(value, path, length, length)))
 
 
-def is_list(value: Any) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+def items(value: Any, path: str, low: int = 0, high: int = 1_000_000) -> Sequence[Any]:
+    """`value` if it is a list of low to high items."""
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes) or not low <= len(value) <= high:
+        raise wrong("list", path, value, f"{low} items" if low == high else f"{low} to {high} items")
+    return value
 
 
 def mapping(value: Any, path: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise MapError(f"{path} is not an object", path=path, got=type(value).__name__, expected="an object")
+        raise wrong("object", path, value, "an object")
     return value
 
 
-def member(value: Mapping[str, Any], key: str, path: str) -> Any:
-    """`value[key]`, or an error that names the missing member."""
-    if key not in value:
-        raise MapError(
-            f"{path} has no member {key!r}", path=f"{path}.{key}", got=None, expected=f"a member {key!r}"
-        )
+def text(value: Any, path: str) -> str:
+    if not isinstance(value, str):
+        raise wrong("text", path, value, "text")
+    return value
+
+
+def member(value: Any, key: str, path: str) -> Any:
+    """`value[key]`, or an error that names the missing member; an empty path is the top of the document."""
+    if key not in mapping(value, path or "document"):
+        where = f"{path}.{key}" if path else key
+        raise MapError(f"{where} is missing", path=where, expected=f"a member {key!r}")
     return value[key]
+
+
+def wrong(kind: str, path: str, value: Any, expected: str) -> MapError:
+    return MapError(f"{path} is not a usable {kind}", path=path, got=shown(value), expected=expected)
+
+
+def shown(value: Any) -> Any:
+    """`value` as an error may echo it: whole if it is short, else what it is."""
+    if isinstance(value, str):
+        return value if len(value) <= 100 else f"{value[:100]}... ({len(value)} characters)"
+    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 1 << 63):
+        return value
+    if isinstance(value, Mapping | Sequence):
+        return f"{type(value).__name__} of {len(value)}"
+    return type(value).__name__

@@ -61,15 +61,8 @@ class Polygon:
     vertices: tuple[Point, ...]
 
     def __post_init__(self) -> None:
-        if not checks.is_list(self.vertices) or not 3 <= len(self.vertices) <= MAX_VERTICES:
-            got = len(self.vertices) if checks.is_list(self.vertices) else self.vertices
-            raise MapError(
-                "a polygon is a list of vertices",
-                path="vertices",
-                got=got,
-                expected=f"3 to {MAX_VERTICES} of [x, y]",
-            )
-        vertices = tuple(checks.numbers(v, 2, f"vertices[{i}]") for i, v in enumerate(self.vertices))
+        given = checks.items(self.vertices, "vertices", 3, MAX_VERTICES)
+        vertices = tuple(checks.numbers(v, 2, f"vertices[{i}]") for i, v in enumerate(given))
         object.__setattr__(self, "vertices", vertices)
         first, second = _crossing_edges(np.array(vertices))
         if first >= 0:
@@ -87,13 +80,7 @@ class Union:
     members: tuple[Circle | Rectangle | Polygon, ...]
 
     def __post_init__(self) -> None:
-        if not 1 <= len(self.members) <= MAX_MEMBERS:
-            raise MapError(
-                "a union needs members",
-                path="members",
-                got=len(self.members),
-                expected=f"1 to {MAX_MEMBERS} regions",
-            )
+        checks.items(self.members, "members", 1, MAX_MEMBERS)
         object.__setattr__(self, "members", tuple(self.members))
 
 
@@ -267,15 +254,8 @@ def region_from_json(spec: Any, path: str) -> Region:
 
 
 def _union_from_json(members: Any, path: str) -> Union:
-    if not checks.is_list(members) or not 1 <= len(members) <= MAX_MEMBERS:
-        raise MapError(
-            "a union is a list of regions",
-            path=f"{path}.members",
-            got=members,
-            expected=f"1 to {MAX_MEMBERS} regions",
-        )
     parts: list[Circle | Rectangle | Polygon] = []
-    for i, spec in enumerate(members):
+    for i, spec in enumerate(checks.items(members, f"{path}.members", 1, MAX_MEMBERS)):
         where = f"{path}.members[{i}]"
         if isinstance(spec, Mapping) and spec.get("type") == "union":
             raise MapError(

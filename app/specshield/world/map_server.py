@@ -1,0 +1,194 @@
+"""Maps as ROS has them: map_server YAML with an image, and nav_msgs/OccupancyGrid as JSON.
+
+Both give values per cell, -1 unknown and 0 to 100 occupied in percent, as nav2_map_server publishes them;
+FREE_AT_MOST then says which cells are free. Everything else, the unknown included, is occupied.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
+
+from specshield.errors import MapError
+from specshield.world import checks
+from specshield.world.occupancy import OccupancyGrid, check_size
+
+FREE_AT_MOST = 25  # percent: what nav2's map_saver writes as free by default
+MAX_YAML = 16_384  # characters; a map's YAML has some 150
+UNKNOWN = -1
+MODES = ("trinary", "scale", "raw")
+
+
+def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
+    """A map_server map. `image` holds PGM or PNG, row 0 the top of the map; the YAML's `image:` is ignored.
+
+    Values follow nav2_map_server (map_io.cpp): raw ignores negate and thresholds, trinary averages alpha in
+    with the colours, scale takes transparent pixels for unknown. MapError for anything that does not fit.
+    """
+    document = _read_yaml(yaml_text)
+    resolution = _scalar(document, "resolution", 1e-4, 100.0)
+    origin = checks.items(checks.member(document, "origin", ""), "origin", 3, 3)
+    x, y, yaw = (_number(v, f"origin[{i}]") for i, v in enumerate(origin))
+    free_thresh = _scalar(document, "free_thresh", 0.0, 1.0)
+    occupied_thresh = _scalar(document, "occupied_thresh", 0.0, 1.0)
+    if free_thresh >= occupied_thresh:
+        raise MapError(
+            "free_thresh has to be below occupied_thresh",
+            path="free_thresh",
+            got=free_thresh,
+            expected=f"< {occupied_thresh:g}",
+        )
+    negate = checks.member(document, "negate", "")
+    if negate not in (0, 1):  # True and False as well
+        raise checks.wrong("flag", "negate", negate, "0 or 1")
+    mode = document.get("mode", "trinary")
+    if mode not in MODES:
+        raise checks.wrong("mode", "mode", mode, "one of " + ", ".join(MODES))
+
+    shade, opacity = _read_image(image, alpha_counts=mode == "trinary")
+    occupancy = shade if negate else 1.0 - shade
+    if mode == "raw":
+        values = np.floor(shade * 255 + 0.5)
+        values[values > 100] = UNKNOWN
+    else:
+        between = np.rint((occupancy - free_thresh) / (occupied_thresh - free_thresh) * 100.0)
+        middle = between if mode == "scale" else UNKNOWN
+        values = np.where(occupancy > occupied_thresh, 100, np.where(occupancy < free_thresh, 0, middle))
+        if mode == "scale":
+            values[opacity < 1.0] = UNKNOWN
+    return _from_values(values[::-1], resolution, (x, y, yaw))
+
+
+def dump_map(grid: OccupancyGrid, image: str = "map.pgm") -> tuple[str, bytes]:
+    """(YAML text, PGM bytes) that load_map reads back as an equal grid. `image` is the name it gives."""
+    x, y, yaw = (repr(v) for v in grid.origin)
+    text = (
+        f"image: {image}\nmode: trinary\nresolution: {grid.resolution!r}\norigin: [{x}, {y}, {yaw}]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
+    )
+    pixels = np.where(grid.occupied[::-1], 0, 254).astype(np.uint8)
+    return text, b"P5\n%d %d\n255\n" % (grid.width, grid.height) + pixels.tobytes()
+
+
+def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
+    """nav_msgs/OccupancyGrid: its `info` as an object, its `data` as a flat list, row 0 the lowest y."""
+    width, height = check_size(checks.member(info, "width", "info"), checks.member(info, "height", "info"))
+    resolution = checks.number(checks.member(info, "resolution", "info"), "info.resolution", 1e-4, 100.0)
+    origin = checks.member(info, "origin", "info")
+    position = checks.member(origin, "position", "info.origin")
+    x, y = (
+        checks.number(checks.member(position, key, "info.origin.position"), f"info.origin.position.{key}")
+        for key in "xy"
+    )
+    yaw = _yaw(checks.member(origin, "orientation", "info.origin"))
+    checks.items(data, "data", width * height, width * height)
+    try:
+        values = np.array(data)
+    except (ValueError, OverflowError):
+        values = np.array(None)
+    if values.dtype.kind != "i" or values.ndim != 1:
+        raise MapError(
+            "data holds something other than integers", path="data", expected="integers from -1 to 100"
+        )
+    wrong = np.flatnonzero((values < UNKNOWN) | (values > 100))
+    if wrong.size:
+        i = int(wrong[0])
+        raise checks.wrong("occupancy", f"data[{i}]", int(values[i]), "an integer from -1 (unknown) to 100")
+    return _from_values(values.reshape(height, width), resolution, (x, y, yaw))
+
+
+def _from_values(
+    values: NDArray[Any], resolution: float, origin: tuple[float, float, float]
+) -> OccupancyGrid:
+    return OccupancyGrid((values < 0) | (values > FREE_AT_MOST), resolution, origin)
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe, and without aliases: merged ones grow without bound."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.composer.ComposerError(problem="aliases are not read")
+        return super().compose_node(parent, index)
+
+
+def _read_yaml(text: str) -> dict[str, Any]:
+    if len(text) > MAX_YAML:
+        raise MapError(
+            "the YAML is too long", path="metadata", got=len(text), expected=f"at most {MAX_YAML} characters"
+        )
+    try:
+        document = yaml.load(text, Loader=_Loader)
+    except Exception as error:  # tags on text that they do not fit raise anything
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "it cannot be read"
+        raise MapError(
+            f"the YAML is malformed{where}: {problem}", path="metadata", expected="YAML"
+        ) from error
+    if not isinstance(document, dict):
+        raise checks.wrong("map_server YAML", "metadata", document, "resolution, origin, negate, ...")
+    return document
+
+
+def _scalar(document: dict[str, Any], key: str, low: float, high: float) -> float:
+    return _number(checks.member(document, key, ""), key, low, high)
+
+
+def _number(value: Any, path: str, low: float = -checks.LIMIT, high: float = checks.LIMIT) -> float:
+    """YAML 1.1 reads 5e-2 as text; ROS reads it as a number."""
+    if isinstance(value, str):
+        try:
+            return checks.number(float(value), path, low, high)
+        except ValueError:
+            pass
+    return checks.number(value, path, low, high)
+
+
+def _read_image(image: bytes, alpha_counts: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(shade, opacity) in [0, 1], each [height, width]. The size is checked before anything is decoded."""
+    try:
+        picture = Image.open(io.BytesIO(image), formats=["PPM", "PNG"])
+    except Exception as error:  # decoders raise whatever the bytes lead to
+        raise MapError(
+            "the image has no header of a PGM or PNG",
+            path="image",
+            got=f"{len(image)} bytes",
+            expected="PGM or PNG",
+        ) from error
+    check_size(*picture.size)
+    try:
+        if picture.mode[0] in "IF":  # 16 bits
+            shade = np.asarray(picture, dtype=np.float64) / 65535
+            return shade, np.ones_like(shade)
+        transparent = "A" in picture.mode or "transparency" in picture.info
+        channels = np.asarray(picture.convert("RGBA" if transparent else "RGB"), dtype=np.float64) / 255
+    except Exception as error:
+        raise MapError(
+            "the image is broken or cut off",
+            path="image",
+            got=f"{len(image)} bytes",
+            expected="a whole PGM or PNG",
+        ) from error
+    opacity = channels[..., 3] if transparent else np.ones(channels.shape[:2])
+    return channels[..., : None if alpha_counts else 3].mean(axis=-1), opacity
+
+
+def _yaw(orientation: Any) -> float:
+    """The yaw of a unit quaternion about z."""
+    path = "info.origin.orientation"
+    x, y, z, w = (checks.number(checks.member(orientation, k, path), f"{path}.{k}") for k in "xyzw")
+    if abs(x * x + y * y + z * z + w * w - 1) > 1e-3 or math.hypot(x, y) > 1e-3:
+        raise MapError(
+            "a map is turned about z alone",
+            path=path,
+            got=[x, y, z, w],
+            expected="a unit quaternion, x = y = 0",
+        )
+    return 2 * math.atan2(z, w)
