@@ -1,0 +1,55 @@
+"""Signal Temporal Logic over discrete time: text, robustness, bounds on prefixes, the synthesis fragment."""
+
+from specshield.stl.formula import (
+    Abs,
+    Always,
+    And,
+    Arithmetic,
+    Atom,
+    Comparison,
+    Eventually,
+    Formula,
+    Implies,
+    Name,
+    Neg,
+    Node,
+    Not,
+    Number,
+    Or,
+    Term,
+    Until,
+    is_name,
+)
+from specshield.stl.fragment import Obligation, conjuncts, obligations
+from specshield.stl.parser import parse
+from specshield.stl.robustness import SATISFIED_ABOVE, Verdict, robustness, robustness_bounds, verdict
+
+__all__ = [
+    "SATISFIED_ABOVE",
+    "Abs",
+    "Always",
+    "And",
+    "Arithmetic",
+    "Atom",
+    "Comparison",
+    "Eventually",
+    "Formula",
+    "Implies",
+    "Name",
+    "Neg",
+    "Node",
+    "Not",
+    "Number",
+    "Obligation",
+    "Or",
+    "Term",
+    "Until",
+    "Verdict",
+    "conjuncts",
+    "is_name",
+    "obligations",
+    "parse",
+    "robustness",
+    "robustness_bounds",
+    "verdict",
+]

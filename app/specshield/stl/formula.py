@@ -1,0 +1,275 @@
+"""The nodes of an STL formula: frozen, hashable, and printed so that `parse(str(f)) == f`.
+
+Terms are real-valued at each time step, formulas have a robustness at each time step. Windows are closed and
+in whole steps; for `F`, `G` and `U` they are relative to the step at which the operator is evaluated.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, fields
+from functools import cached_property
+from itertools import chain
+from typing import Any, Literal
+
+from specshield.errors import FormulaError
+
+KEYWORDS = frozenset({"F", "G", "U", "not", "always", "eventually", "until", "and", "or", "implies", "abs"})
+MAX_BOUND = 100_000  # steps; keeps what an unbounded horizon allocates within reason
+
+# How tight each kind of expression binds; an operand looser than its place asks for gets parentheses.
+IMPLIES, OR, AND, UNTIL, PREFIX, COMPARISON, SUM, PRODUCT, NEGATION, PRIMARY = range(1, 11)
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+def is_name(text: str) -> bool:
+    """Whether a formula can call something `text`: letters, digits and _, no keyword, no digit in front."""
+    return _NAME.fullmatch(text) is not None and text not in KEYWORDS
+
+
+@dataclass(frozen=True)
+class Node:
+    """A term or a formula."""
+
+    @cached_property
+    def parts(self) -> tuple[Node, ...]:
+        """The direct sub-nodes, left to right."""
+        values = (getattr(self, field.name) for field in fields(self))
+        joined = chain.from_iterable(value if isinstance(value, tuple) else (value,) for value in values)
+        return tuple(part for part in joined if isinstance(part, Node))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names whose samples it needs, sorted."""
+        if isinstance(self, Name | Atom):
+            return (self.name,)
+        return tuple(sorted({name for part in self.parts for name in part.names}))
+
+    @cached_property
+    def depth(self) -> int:
+        """Nodes on the longest way down, itself included."""
+        return 1 + max((part.depth for part in self.parts), default=0)
+
+    @property
+    def binding(self) -> int:
+        if isinstance(self, Arithmetic):
+            return SUM if self.op in "+-" else PRODUCT
+        return _BINDING.get(type(self), PRIMARY)
+
+    def _at(self, binding: int) -> str:
+        return str(self) if self.binding >= binding else f"({self})"
+
+
+@dataclass(frozen=True)
+class Term(Node):
+    """Base of what has a value: numbers, names and arithmetic over them."""
+
+
+@dataclass(frozen=True)
+class Number(Term):
+    value: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", float(self.value))
+        if not math.isfinite(self.value):
+            raise FormulaError("a number has to be finite", got=repr(self.value), expected="a finite number")
+
+    def __str__(self) -> str:
+        return repr(self.value).removesuffix(".0")
+
+
+@dataclass(frozen=True)
+class Name(Term):
+    """The sampled value of a name: a region's signed distance, a coordinate, a signal."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True)
+class Neg(Term):
+    child: Term
+
+    def __str__(self) -> str:
+        text = self.child._at(NEGATION)
+        # `-3` is the number minus three, so the negated number three is `-(3)`.
+        return f"-({text})" if isinstance(self.child, Number) and not text.startswith("-") else f"-{text}"
+
+
+@dataclass(frozen=True)
+class Abs(Term):
+    child: Term
+
+    def __str__(self) -> str:
+        return f"abs({self.child})"
+
+
+@dataclass(frozen=True)
+class Arithmetic(Term):
+    op: Literal["+", "-", "*", "/"]
+    left: Term
+    right: Term
+
+    def __str__(self) -> str:
+        return f"{self.left._at(self.binding)} {self.op} {self.right._at(self.binding + 1)}"
+
+
+@dataclass(frozen=True)
+class Formula(Node):
+    """Base of what has a robustness rho; it is satisfied where rho > 0."""
+
+    @cached_property
+    def horizon(self) -> int:
+        """hrz: the last step, counted from the one of evaluation, whose samples it may need."""
+        below = (part.horizon for part in self.parts if isinstance(part, Formula))
+        return self._reach + max(below, default=0)
+
+    @property
+    def _reach(self) -> int:
+        return 0
+
+
+@dataclass(frozen=True)
+class Atom(Formula):
+    """A name used as a truth value: rho is its sample, for a region the signed distance, positive inside."""
+
+    name: str
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True)
+class Comparison(Formula):
+    """rho is left - right for `>` and `>=`, right - left for `<` and `<=`."""
+
+    op: Literal["<", "<=", ">", ">="]
+    left: Term
+    right: Term
+
+    def __str__(self) -> str:
+        return f"{self.left._at(SUM)} {self.op} {self.right._at(SUM)}"
+
+
+@dataclass(frozen=True)
+class Not(Formula):
+    child: Formula
+
+    def __str__(self) -> str:
+        return f"not {self.child._at(PREFIX)}"
+
+
+@dataclass(frozen=True)
+class And(Formula):
+    children: tuple[Formula, ...]
+
+    def __post_init__(self) -> None:
+        _check_children(self)
+
+    def __str__(self) -> str:
+        return " and ".join(child._at(AND + 1) for child in self.children)
+
+
+@dataclass(frozen=True)
+class Or(Formula):
+    children: tuple[Formula, ...]
+
+    def __post_init__(self) -> None:
+        _check_children(self)
+
+    def __str__(self) -> str:
+        return " or ".join(child._at(OR + 1) for child in self.children)
+
+
+@dataclass(frozen=True)
+class Implies(Formula):
+    left: Formula
+    right: Formula
+
+    def __str__(self) -> str:
+        return f"{self.left._at(IMPLIES + 1)} -> {self.right._at(IMPLIES + 1)}"
+
+
+@dataclass(frozen=True)
+class Windowed(Formula):
+    """Base of the temporal operators: their window is [a, b], 0 <= a <= b."""
+
+    a: int
+    b: int
+
+    def __post_init__(self) -> None:
+        _check_window(self.a, self.b)
+
+    @property
+    def _reach(self) -> int:
+        return self.b
+
+
+@dataclass(frozen=True)
+class Always(Windowed):
+    child: Formula
+
+    def __str__(self) -> str:
+        return f"G[{self.a},{self.b}] {self.child._at(PREFIX)}"
+
+
+@dataclass(frozen=True)
+class Eventually(Windowed):
+    child: Formula
+
+    def __str__(self) -> str:
+        return f"F[{self.a},{self.b}] {self.child._at(PREFIX)}"
+
+
+@dataclass(frozen=True)
+class Until(Windowed):
+    """left U[a,b] right: right at some t' in [t+a, t+b], and left at every step of [t, t')."""
+
+    left: Formula
+    right: Formula
+
+    def __str__(self) -> str:
+        return f"{self.left._at(UNTIL + 1)} U[{self.a},{self.b}] {self.right._at(UNTIL + 1)}"
+
+
+_BINDING: dict[type[Node], int] = {
+    Neg: NEGATION,
+    Comparison: COMPARISON,
+    Not: PREFIX,
+    Always: PREFIX,
+    Eventually: PREFIX,
+    Until: UNTIL,
+    And: AND,
+    Or: OR,
+    Implies: IMPLIES,
+}
+
+
+def _check_window(a: Any, b: Any) -> None:
+    whole = all(isinstance(bound, int) and not isinstance(bound, bool) for bound in (a, b))
+    if not whole or not 0 <= a <= b <= MAX_BOUND:
+        expected = f"whole numbers with 0 <= a <= b <= {MAX_BOUND}"
+        raise FormulaError(f"[{a},{b}] is no window; expected {expected}", got=[a, b], expected=expected)
+
+
+def _check_name(name: str) -> None:
+    if not is_name(name):
+        expected = "letters, digits and _, not starting with a digit, and not a keyword"
+        problem = f"{name!r} cannot be a name in a formula; expected {expected}"
+        raise FormulaError(problem, got=name, expected=expected)
+
+
+def _check_children(node: And | Or) -> None:
+    object.__setattr__(node, "children", tuple(node.children))
+    if len(node.children) < 2:
+        raise FormulaError("and/or join at least two formulas", got=len(node.children), expected="at least 2")

@@ -1,0 +1,287 @@
+"""From text to formula, by precedence climbing.
+
+    formula    = implies
+    implies    = or  [ ("->" | "implies") or ]                     not associative: parenthesise a chain
+    or         = and { ("or" | "|") and }
+    and        = until { ("and" | "&") until }
+    until      = prefix [ ("U" | "until") window prefix ]          not associative: parenthesise a chain
+    prefix     = ("not" | "!") prefix
+               | ("G" | "always" | "F" | "eventually") window prefix
+               | comparison
+    comparison = sum ("<" | "<=" | ">" | ">=") sum                 not associative: comparisons do not chain
+               | name                                              as a truth value: name > 0
+               | "(" formula ")"
+    sum        = product { ("+" | "-") product }
+    product    = factor { ("*" | "/") factor }
+    factor     = "-" factor | number | name | "abs" "(" sum ")" | "(" sum ")"
+    window     = "[" bound ("," | ":") bound "]"                   whole steps, 0 <= a <= b
+    name       = letter or "_", then letters, digits, "_"; not a keyword
+
+`-3` is a number; so `F[0,3] a and b` is `(F[0,3] a) and b`, and `not a > 0` is `not (a > 0)`.
+Text is at most MAX_LENGTH characters and a formula at most MAX_DEPTH nodes deep, so that hostile text is an
+error here and never a stack overflow in whatever walks the formula.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Any, TypeVar
+
+from specshield.errors import FormulaError, HorizonError
+from specshield.stl.formula import (
+    AND,
+    COMPARISON,
+    IMPLIES,
+    MAX_BOUND,
+    NEGATION,
+    OR,
+    PREFIX,
+    PRODUCT,
+    SUM,
+    UNTIL,
+    Abs,
+    Always,
+    And,
+    Arithmetic,
+    Atom,
+    Comparison,
+    Eventually,
+    Formula,
+    Implies,
+    Name,
+    Neg,
+    Node,
+    Not,
+    Number,
+    Or,
+    Term,
+    Until,
+)
+from specshield.stl.tokens import Token, tokens
+
+MAX_DEPTH = 64
+
+_BINDING = {
+    "implies": IMPLIES,
+    "or": OR,
+    "and": AND,
+    "U": UNTIL,
+    **dict.fromkeys(("<", "<=", ">", ">="), COMPARISON),
+    **dict.fromkeys("+-", SUM),
+    **dict.fromkeys("*/", PRODUCT),
+}
+_COMPARE = "a comparison (< <= > >=)"
+_OPERAND = "a formula, a name or a number"
+
+_N = TypeVar("_N", bound=Node)
+
+
+def parse(text: str, names: Collection[str] | None = None, max_horizon: int | None = None) -> Formula:
+    """The formula that `text` says.
+
+    names: what the formula may name; None admits every name. max_horizon: in steps; None is no limit.
+    FormulaError with `position`, the offset into the text, where something is wrong; HorizonError (one of
+    them) where the horizon is over the limit.
+    """
+    return _Parser(text, names, max_horizon).formula()
+
+
+class _Parser:
+    def __init__(self, text: str, names: Collection[str] | None, max_horizon: int | None) -> None:
+        self._names, self._max_horizon = names, max_horizon
+        self._tokens = tokens(text)
+        self._index = 0
+        self._nesting = 0
+
+    def formula(self) -> Formula:
+        formula = self._as_formula(self._expression(IMPLIES))
+        if self._token.kind != "end":
+            raise self._unexpected("an operator or the end")
+        return formula
+
+    @property
+    def _token(self) -> Token:
+        return self._tokens[self._index]
+
+    def _next(self) -> Token:
+        self._index += 1
+        return self._tokens[self._index - 1]
+
+    def _take(self, kind: str, expected: str) -> Token:
+        if self._token.kind != kind:
+            raise self._unexpected(expected)
+        return self._next()
+
+    def _expression(self, binding: int) -> Node:
+        """The longest expression from here whose operators bind at least as tight as `binding`."""
+        self._nesting += 1
+        if self._nesting > 2 * MAX_DEPTH + 1:  # a printed node nests at most twice: parentheses and operand
+            raise self._too_deep(self._token)
+        start = self._token.position
+        left = self._operand()
+        while (level := _BINDING.get(self._token.kind, 0)) >= binding:
+            left = self._infix(left, start, level)
+        self._nesting -= 1
+        return left
+
+    def _operand(self) -> Node:
+        token = self._next()
+        match token.kind:
+            case "number":
+                return self._number(token, sign=1.0)
+            case "name":
+                return self._name(token)
+            case "(":
+                inner = self._expression(IMPLIES)
+                self._take(")", "')' or an operator")
+                return inner
+            case "-":
+                if self._token.kind == "number":
+                    return self._number(self._next(), sign=-1.0)
+                return self._made(Neg(self._term(NEGATION)), token)
+            case "abs":
+                self._take("(", "'(' after abs")
+                child = self._term(IMPLIES)
+                self._take(")", "')' or an operator")
+                return self._made(Abs(child), token)
+            case "not":
+                return self._made(Not(self._subformula(PREFIX)), token)
+            case "G" | "F":
+                a, b = self._window(token)
+                make = Always if token.kind == "G" else Eventually
+                return self._made(make(a, b, self._subformula(PREFIX)), token)
+            case _:
+                self._index -= 1
+                raise self._unexpected(_OPERAND)
+
+    def _infix(self, left: Node, start: int, level: int) -> Node:
+        token = self._token
+        match token.kind:
+            case "and" | "or":
+                children = [self._as_formula(left)]
+                while self._token.kind == token.kind:
+                    self._next()
+                    children.append(self._subformula(level + 1))
+                return self._made((And if token.kind == "and" else Or)(tuple(children)), token)
+            case "implies":
+                condition = self._as_formula(left)
+                self._next()
+                implied = self._made(Implies(condition, self._subformula(level + 1)), token)
+                self._refuse_chain(level, "implications do not chain", "parentheses around one of them")
+                return implied
+            case "U":
+                before = self._as_formula(left)
+                self._next()
+                a, b = self._window(token)
+                until = self._made(Until(a, b, before, self._subformula(level + 1)), token)
+                self._refuse_chain(level, "untils do not chain", "parentheses around one of them")
+                return until
+            case "<" | "<=" | ">" | ">=" as op:
+                lesser = self._as_term(left, start)
+                self._next()
+                comparison = self._made(Comparison(op, lesser, self._term(level + 1)), token)
+                self._refuse_chain(level, "comparisons do not chain", "'and' between two of them")
+                return comparison
+            case "+" | "-" | "*" | "/" as op:
+                first = self._as_term(left, start)
+                self._next()
+                return self._made(Arithmetic(op, first, self._term(level + 1)), token)
+        raise AssertionError(token.kind)
+
+    def _subformula(self, binding: int) -> Formula:
+        return self._as_formula(self._expression(binding))
+
+    def _term(self, binding: int) -> Term:
+        start = self._token.position
+        return self._as_term(self._expression(binding), start)
+
+    def _as_formula(self, node: Node) -> Formula:
+        if isinstance(node, Name):
+            return Atom(node.name)
+        if not isinstance(node, Formula):
+            raise self._error(f"'{_clip(str(node))}' is a value, not true or false", self._token, _COMPARE)
+        return node
+
+    def _as_term(self, node: Node, start: int) -> Term:
+        if not isinstance(node, Term):
+            text = f"'{_clip(str(node))}' is true or false, not a value"
+            raise self._error(text, Token("", str(node), start), "arithmetic over names and numbers")
+        return node
+
+    def _number(self, token: Token, sign: float) -> Number:
+        value = sign * float(token.text)
+        if not math.isfinite(value):
+            raise self._error(f"'{_clip(token.text)}' is too large", token, "a number that a float64 holds")
+        return Number(value)
+
+    def _name(self, token: Token) -> Name:
+        if self._names is not None and token.text not in self._names:
+            known = sorted(self._names)
+            more = f" and {len(known) - 20} more" if len(known) > 20 else ""
+            expected = f"one of {', '.join(known[:20])}{more}" if known else "no names at all"
+            raise self._error(f"nothing declares '{_clip(token.text)}'", token, expected)
+        return Name(token.text)
+
+    def _window(self, operator: Token) -> tuple[int, int]:
+        opening = self._take("[", f"a window such as [0,10]: '{operator.text}' has to be bounded")
+        a = self._bound()
+        if self._token.kind not in (",", ":"):
+            raise self._unexpected("',' or ':' between the window's bounds")
+        self._next()
+        b = self._bound()
+        self._take("]", "']' after the window's bounds")
+        if a > b:
+            raise self._error(f"the window [{a},{b}] is empty", opening, "a <= b", got=[a, b])
+        return a, b
+
+    def _bound(self) -> int:
+        token = self._take("number", "a window bound, a whole number of steps, not negative")
+        if not token.text.isdigit():
+            problem = f"'{_clip(token.text)}' is no window bound"
+            raise self._error(problem, token, "a whole number of steps")
+        digits = token.text.lstrip("0") or "0"
+        if len(digits) > len(str(MAX_BOUND)) or int(digits) > MAX_BOUND:
+            problem = f"a window bound of {_clip(digits)} steps"
+            raise self._error(problem, token, f"at most {MAX_BOUND} steps", HorizonError)
+        return int(digits)
+
+    def _made(self, node: _N, token: Token) -> _N:
+        if node.depth > MAX_DEPTH:
+            raise self._too_deep(token)
+        limit = self._max_horizon
+        if limit is not None and isinstance(node, Formula) and node.horizon > limit:
+            problem = f"a horizon of {node.horizon} steps"
+            raise self._error(problem, token, f"at most {limit} steps", HorizonError, got=node.horizon)
+        return node
+
+    def _refuse_chain(self, level: int, problem: str, expected: str) -> None:
+        if _BINDING.get(self._token.kind) == level:
+            raise self._error(problem, self._token, expected)
+
+    def _too_deep(self, token: Token) -> FormulaError:
+        return self._error("the nesting is too deep", token, f"at most {MAX_DEPTH} levels")
+
+    def _unexpected(self, expected: str) -> FormulaError:
+        token = self._token
+        problem = "the text ends" if token.kind == "end" else f"unexpected '{_clip(token.text)}'"
+        return self._error(problem, token, expected)
+
+    def _error(
+        self,
+        problem: str,
+        token: Token,
+        expected: str,
+        error: type[FormulaError] = FormulaError,
+        got: Any = None,
+    ) -> FormulaError:
+        return error(
+            f"{problem} at position {token.position}; expected {expected}",
+            got=_clip(token.text) if got is None else got,
+            expected=expected,
+            position=token.position,
+        )
+
+
+def _clip(text: str) -> str:
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,160 @@
+"""Boolean combinations of predicates as postfix stack programs, for compiled rollouts.
+
+A program's value is `robustness(predicate, ...)` bit for bit, since both do the same float64 operations in
+the same order; where that raises for arithmetic that is not finite, it is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from specshield.errors import FormulaError, FragmentError
+from specshield.stl.formula import (
+    Abs,
+    And,
+    Arithmetic,
+    Atom,
+    Comparison,
+    Implies,
+    Name,
+    Neg,
+    Node,
+    Not,
+    Number,
+    Or,
+)
+from specshield.stl.parser import MAX_DEPTH
+
+STACK_SIZE = MAX_DEPTH  # what a formula of the parser's depth can need at most
+
+NUMBER, VALUE, NEGATE, ABSOLUTE, ADD, SUBTRACT, MULTIPLY, DIVIDE, MINIMUM, MAXIMUM = range(10)
+_ARITHMETIC = {"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "/": DIVIDE}
+
+
+class Program(NamedTuple):
+    """ops int64[n]; args float64[n]: the number of a NUMBER, the slot of a VALUE, else 0."""
+
+    ops: NDArray[np.int64]
+    args: NDArray[np.float64]
+
+
+class Programs(NamedTuple):
+    """Several programs end to end; program k is at starts[k] to starts[k + 1]. starts int64[k + 1]."""
+
+    ops: NDArray[np.int64]
+    args: NDArray[np.float64]
+    starts: NDArray[np.int64]
+
+
+def compile_predicate(predicate: Node, slots: Mapping[str, int]) -> Program:
+    """The program of `predicate`, name n's value at values[slots[n]].
+
+    FragmentError at a temporal operator; FormulaError at a name without a slot or nesting beyond STACK_SIZE.
+    """
+    if predicate.depth > STACK_SIZE:
+        expected = f"at most {STACK_SIZE} levels of nesting"
+        raise FormulaError(f"a predicate is {predicate.depth} deep; expected {expected}", expected=expected)
+    code = list(_code(predicate, slots))
+    return Program(np.array([op for op, _ in code], np.int64), np.array([arg for _, arg in code], np.float64))
+
+
+def pack(programs: Sequence[Program]) -> Programs:
+    starts = np.cumsum([0, *(len(program.ops) for program in programs)], dtype=np.int64)
+    ops = np.concatenate([np.empty(0, np.int64), *(program.ops for program in programs)])
+    args = np.concatenate([np.empty(0, np.float64), *(program.args for program in programs)])
+    return Programs(ops, args, starts)
+
+
+def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
+    match node:
+        case Number(value):
+            yield NUMBER, value
+        case Name(name) | Atom(name):
+            if name not in slots:
+                raise FormulaError(f"nothing declares '{name}'", got=name, expected=", ".join(sorted(slots)))
+            yield VALUE, slots[name]
+        case Neg(child) | Not(child):
+            yield from _code(child, slots)
+            yield NEGATE, 0
+        case Abs(child):
+            yield from _code(child, slots)
+            yield ABSOLUTE, 0
+        case Arithmetic(op, left, right):
+            yield from _code(left, slots)
+            yield from _code(right, slots)
+            yield _ARITHMETIC[op], 0
+        case Comparison(op, left, right):
+            first, second = (left, right) if op in (">", ">=") else (right, left)
+            yield from _code(first, slots)
+            yield from _code(second, slots)
+            yield SUBTRACT, 0
+        case And(children) | Or(children):
+            yield from _code(children[0], slots)
+            for child in children[1:]:
+                yield from _code(child, slots)
+                yield MINIMUM if isinstance(node, And) else MAXIMUM, 0
+        case Implies(left, right):
+            yield from _code(left, slots)
+            yield NEGATE, 0
+            yield from _code(right, slots)
+            yield MAXIMUM, 0
+        case _:
+            expected = "a boolean combination of predicates"
+            problem = f"'{node}' is temporal; expected {expected}"
+            raise FragmentError(problem, got=str(node), expected=expected)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run(ops, args, start, stop, values, stack):  # type: ignore[no-untyped-def]
+    top = -1
+    for i in range(start, stop):
+        op = ops[i]
+        if op == VALUE:
+            top += 1
+            stack[top] = values[int(args[i])]
+        elif op == NUMBER:
+            top += 1
+            stack[top] = args[i]
+        elif op == NEGATE:
+            stack[top] = -stack[top]
+        elif op == ABSOLUTE:
+            stack[top] = abs(stack[top])
+        else:
+            right = stack[top]
+            top -= 1
+            left = stack[top]
+            if op == MINIMUM:
+                stack[top] = min(left, right)
+            elif op == MAXIMUM:
+                stack[top] = max(left, right)
+            else:
+                if op == ADD:
+                    left += right
+                elif op == SUBTRACT:
+                    left -= right
+                elif op == MULTIPLY:
+                    left *= right
+                else:
+                    left /= right
+                if not math.isfinite(left):
+                    return math.nan
+                stack[top] = left
+    return stack[0] + 0.0  # one zero, as in `robustness`
+
+
+@njit(cache=True, nogil=True)
+def evaluate(ops, args, values):  # type: ignore[no-untyped-def]
+    """The robustness of one program, values float64[slots]."""
+    return _run(ops, args, 0, len(ops), values, np.empty(STACK_SIZE))
+
+
+@njit(cache=True, nogil=True)
+def evaluate_packed(k, ops, args, starts, values, stack):  # type: ignore[no-untyped-def]
+    """The robustness of program k of `Programs`; stack float64[STACK_SIZE] is scratch."""
+    return _run(ops, args, starts[k], starts[k + 1], values, stack)
