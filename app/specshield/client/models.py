@@ -1,0 +1,152 @@
+"""What the service answers, as frozen dataclasses whose fields are named as in the HTTP contract.
+
+Lists arrive as tuples. Metres, radians, counter-clockwise, map frame. Fields this version does not
+know are ignored, so a newer server may add some.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Generic, Literal, TypeVar
+
+from specshield.errors import ServerError
+
+T = TypeVar("T")
+Pose = tuple[float, float, float]
+SpecStatus = Literal["pending", "satisfied", "violated"]
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A formula the server has parsed: canonical text, horizon [steps], the names it uses."""
+
+    formula: str
+    horizon: int
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Map:
+    """An occupancy grid: resolution [m], size [cells], `origin` (x, y, yaw) of its lower-left corner."""
+
+    id: str
+    resolution: float
+    width: int
+    height: int
+    origin: tuple[float, float, float]
+    bounds: tuple[float, float, float, float]
+    rooms: Mapping[str, Any]
+    name: str | None = None
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy pi_phi: `progress` in [0, 1], `eta_s` an estimate of the time left [s], `error` why it failed."""
+
+    id: str
+    status: Literal["queued", "training", "ready", "failed"]
+    progress: float
+    horizon: int
+    metrics: Mapping[str, Any]
+    error: str | None
+    name: str | None = None
+    eta_s: float | None = None
+
+
+@dataclass(frozen=True)
+class SessionInfo:
+    """A session as the server described it; `next_t` is the step it expects next."""
+
+    id: str
+    policy_ids: tuple[str, ...]
+    map_id: str
+    spec: Mapping[str, Any]
+    horizon: int
+    actions: tuple[str, ...]
+    terminal_actions: tuple[int, ...]  # indices of those that end the main task
+    next_t: int
+    feasible: bool
+    spec_status: SpecStatus
+    main_task_done: bool
+    finished: bool
+    expires_at: str
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How far x_t lies from where the last action should have led: [m], [rad]."""
+
+    translation: float
+    rotation: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision at step `t`; the sequences without a comment have one entry an action.
+
+    `execute` is the action to run: `action` as drawn, except that a terminal one is never run while
+    the specification is pending (then it is `completion_action`), and that once the specification is
+    settled and the main task over it is the terminal action: nothing is left to do.
+    """
+
+    t: int
+    mode: Literal["prior", "shaped", "completion", "fallback", "violated"]
+    distribution: tuple[float, ...]
+    j_values: tuple[float | None, ...]
+    robustness: tuple[float | None, ...]
+    action: int
+    action_name: str
+    completion_action: int | None
+    spec_status: SpecStatus
+    feasible_mass: float | None
+    kl: float | None
+    reason: str | None
+    finished: bool
+    next_poses: tuple[Pose, ...]
+    residual: Residual | None
+    witness: tuple[int, ...] | None  # the actions that follow `action` to the horizon
+    execute: int
+    timings: Mapping[str, float]  # [ms], from the Server-Timing header
+    witnesses: tuple[tuple[int, ...] | None, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a closed session ended; the bounds are those of rho over all continuations, null is infinite."""
+
+    spec_status: SpecStatus
+    robustness_bounds: tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class TrajectoryItem:
+    """The state at `t`, and the answer given there by the contract's names; None where none was asked for."""
+
+    t: int
+    pose: Pose
+    signals: Mapping[str, float]
+    decision: Mapping[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Page(Generic[T]):
+    """One page of a list; `next` asks for the following one."""
+
+    items: tuple[T, ...]
+    next: str | None
+
+
+def build(cls: type[T], body: Mapping[str, Any], **more: Any) -> T:
+    """`cls` from the members of `body` it knows; ServerError where one is missing."""
+    known = {f.name for f in fields(cls)} - more.keys()  # type: ignore[arg-type]
+    try:
+        return cls(**{name: _tuples(value) for name, value in body.items() if name in known}, **more)
+    except (AttributeError, TypeError) as error:
+        raise ServerError(
+            f"not a {cls.__name__.lower()} as this client knows it: {error}", got=body
+        ) from error
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(item) for item in value) if isinstance(value, list) else value

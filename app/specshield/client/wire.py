@@ -1,0 +1,226 @@
+"""Requests and replies as values: what is sent, what came back, and which error a reply stands for."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import quote
+
+from specshield.client.models import Pose
+from specshield.errors import (
+    BodyTooLarge,
+    Conflict,
+    InputError,
+    LogitsError,
+    NotFound,
+    PoseError,
+    SampleError,
+    ServerError,
+    SpecshieldError,
+    TransportError,
+    TransportTimeout,
+    Unauthorized,
+    tree,
+)
+
+
+class Array(Protocol):
+    """Any array (numpy, torch, array.array), known by its `tolist`."""
+
+    def tolist(self) -> Any: ...
+
+
+Numbers = Iterable[float] | Array
+Logits = Iterable[float | None] | Array
+TRIES = 5
+Content = bytes | str | os.PathLike[str]
+
+
+@dataclass(frozen=True)
+class Request:
+    """One request. `slow`: the server prepares something; `tries`: how often it may be sent at most."""
+
+    method: str
+    path: str
+    body: bytes | None = None  # JSON, encoded once: every try sends the same bytes
+    files: Mapping[str, tuple[str, bytes, str]] | None = None  # multipart: (file name, content, type)
+    params: Mapping[str, str] | None = None
+    slow: bool = False
+    tries: int = TRIES
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What the server answered, after `seconds`, where `timeout` were allowed."""
+
+    status: int
+    headers: Mapping[str, str]  # names in lower case
+    content: bytes
+    seconds: float
+    timeout: float
+
+
+@dataclass(frozen=True)
+class Failure:
+    """No answer: the error, after `seconds`, where `timeout` were allowed."""
+
+    error: TransportError
+    seconds: float
+    timeout: float
+
+
+def get(*segments: str, slow: bool = False, params: Mapping[str, str] | None = None) -> Request:
+    return Request("GET", path(*segments), params=params, slow=slow)
+
+
+def post(*segments: str, body: Mapping[str, Any], slow: bool = False, tries: int = TRIES) -> Request:
+    return Request("POST", path(*segments), body=encode(body), slow=slow, tries=tries)
+
+
+def path(*segments: str) -> str:
+    return "/v1/" + "/".join(quote(segment, safe="") for segment in segments)
+
+
+def encode(body: Mapping[str, Any]) -> bytes:
+    """JSON; arrays become lists. InputError for what JSON cannot hold (NaN, infinity, other objects)."""
+    try:
+        return json.dumps(body, allow_nan=False, separators=(",", ":"), default=_listed).encode()
+    except (TypeError, ValueError) as error:
+        raise InputError(f"cannot be sent as JSON: {error}") from error
+
+
+def _listed(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not JSON")
+
+
+def content(source: Content) -> bytes:
+    """The bytes of a file (a path object), of a text, or as given."""
+    if isinstance(source, os.PathLike):
+        return Path(source).read_bytes()
+    return source.encode() if isinstance(source, str) else source
+
+
+def pose_values(pose: Numbers, where: str = "pose") -> Pose:
+    """(x, y, theta) in [m], [m], [rad]. PoseError unless these are three finite numbers."""
+    values = _floats(pose, PoseError, where, "three finite numbers x, y, theta")
+    if len(values) != 3 or not all(map(math.isfinite, values)):
+        raise PoseError("a pose is three finite numbers", path=where, got=values, expected="[x, y, theta]")
+    return values[0], values[1], values[2]
+
+
+def logit_values(logits: Logits) -> list[float | None]:
+    """One logit an action; minus infinity becomes null. LogitsError for NaN and plus infinity."""
+    values = _floats(logits, LogitsError, "logits", "one number an action")
+    for i, value in enumerate(values):
+        if math.isnan(value) or value == math.inf:
+            raise LogitsError(
+                f"logit {i} is {value}",
+                path=f"logits.{i}",
+                got=str(value),
+                expected="a finite number, -inf or None",
+            )
+    return [None if value == -math.inf else value for value in values]
+
+
+def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
+    """SampleError unless every signal is a finite number."""
+    values = {}
+    for name, value in signals.items():
+        (values[name],) = _floats([value], SampleError, f"signals.{name}", "a finite number")
+        if not math.isfinite(values[name]):
+            raise SampleError(
+                "a signal is a finite number", path=f"signals.{name}", got=str(value), expected="finite"
+            )
+    return values
+
+
+def _floats(values: Any, error: type[InputError], where: str, expected: str) -> list[float]:
+    """None is minus infinity, which only a logit may be."""
+    try:
+        listed = values.tolist() if hasattr(values, "tolist") else values
+        return [-math.inf if value is None else float(value) for value in listed]
+    except (TypeError, ValueError) as cause:
+        raise error(f"{where}: {cause}", path=where, expected=expected) from cause
+
+
+_BY_TYPE = {cls.type: cls for cls in tree()}
+_BY_STATUS: dict[int, type[SpecshieldError]] = {
+    401: Unauthorized,
+    403: Unauthorized,
+    404: NotFound,
+    409: Conflict,
+    413: BodyTooLarge,
+}
+_GATEWAY: dict[int, type[TransportError]] = {502: TransportError, 503: TransportError, 504: TransportTimeout}
+
+
+def json_object(reply: Reply) -> dict[str, Any]:
+    """The object a successful reply holds; the error an unsuccessful one stands for is raised."""
+    check(reply)
+    try:
+        body = json.loads(reply.content)
+    except ValueError:
+        body = None
+    if not isinstance(body, dict):
+        raise ServerError(
+            "the answer is not a JSON object; is this a specshield server?", status=reply.status
+        )
+    return body
+
+
+def check(reply: Reply) -> None:
+    """Raise the error an unsuccessful reply stands for."""
+    if not 200 <= reply.status < 300:
+        raise error_of(reply)
+
+
+def error_of(reply: Reply) -> SpecshieldError:
+    """The class its problem document's `type` names (RFC 9457), holding all the document says."""
+    document = _problem(reply)
+    if document is None and reply.status in _GATEWAY:  # something in front of the server spoke
+        return _GATEWAY[reply.status](
+            f"the server cannot be reached: status {reply.status}", status=reply.status
+        )
+    document = document or {}
+    default = _BY_STATUS.get(reply.status) or (InputError if 400 <= reply.status < 500 else ServerError)
+    cls = _BY_TYPE.get(str(document.get("type")), default)
+    error = cls(
+        str(document.get("detail") or document.get("title") or f"status {reply.status}"),
+        path=document.get("path"),
+        got=document.get("got"),
+        expected=document.get("expected"),
+    )
+    told = {"title", "detail", "path", "got", "expected"} | (
+        {"type"} if cls.type == document.get("type") else set()
+    )
+    error.details.update({"status": reply.status, **{k: v for k, v in document.items() if k not in told}})
+    return error
+
+
+def _problem(reply: Reply) -> dict[str, Any] | None:
+    if not reply.headers.get("content-type", "").startswith("application/problem+json"):
+        return None
+    try:
+        document = json.loads(reply.content)
+    except ValueError:
+        return None
+    return document if isinstance(document, dict) else None
+
+
+def timings(reply: Reply) -> dict[str, float]:
+    """`total;dur=2.1, rollout;dur=1.5` as {"total": 2.1, "rollout": 1.5}, in ms."""
+    entries = {}
+    for metric in reply.headers.get("server-timing", "").split(","):
+        name, *parameters = (part.strip() for part in metric.split(";"))
+        for parameter in parameters:
+            key, _, value = parameter.partition("=")
+            if key == "dur":
+                entries[name] = float(value)
+    return entries

@@ -1,0 +1,209 @@
+"""The calls as generators: what they send, when they try again, what they make of the answers."""
+
+import json
+
+import pytest
+from client_script import SESSION, answer, drive, lost, problem
+from specshield import errors
+from specshield.client import core
+from specshield.client.models import Policy
+from specshield.client.wire import Request, get, post
+
+POLICY = {"id": "p", "status": "training", "progress": 0.5, "horizon": 140, "metrics": {}, "error": None}
+
+
+@pytest.mark.parametrize(
+    "passing", [lost(0.0), problem(503, "store-unavailable"), answer({}, 502), answer({}, 504)]
+)
+def test_a_lost_answer_is_asked_for_again_with_the_same_request(passing):
+    request = post("specs", "validate", body={"formula": "a"})
+    delivery, sent, waits = drive(core.deliver(request), passing, passing, answer({"ok": 1}))
+    assert delivery.tries == 3
+    assert sent == [request] * 3
+    assert waits == [0.05, 0.1]
+
+
+def test_tries_are_bounded_in_number():
+    error, sent, waits = drive(core.deliver(get("maps")), *[lost(0.0)] * 5)
+    assert type(error) is errors.TransportTimeout
+    assert error.details["tries"] == len(sent) == 5
+    assert waits == [0.05, 0.1, 0.2, 0.4]
+
+
+def test_tries_are_bounded_in_time():
+    """Four timeouts are 2 s: three tries of 0.6 s and two waits are 1.95 s, a fourth would start too late."""
+    error, sent, _ = drive(core.deliver(get("maps")), *[lost(0.6)] * 3)
+    assert type(error) is errors.TransportTimeout
+    assert len(sent) == 3
+    assert error.details["seconds"] == pytest.approx(1.95)
+
+
+@pytest.mark.parametrize(
+    "final",
+    [
+        problem(503, "training-unavailable"),
+        problem(500, "internal-error"),
+        problem(409, "step-conflict"),
+        answer({}, 201),
+    ],
+)
+def test_an_answer_that_would_not_change_is_taken(final):
+    delivery, sent, _ = drive(core.deliver(get("maps")), final)
+    assert delivery.reply is final
+    assert len(sent) == 1
+
+
+def test_a_gateway_that_stays_is_a_transport_error():
+    error, sent, _ = drive(core.call(get("maps")), *[answer({}, 503)] * 5)
+    assert type(error) is errors.TransportError
+    assert len(sent) == 5
+
+
+def create(**given):
+    arguments = {
+        "policy_id": "p",
+        "policy_ids": None,
+        "initial_pose": (1, 2, 0.5),
+        "id": None,
+        "seed": 0,
+        "threshold": 1.0,
+        "margin": 0.0,
+        "evaluation": "feasibility",
+        "shaping": "projection",
+        "max_steps": None,
+        "allow_infeasible": False,
+    }
+    return core.create_session(**{**arguments, **given})
+
+
+def test_a_session_is_created_under_an_id_of_our_own():
+    info, (request,), _ = drive(create(), answer(SESSION, 201))
+    body = json.loads(request.body)
+    assert len(body.pop("id")) == 36
+    assert body == {
+        "policy_id": "p",
+        "initial_pose": [1.0, 2.0, 0.5],
+        "seed": 0,
+        "threshold": 1.0,
+        "margin": 0.0,
+        "evaluation": "feasibility",
+        "shaping": "projection",
+        "allow_infeasible": False,
+    }
+    assert info.policy_ids == ("p",)
+    _, (again,), _ = drive(
+        create(policy_id=None, policy_ids=("p", "q"), id="mine", max_steps=9), answer(SESSION, 201)
+    )
+    body = json.loads(again.body)
+    assert (body["id"], body["policy_ids"], body["max_steps"], "policy_id" in body) == (
+        "mine",
+        ["p", "q"],
+        9,
+        False,
+    )
+
+
+@pytest.mark.parametrize("ids", [{}, {"policy_id": "p", "policy_ids": ["q"]}])
+def test_exactly_one_way_to_name_policies(ids):
+    error, sent, _ = drive(create(**{"policy_id": None, "policy_ids": None, **ids}))
+    assert type(error) is errors.InputError
+    assert sent == []
+
+
+def test_session_exists_after_a_lost_answer_of_our_own_is_our_session():
+    info, sent, _ = drive(
+        create(), lost(), problem(409, "session-exists"), answer({**SESSION, "id": "read back"})
+    )
+    assert info.id == "read back"
+    key = json.loads(sent[0].body)["id"]
+    assert (sent[2].method, sent[2].path) == ("GET", f"/v1/sessions/{key}")
+
+
+def test_session_exists_at_the_first_try_is_somebody_elses():
+    error, sent, _ = drive(create(id="taken"), problem(409, "session-exists"))
+    assert type(error) is errors.SessionExists
+    assert len(sent) == 1
+
+
+def test_a_callers_id_that_has_moved_on_is_somebody_elses_even_after_a_lost_answer():
+    busy = answer({**SESSION, "next_t": 4})
+    error, _, _ = drive(create(id="taken"), lost(), problem(409, "session-exists"), busy)
+    assert type(error) is errors.SessionExists
+
+
+def test_erasing_what_a_lost_try_erased_succeeds_and_what_never_was_does_not():
+    assert drive(core.delete_session("s"), lost(), problem(404, "not-found"))[0] is None
+    assert type(drive(core.delete_session("s"), problem(404, "not-found"))[0]) is errors.NotFound
+
+
+def test_deleting_a_policy_is_never_repeated():
+    """The first DELETE cancels a training; the second would remove the policy."""
+    error, sent, _ = drive(core.delete_policy("p"), lost())
+    assert type(error) is errors.TransportTimeout
+    assert len(sent) == 1
+
+
+def test_pages():
+    page, (first,), _ = drive(core.page(Policy, "policies", None), answer({"items": [POLICY], "next": "p"}))
+    assert (first.path, first.params, page.items[0].id, page.next) == ("/v1/policies", {}, "p", "p")
+    page, (second,), _ = drive(core.page(Policy, "policies", "p"), answer({"items": [], "next": None}))
+    assert (second.params, page.items, page.next) == ({"cursor": "p"}, (), None)
+
+
+def test_waiting_ends_with_ready_or_failed_and_reports_on_the_way():
+    seen = []
+    answers = [answer({**POLICY, "progress": p}) for p in (0.1, 0.5)]
+    done = answer({**POLICY, "status": "failed", "error": "killed"})
+    policy, _, waits = drive(core.wait_policy("p", 60, 2, lambda p: seen.append(p.progress)), *answers, done)
+    assert (policy.status, policy.error) == ("failed", "killed")
+    assert seen == [0.1, 0.5, 0.5]
+    assert waits == [2, 2]
+
+
+def test_waiting_outlasts_a_server_that_is_away_for_a_while_but_not_one_that_never_was():
+    outage = [lost()] * 4
+    policy, _, _ = drive(
+        core.wait_policy("p", 60, 1, None), answer(POLICY), *outage, answer({**POLICY, "status": "ready"})
+    )
+    assert policy.status == "ready"
+    error, _, _ = drive(core.wait_policy("p", 60, 1, None), *outage)
+    assert type(error) is errors.TransportTimeout
+
+
+def test_waiting_has_an_end():
+    error, _, waits = drive(core.wait_policy("p", 5, 2, None), *[answer(POLICY)] * 3)
+    assert type(error) is errors.TransportTimeout
+    assert "training (50%)" in error.message
+    assert sum(waits) == 4
+
+
+def test_uploads_are_multipart_and_get_the_time_to_be_prepared():
+    map_json = {
+        "id": "m",
+        "resolution": 0.05,
+        "width": 2,
+        "height": 1,
+        "origin": [0, 0, 0],
+        "bounds": [0, 0, 0.1, 0.05],
+        "rooms": {},
+        "from_the_future": 1,
+    }
+    uploaded, (request,), _ = drive(core.upload_map("resolution: 0.05", b"P5"), answer(map_json, 201))
+    assert uploaded.bounds == (0, 0, 0.1, 0.05)
+    assert isinstance(request, Request)
+    assert request.slow
+    assert {name: part[1] for name, part in request.files.items()} == {
+        "metadata": b"resolution: 0.05",
+        "image": b"P5",
+    }
+    _, (request,), _ = drive(core.upload_policy(b"weights", {"seed": 0}), answer(POLICY, 202))
+    assert {name: part[1] for name, part in request.files.items()} == {
+        "weights": b"weights",
+        "card": b'{"seed":0}',
+    }
+
+
+def test_an_answer_that_lacks_a_field_is_a_server_error():
+    error, _, _ = drive(core.get_policy("p"), answer({"id": "p"}))
+    assert type(error) is errors.ServerError
+    assert "status" in error.message

@@ -1,0 +1,257 @@
+"""Both shells over httpx: how a network fails, what goes over the wire, and that they mirror each other."""
+
+import asyncio
+import inspect
+import json
+import socket
+import subprocess
+import sys
+import time
+
+import httpx
+import pytest
+import specshield.client
+from client_script import SESSION
+from specshield import errors
+from specshield.client import AsyncShieldClient, ShieldClient, aio, sync
+
+SPEC = {"formula": "F[0,3] a", "horizon": 3, "names": ["a"]}
+
+
+@pytest.fixture(params=["sync", "async"])
+def use(request):
+    """use(handler or base_url, action): what `action(client)` gives through the one shell or the other."""
+
+    def blocking(client, action):
+        with client:
+            result = action(client)
+            return list(result) if inspect.isgenerator(result) else result
+
+    async def awaiting(client, action):
+        async with client:
+            result = action(client)
+            return await result if inspect.isawaitable(result) else [item async for item in result]
+
+    def use(server, action, **options):
+        if callable(server):
+            options["transport"] = httpx.MockTransport(server)
+            server = "http://robot.test/prefix"
+        if request.param == "sync":
+            return blocking(ShieldClient(server, **options), action)
+        return asyncio.run(awaiting(AsyncShieldClient(server, **options), action))
+
+    return use
+
+
+def validate(client):
+    return client.specs.validate("F[0,3] a")
+
+
+def failing(*failures, then=SPEC):
+    """A network on which the first requests go wrong."""
+    script, seen = list(failures), []
+
+    def handler(request):
+        seen.append(request)
+        fault = script.pop(0) if script else None
+        if isinstance(fault, Exception):
+            raise fault
+        return httpx.Response(200 if fault is None else fault, json=then)
+
+    return handler, seen
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        httpx.ConnectError("refused"),
+        httpx.ReadTimeout(""),
+        httpx.RemoteProtocolError("Server disconnected"),
+        httpx.ReadError(""),
+        502,
+        503,
+        504,
+    ],
+)
+def test_a_passing_failure_is_not_noticed(use, fault):
+    handler, seen = failing(fault, fault)
+    assert use(handler, validate).horizon == 3
+    assert len(seen) == 3
+    assert seen[0].content == seen[2].content
+
+
+@pytest.mark.parametrize(
+    ("fault", "cls"),
+    [
+        (httpx.ReadTimeout(""), errors.TransportTimeout),
+        (httpx.ConnectError("refused"), errors.TransportError),
+    ],
+)
+def test_a_lasting_failure_is_a_transport_error_with_its_cause(use, fault, cls):
+    handler, seen = failing(*[fault] * 5)
+    with pytest.raises(errors.TransportError) as caught:
+        use(handler, validate)
+    assert type(caught.value) is cls
+    assert caught.value.__cause__ is fault
+    assert "POST http://robot.test/prefix/v1/specs/validate" in caught.value.message
+    assert len(seen) == 5
+
+
+def test_a_server_that_never_answers_costs_a_bounded_time(use):
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        start = time.monotonic()
+        with pytest.raises(errors.TransportTimeout):
+            use(url, validate, timeout=0.1)
+        assert time.monotonic() - start < 1.0
+
+
+def test_a_closed_port_is_a_transport_error(use):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
+    with pytest.raises(errors.TransportError, match=url):
+        use(url, validate)
+
+
+def test_what_goes_over_the_wire(use):
+    handler, seen = failing()
+    use(handler, validate, api_key="secret", timeout=0.25)
+    (request,) = seen
+    assert (request.method, str(request.url)) == ("POST", "http://robot.test/prefix/v1/specs/validate")
+    assert request.headers["authorization"] == "Bearer secret"
+    assert request.headers["content-type"] == "application/json"
+    assert json.loads(request.content) == {"formula": "F[0,3] a"}
+    assert request.extensions["timeout"] == {"connect": 0.25, "read": 0.25, "write": 0.25, "pool": 0.25}
+
+
+def test_without_a_key_nothing_is_claimed_and_what_prepares_gets_time(use):
+    handler, seen = failing(then=SESSION)
+    use(handler, lambda client: client.sessions.create(policy_id="p", initial_pose=(0, 0, 0)))
+    assert "authorization" not in seen[0].headers
+    assert seen[0].extensions["timeout"] == {"connect": 0.5, "read": 30.0, "write": 30.0, "pool": 30.0}
+
+
+def test_lists_follow_their_pages(use):
+    def handler(request):
+        cursor = request.url.params.get("cursor")
+        item = {**SESSION, "id": cursor or "first"}
+        return httpx.Response(
+            200, json={"items": [item], "next": {None: "second", "second": "third"}.get(cursor)}
+        )
+
+    sessions = use(handler, lambda client: client.sessions.list())
+    assert [info.id for info in sessions] == ["first", "second", "third"]
+
+
+class Closing:
+    """A server that creates sessions and answers `close` as told; counts what comes."""
+
+    def __init__(self, answer):
+        self.answer, self.closes = answer, 0
+
+    def __call__(self, request):
+        if not request.url.path.endswith("/close"):
+            return httpx.Response(201, json=SESSION)
+        self.closes += 1
+        if self.answer is None:
+            raise httpx.ReadTimeout("")
+        status, body = self.answer
+        kind = "application/json" if status == 200 else "application/problem+json"
+        return httpx.Response(status, content=json.dumps(body), headers={"content-type": kind})
+
+
+CLOSED = (200, {"spec_status": "pending", "robustness_bounds": [None, 0.5]})
+GONE = (404, {"type": "not-found", "detail": "gone"})
+LOST = None
+
+
+def in_session(use, server, block):
+    """Run `block(session)` inside a session's `with`, in either shell."""
+    begin = {"policy_id": "p", "initial_pose": (0, 0, 0)}
+
+    def action(client):
+        if isinstance(client, ShieldClient):
+            with client.sessions.create(**begin) as session:
+                return block(session)
+
+        async def run():
+            async with await client.sessions.create(**begin) as session:
+                result = block(session)
+                return await result if inspect.isawaitable(result) else result
+
+        return run()
+
+    return use(server, action, timeout=0.05)
+
+
+def test_leaving_the_block_closes_the_session_once(use):
+    server = Closing(CLOSED)
+    assert in_session(use, server, lambda session: session.finished) is False
+    assert server.closes == 1
+    verdict = in_session(use, server, lambda session: session.close((1, 0, 0)))
+    assert verdict.robustness_bounds == (None, 0.5)
+    assert server.closes == 2, "closed in the block: not again at its end"
+
+
+@pytest.mark.parametrize("answer", [CLOSED, LOST, GONE])
+def test_an_error_of_the_block_is_never_masked(use, answer):
+    server = Closing(answer)
+
+    def block(session):
+        raise KeyError("the robot's own")
+
+    with pytest.raises(KeyError, match="the robot's own"):
+        in_session(use, server, block)
+    assert server.closes == 1
+
+
+def test_a_close_that_fails_is_said_unless_the_session_is_gone(use):
+    with pytest.raises(errors.TransportTimeout):
+        in_session(use, Closing(LOST), lambda session: None)
+    assert in_session(use, Closing(GONE), lambda session: session.id) == "s"
+
+
+PAIRS = ["ShieldClient", "Specs", "Maps", "Policies", "Session", "Sessions"]
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_the_shells_mirror_each_other(name):
+    def surface(cls):
+        return {
+            key: str(inspect.signature(member)).replace("Async", "")
+            for key, member in inspect.getmembers(cls, inspect.isfunction)
+            if not key.startswith("_") or key == "__init__"
+        }
+
+    assert surface(getattr(sync, name)) == surface(getattr(aio, f"Async{name}"))
+
+
+def test_the_public_names():
+    assert specshield.client.__all__ == [
+        "AsyncSession",
+        "AsyncShieldClient",
+        "Decision",
+        "Map",
+        "Policy",
+        "Residual",
+        "Session",
+        "SessionInfo",
+        "ShieldClient",
+        "Spec",
+        "TrajectoryItem",
+        "Verdict",
+    ]
+    assert all(hasattr(specshield.client, name) for name in specshield.client.__all__)
+    public = {name for name in vars(sync.Session) | vars(sync.SessionState) if not name.startswith("_")}
+    assert public == {"step", "record", "trajectory", "close", "id"}
+
+
+def test_importing_the_client_brings_httpx_and_nothing_heavy():
+    heavy = ["torch", "fastapi", "numpy", "pydantic", "numba", "redis", "scipy", "starlette", "typer"]
+    code = (
+        "import sys, specshield.client;"
+        f"print([name for name in {heavy} if name in sys.modules],"
+        "sorted(name for name in sys.modules if name.startswith('specshield.') and '.client' not in name))"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "[] ['specshield.errors']"

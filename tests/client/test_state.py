@@ -1,0 +1,215 @@
+"""The session's state machine, step by step, against answers written by hand from the contract."""
+
+import json
+
+import pytest
+from client_script import SESSION, answer, drive, lost, problem
+from specshield import errors
+from specshield.client.models import SessionInfo, build
+from specshield.client.state import SessionState
+
+M, B, END = 0, 1, 2
+LOGITS = [0.0, 0.0, 0.0]
+
+
+def session(initial_pose=(0, 0, 0), **members):
+    return SessionState(
+        build(SessionInfo, {**SESSION, "actions": ["m", "b", "end"], "terminal_actions": [END], **members}),
+        initial_pose,
+    )
+
+
+def decided(t, action, status="pending", **members):
+    body = {
+        "t": t,
+        "mode": "shaped",
+        "distribution": [0.5, 0.25, 0.25],
+        "j_values": [1.0, 0.0, 1.0],
+        "robustness": [0.2, -0.1, None],
+        "action": action,
+        "action_name": ["m", "b", "end"][action],
+        "completion_action": B if status == "pending" else None,
+        "spec_status": status,
+        "feasible_mass": 0.7,
+        "kl": 0.1,
+        "reason": None,
+        "finished": False,
+        "next_poses": [[0.2, 0, 0], [-0.2, 0, 0], [0, 0, 0]],
+        "residual": None,
+        "witness": [M, M],
+        **members,
+    }
+    return answer(body)
+
+
+def step(state, x, *outcomes, logits=LOGITS, main_task_done=None, signals=None, witnesses=False):
+    """(decision or error, the bodies sent)"""
+    result, sent, _ = drive(state._step((x, 0, 0), logits, main_task_done, signals, witnesses), *outcomes)
+    return result, [json.loads(request.body) for request in sent]
+
+
+def sent_poses(body):
+    return body["t"], [pose[0] for pose in body["poses"]]
+
+
+def test_steps_count_t_and_send_the_newest_pose():
+    state = session()
+    decision, (first,) = step(state, 0, decided(0, M, residual={"translation": 0.01, "rotation": 0.0}))
+    assert first == {
+        "t": 0,
+        "poses": [[0, 0, 0]],
+        "logits": LOGITS,
+        "main_task_done": False,
+        "witnesses": False,
+    }
+    assert (decision.execute, decision.next_poses[M], decision.witness) == (M, (0.2, 0, 0), (M, M))
+    assert decision.residual.translation == 0.01
+    assert decision.witnesses is None
+    _, (second,) = step(
+        state, 0.2, decided(1, M, witnesses=[[M], None, [B]]), signals={"soc": 1}, witnesses=True
+    )
+    assert sent_poses(second) == (1, [0.2])
+    assert (second["signals"], second["witnesses"]) == ({"soc": 1.0}, True)
+    assert state.t == 2
+
+
+def test_a_gap_is_filled_from_where_the_server_stands():
+    state = session()
+    for t in range(3):
+        step(state, t, decided(t, M))
+    _, bodies = step(state, 3, problem(409, "history-gap", expected_t=1), decided(3, M))
+    assert [sent_poses(body) for body in bodies] == [(3, [3]), (3, [1, 2, 3])]
+
+
+def test_a_gap_is_filled_once_only_and_not_where_poses_are_lacking():
+    state = session()
+    step(state, 0, decided(0, M))
+    gap = problem(409, "history-gap", expected_t=0)
+    error, bodies = step(state, 1, gap, gap)
+    assert type(error) is errors.HistoryGap
+    assert len(bodies) == 2
+    resumed = session(None, next_t=5)
+    error, bodies = step(resumed, 5, problem(409, "history-gap", expected_t=3))
+    assert type(error) is errors.HistoryGap
+    assert error.details["expected_t"] == 3
+    assert len(bodies) == 1
+
+
+def test_a_session_read_back_goes_on_where_the_server_stands():
+    state = session(None, next_t=5)
+    _, (body,) = step(state, 9, decided(5, M))
+    assert sent_poses(body) == (5, [9])
+
+
+def test_a_failed_step_changes_nothing_and_recorded_poses_follow_with_the_next():
+    state = session()
+    step(state, 0, decided(0, M))
+    before = dict(vars(state))
+    error, bodies = step(state, 1, *[lost(0.0)] * 5, main_task_done=True)
+    assert type(error) is errors.TransportTimeout
+    assert bodies == [bodies[0]] * 5
+    assert vars(state) == before
+    state.record((1, 0, 0))
+    state.record((2, 0, 0))
+    _, (body,) = step(state, 3, decided(3, M))
+    assert sent_poses(body) == (3, [1, 2, 3])
+
+
+@pytest.mark.parametrize("bad", [{"logits": [float("nan")]}, {"signals": {"soc": float("inf")}}])
+def test_bad_input_is_refused_before_anything_is_sent(bad):
+    state = session()
+    error, bodies = step(state, 0, **bad)
+    assert isinstance(error, errors.InputError)
+    assert bodies == []
+    assert state.t == 0
+
+
+def test_end_drawn_while_pending_runs_the_completion_and_is_remembered():
+    state = session()
+    decision, _ = step(state, 0, decided(0, END))
+    assert (decision.action, decision.execute) == (END, B)
+    assert state.main_task_done
+    assert not state.finished
+    decision, (body,) = step(state, 1, decided(1, M, mode="completion"), logits=None)
+    assert (body["main_task_done"], body["logits"]) == (True, None)
+    assert decision.execute == M
+    decision, (body,) = step(state, 2, decided(2, M, "satisfied", mode="prior", finished=True))
+    assert body["main_task_done"]
+    assert decision.execute == END, "all is done: nothing but stopping is left"
+    assert state.finished
+
+
+@pytest.mark.parametrize("status", ["satisfied", "violated"])
+def test_end_drawn_once_the_spec_is_settled_finishes(status):
+    state = session()
+    decision, _ = step(state, 0, decided(0, END, status))
+    assert decision.execute == END
+    assert state.main_task_done
+    assert state.finished
+
+
+def test_the_main_task_goes_on_after_the_spec_is_settled():
+    state = session()
+    decision, _ = step(state, 0, decided(0, M, "satisfied"))
+    assert decision.execute == M
+    assert not state.finished
+    assert state.spec_status == "satisfied"
+
+
+def test_a_caller_that_draws_itself_is_not_bound_by_the_drawn_end():
+    state = session()
+    step(state, 0, decided(0, END), main_task_done=False)
+    assert not state.main_task_done
+    step(state, 1, decided(1, END, "satisfied"), main_task_done=False)
+    assert not state.finished
+    _, (body,) = step(state, 2, decided(2, M, "satisfied", finished=True), main_task_done=True)
+    assert body["main_task_done"]
+    assert state.finished
+
+
+def test_terminal_actions_are_those_the_server_names():
+    state = session(terminal_actions=[B])
+    decision, _ = step(state, 0, decided(0, B, completion_action=M))
+    assert decision.execute == M
+    decision, _ = step(session(terminal_actions=[]), 0, decided(0, END))
+    assert decision.execute == END
+
+
+def close(state, pose, *outcomes, tries=5):
+    result, sent, _ = drive(state._close(pose, tries), *outcomes)
+    return result, [json.loads(request.body) for request in sent]
+
+
+def test_the_trajectory_is_typed():
+    items = [
+        {"t": 0, "pose": [0, 0, 0], "signals": {}, "decision": {"t": 0, "mode": "shaped"}},
+        {"t": 1, "pose": [1, 0, 0], "signals": {"soc": 0.5}, "decision": None},
+    ]
+    trajectory, _, _ = drive(session()._trajectory(), answer({"items": items, "next": None}))
+    assert [item.pose[0] for item in trajectory] == [0, 1]
+    assert (trajectory[0].decision["mode"], trajectory[1].decision) == ("shaped", None)
+
+
+VERDICT = answer({"id": "s", "spec_status": "violated", "robustness_bounds": [None, -0.5]})
+
+
+def test_closing_sends_the_last_poses_and_brings_the_verdict():
+    state = session()
+    step(state, 0, decided(0, M))
+    verdict, (body,) = close(state, (1, 0, 0), VERDICT)
+    assert body == {"t": 1, "poses": [[1, 0, 0]]}
+    assert (verdict.spec_status, verdict.robustness_bounds) == ("violated", (None, -0.5))
+    assert (state.closed, state.finished, state.spec_status) == (True, True, "violated")
+
+
+def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded():
+    state = session()
+    assert close(state, None, VERDICT)[1] == [{"t": 0, "poses": [[0, 0, 0]]}]
+    state = session()
+    step(state, 0, decided(0, M))
+    assert close(state, None, VERDICT)[1] == [{"t": 0, "poses": [[0, 0, 0]]}]
+    state.record((1, 0, 0))
+    state.record((2, 0, 0))
+    bodies = close(state, None, problem(409, "history-gap", expected_t=0), VERDICT)[1]
+    assert [sent_poses(body) for body in bodies] == [(2, [1, 2]), (2, [0, 1, 2])]
+    assert close(session(None, next_t=5), None, VERDICT)[1] == [{}]

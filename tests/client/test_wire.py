@@ -1,0 +1,152 @@
+import array
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from specshield import errors
+from specshield.client import wire
+from specshield.client.wire import Reply
+
+
+def reply(status, document=None, content_type="application/problem+json", **headers):
+    content = b"" if document is None else json.dumps(document).encode()
+    return Reply(status, {"content-type": content_type, **headers}, content, 0.01, 0.5)
+
+
+@pytest.mark.parametrize("cls", list(errors.tree()))
+def test_every_problem_type_becomes_its_class_with_all_the_document_says(cls):
+    document = {
+        "type": cls.type,
+        "title": "A title",
+        "status": 422,
+        "detail": "what was wrong",
+        "path": "spec.formula",
+        "got": "G[5,2] a",
+        "expected": "a window [a,b] with a <= b",
+        "position": 1,
+        "expected_t": 4,
+    }
+    error = wire.error_of(reply(422, document))
+    assert type(error) is cls
+    assert (str(error), error.message) == ("what was wrong", "what was wrong")
+    assert (error.path, error.got, error.expected) == (
+        "spec.formula",
+        "G[5,2] a",
+        "a window [a,b] with a <= b",
+    )
+    assert error.details == {"status": 422, "position": 1, "expected_t": 4}
+
+
+@pytest.mark.parametrize(
+    ("status", "cls"),
+    [
+        (400, errors.InputError),
+        (401, errors.Unauthorized),
+        (404, errors.NotFound),
+        (409, errors.Conflict),
+        (413, errors.BodyTooLarge),
+        (302, errors.ServerError),
+        (500, errors.ServerError),
+        (502, errors.TransportError),
+        (503, errors.TransportError),
+        (504, errors.TransportTimeout),
+    ],
+)
+def test_an_answer_without_a_document_is_judged_by_its_status(status, cls):
+    error = wire.error_of(reply(status, {"type": "not-found"}, "text/html"))
+    assert type(error) is cls
+    assert str(status) in error.message
+    assert error.details == {"status": status}
+
+
+def test_an_unknown_type_is_kept_and_falls_back_to_the_status():
+    error = wire.error_of(reply(409, {"type": "from-the-future", "detail": "no"}))
+    assert type(error) is errors.Conflict
+    assert error.details == {"status": 409, "type": "from-the-future"}
+
+
+@pytest.mark.parametrize("content", [b"<html>", b"[1]", b"\xff", b""])
+def test_a_success_that_is_no_json_object_is_a_server_error(content):
+    with pytest.raises(errors.ServerError, match="specshield"):
+        wire.json_object(Reply(200, {}, content, 0.0, 0.5))
+
+
+@pytest.mark.parametrize(
+    "logits",
+    [
+        [0.1, -math.inf, 2],
+        (0.1, None, 2),
+        np.array([0.1, -np.inf, 2.0]),
+        [np.float64(0.1), None, np.int64(2)],
+        array.array("d", [0.1, -math.inf, 2.0]),
+        (value for value in [0.1, None, 2]),
+    ],
+)
+def test_logits_of_any_sequence_go_out_as_float64_and_minus_infinity_as_null(logits):
+    assert json.loads(wire.encode({"logits": wire.logit_values(logits)})) == {"logits": [0.1, None, 2.0]}
+
+
+def test_float32_logits_keep_their_value():
+    (value,) = wire.logit_values(np.array([0.1], dtype=np.float32))
+    assert value == float(np.float32(0.1))
+
+
+@pytest.mark.parametrize("bad", [[0.0, math.nan], [0.0, math.inf], [0.0, "x"], [[0.0, 1.0]], 3.0])
+def test_bad_logits_are_refused_before_anything_is_sent(bad):
+    with pytest.raises(errors.LogitsError) as caught:
+        wire.logit_values(bad)
+    assert caught.value.path.startswith("logits")
+    assert caught.value.expected
+
+
+@pytest.mark.parametrize("bad", [(0, 0), (0, 0, 0, 0), (0, 0, math.nan), (0, 0, None), (0, 0, "north"), None])
+def test_bad_poses_are_refused(bad):
+    with pytest.raises(errors.PoseError):
+        wire.pose_values(bad)
+
+
+def test_poses_of_any_sequence():
+    assert (
+        wire.pose_values(np.array([1.5, -2.0, 0.25]))
+        == wire.pose_values([1.5, -2, 0.25])
+        == (1.5, -2.0, 0.25)
+    )
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, None, "low"])
+def test_bad_signals_name_the_signal(bad):
+    with pytest.raises(errors.SampleError) as caught:
+        wire.signal_values({"battery": bad})
+    assert caught.value.path == "signals.battery"
+
+
+def test_bodies_take_arrays_and_refuse_what_json_cannot_hold():
+    body = json.loads(
+        wire.encode({"data": np.array([0, 100, -1], dtype=np.int8), "centre": (np.float64(0.5), 1)})
+    )
+    assert body == {"data": [0, 100, -1], "centre": [0.5, 1]}
+    with pytest.raises(errors.InputError):
+        wire.encode({"x": math.nan})
+    with pytest.raises(errors.InputError):
+        wire.encode({"x": object()})
+
+
+def test_content_is_bytes_a_text_or_a_file(tmp_path: Path):
+    (tmp_path / "map.yaml").write_text("resolution: 0.05")
+    assert (
+        wire.content(tmp_path / "map.yaml")
+        == wire.content("resolution: 0.05")
+        == wire.content(b"resolution: 0.05")
+    )
+
+
+def test_an_id_cannot_leave_its_place_in_the_path():
+    assert wire.path("maps", "../policies?x=1", "image.png") == "/v1/maps/..%2Fpolicies%3Fx%3D1/image.png"
+
+
+def test_server_timing():
+    timed = reply(200, {}, **{"server-timing": 'total;dur=2.5, rollout;desc="J";dur=1.25, miss'})
+    assert wire.timings(timed) == {"total": 2.5, "rollout": 1.25}
+    assert wire.timings(reply(200, {})) == {}
