@@ -42,7 +42,7 @@ class Map:
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy pi_phi: `progress` in [0, 1], `eta_s` an estimate of the time left [s], `error` why it failed."""
+    """A policy pi_phi: `progress` in [0, 1], `eta_s` the estimated time left [s], `error` why it failed."""
 
     id: str
     status: Literal["queued", "training", "ready", "failed"]
