@@ -1,0 +1,160 @@
+"""A trained pi_phi: its card, its weights, and what it proposes. Weights are safetensors; nothing is unpickled."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from specshield.errors import PolicyError
+from specshield.policy.network import Network, make_network
+from specshield.policy.observation import Sight, make_sight, observation_size
+from specshield.policy.progress import Rules, hold_signals, make_rules, replay
+from specshield.policy.rollout import rollout, rollout_all
+from specshield.robot import Robot, robot_to_json
+from specshield.robot.unicycle import Body, make_body
+from specshield.task import Task
+from specshield.world.regions import region_to_json
+
+Card = dict[str, Any]
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What pi_phi would do: a continuation to the horizon after each first motion.
+
+    motions [M, T - t]: row m begins with motion m; indices into `Robot.motions`. poses [M, T - t, 3]: after each.
+    preferred: the motion pi_phi itself takes at x_t.
+    """
+
+    motions: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    preferred: int
+
+
+class Proposer(Protocol):
+    """A policy as the shield sees it: it proposes, exact simulation certifies."""
+
+    @property
+    def id(self) -> str: ...
+
+    @property
+    def task(self) -> Task: ...
+
+    def propose(self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float) -> Proposal:
+        """history [t + 1, 3] with t < T; signals {name: [t + 1]}; margin: robustness to aim above."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A DQN's greedy policy pi_phi(x, t) = argmax_a Q(x, a, t), with the formula's progress in its observation."""
+
+    task: Task
+    card: Card
+    network: Network
+
+    @property
+    def id(self) -> str:
+        return str(self.card["id"])
+
+    @cached_property
+    def _prepared(self) -> tuple[Body, Rules, Sight]:
+        body, rules = make_body(self.task.robot, self.task.grid), make_rules(self.task)
+        return body, rules, make_sight(self.task, rules, body)
+
+    def propose(self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float) -> Proposal:
+        body, rules, sight = self._prepared
+        rules = hold_signals(rules, self.task, signals)._replace(margin=margin)
+        t, wait = len(history) - 1, wait_motion(self.task.robot)
+        status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
+        replay(rules, history, status, run)
+        motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
+        poses = np.empty((*motions.shape, 3))
+        args = (body, rules, sight, self.network, history[-1], t, status, run)
+        rollout_all(*args, wait, motions, poses)
+        one = np.empty(1, np.int64)
+        rollout(*args, -1, wait, one, np.empty((1, 3)))
+        return Proposal(motions, poses, int(one[0]))
+
+    def weights(self) -> bytes:
+        """The safetensors file."""
+        return save_tensors(self.network._asdict())
+
+
+def wait_motion(robot: Robot) -> int:
+    """The motion that leaves the pose as it is, -1 where the robot cannot stand still."""
+    return robot.motions.index((0.0, 0.0)) if (0.0, 0.0) in robot.motions else -1
+
+
+def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:
+    """The hash of task, method, options and seed, as hex."""
+    content = json.dumps({"task": task_hash, "method": method, "options": options, "seed": seed}, sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def make_card(
+    task: Task,
+    method: str,
+    options: Mapping[str, Any],
+    seed: int,
+    metrics: Mapping[str, Any],
+    spec: Mapping[str, Any] | None = None,
+) -> Card:
+    """What is told of a policy beside its weights. `metrics` holds measured figures and the wall time.
+
+    spec: the spec as it was given; by default the canonical formula and every region it uses, rooms included.
+    """
+    return {
+        "format": FORMAT,
+        "id": policy_id(task.content_hash, method, options, seed),
+        "method": method,
+        "map_id": task.grid.content_hash,
+        "robot": robot_to_json(task.robot),
+        "spec": dict(spec) if spec else task_spec(task),
+        "task_hash": task.content_hash,
+        "horizon": task.horizon,
+        "options": dict(options),
+        "seed": seed,
+        "metrics": dict(metrics),
+    }
+
+
+def task_spec(task: Task) -> dict[str, Any]:
+    """The task's rule as a self-contained spec."""
+    spec: dict[str, Any] = {
+        "formula": str(task.formula),
+        "regions": {name: region_to_json(region) for name, region in task.regions.items()},
+    }
+    return spec | ({"signals": dict(task.signals)} if task.signals else {})
+
+
+def load_policy(weights: bytes, card: Card, task: Task) -> Policy:
+    """A policy from its two files, for the task it was made for.
+
+    Raises PolicyError where the card names another task, or the weights are not a network that fits it.
+    """
+    if card.get("task_hash") != task.content_hash:
+        raise PolicyError(
+            "the policy was made for another task", path="card.task_hash", got=card.get("task_hash"),
+            expected=task.content_hash,
+        )  # fmt: skip
+    if card.get("method") != "dqn":
+        raise PolicyError("unknown method", path="card.method", got=card.get("method"), expected="'dqn'")
+    try:
+        tensors = load_tensors(weights)
+    except Exception as error:  # the parser raises its own types for hostile bytes
+        raise PolicyError(
+            f"not a safetensors file: {error}", path="weights", got=f"{len(weights)} bytes", expected="safetensors"
+        ) from error
+    body, rules = make_body(task.robot, task.grid), make_rules(task)
+    return Policy(task, card, make_network(tensors, observation_size(rules, body), len(body.translate)))

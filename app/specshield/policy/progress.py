@@ -1,0 +1,168 @@
+"""The formula's progress: which obligations are settled, which are broken, as compiled code steps along a trajectory.
+
+pi_phi sees time and pose, but phi depends on history (a charger already visited): progress is what of the history
+still matters to a formula of the paper's fragment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from specshield.stl import Obligation, obligations
+from specshield.stl.program import STACK_SIZE, compile_predicate, evaluate_packed, pack
+from specshield.task import POSE_NAMES, Task
+from specshield.world.regions import pack_regions, region_distance
+
+EVENTUALLY, ALWAYS, EVENTUALLY_ALWAYS = 0, 1, 2
+KINDS = {"eventually": EVENTUALLY, "always": ALWAYS, "eventually_always": EVENTUALLY_ALWAYS}
+PENDING, SETTLED, BROKEN = 0, 1, 2
+MAX_OBLIGATIONS = 8
+STACK = STACK_SIZE
+
+
+class Rules(NamedTuple):
+    """A formula's K obligations as flat arrays. Predicates read `values`: x, y, theta, regions, signals."""
+
+    kind: NDArray[np.int64]  # [K]
+    a: NDArray[np.int64]  # [K] windows in absolute steps, closed
+    b: NDArray[np.int64]
+    c1: NDArray[np.int64]
+    c2: NDArray[np.int64]
+    last: NDArray[np.int64]  # [K] the step by which the obligation is decided
+    ops: NDArray[np.int64]  # packed predicate programs
+    args: NDArray[np.float64]
+    starts: NDArray[np.int64]  # [K + 1]
+    region_starts: NDArray[np.int64]
+    region_kinds: NDArray[np.int64]
+    region_offsets: NDArray[np.int64]
+    region_data: NDArray[np.float64]
+    signals: NDArray[np.float64]  # [n] the value each signal holds
+    margin: float  # an obligation holds where its predicate's robustness is above this
+
+
+def make_rules(task: Task, margin: float = 0.0) -> Rules:
+    """Compiles the task's formula. Raises FragmentError where it lies outside the paper's fragment."""
+    parts = obligations(task.formula)
+    names = [*POSE_NAMES, *task.regions, *task.signals]
+    slots = {name: i for i, name in enumerate(names)}
+    ops, args, starts = pack([compile_predicate(part.predicate, slots) for part in parts])
+    regions = pack_regions(list(task.regions.values()))
+
+    def column(values: list[int]) -> NDArray[np.int64]:
+        return np.array(values, dtype=np.int64)
+
+    return Rules(
+        kind=column([KINDS[p.kind] for p in parts]),
+        a=column([p.a for p in parts]),
+        b=column([p.b for p in parts]),
+        c1=column([p.c1 for p in parts]),
+        c2=column([p.c2 for p in parts]),
+        last=column([last_step(p) for p in parts]),
+        ops=ops,
+        args=args,
+        starts=starts,
+        region_starts=regions.starts,
+        region_kinds=regions.kinds,
+        region_offsets=regions.offsets,
+        region_data=regions.data,
+        signals=np.array([task.signals[name] for name in task.signals], dtype=np.float64),
+        margin=margin,
+    )
+
+
+def last_step(part: Obligation) -> int:
+    """The last step an obligation looks at: its own horizon."""
+    return part.c1 + part.b if part.kind == "eventually_always" else part.b
+
+
+def hold_signals(rules: Rules, task: Task, signals: Mapping[str, NDArray[np.float64]]) -> Rules:
+    """The same rules with each signal at its latest value. signals {name: [n]}."""
+    if not task.signals:
+        return rules
+    latest = [signals[n][-1] if n in signals and len(signals[n]) else task.signals[n] for n in task.signals]
+    return rules._replace(signals=np.array(latest, dtype=np.float64))
+
+
+@njit(cache=True, nogil=True)
+def value_count(rules: Rules) -> int:
+    return 3 + rules.region_starts.shape[0] - 1 + rules.signals.shape[0]
+
+
+@njit(cache=True, nogil=True)
+def read_values(rules: Rules, x: float, y: float, theta: float, values: NDArray[np.float64]) -> None:
+    """What the predicates read at a pose, into `values`, shape (value_count,)."""
+    values[0], values[1], values[2] = x, y, theta
+    n = rules.region_starts.shape[0] - 1
+    for i in range(n):
+        values[3 + i] = region_distance(
+            i, rules.region_starts, rules.region_kinds, rules.region_offsets, rules.region_data, x, y
+        )
+    for i in range(rules.signals.shape[0]):
+        values[3 + n + i] = rules.signals[i]
+
+
+@njit(cache=True, nogil=True)
+def read_predicates(
+    rules: Rules,
+    x: float,
+    y: float,
+    theta: float,
+    values: NDArray[np.float64],
+    stack: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """The robustness of each obligation's predicate at a pose, into `out`, shape (K,)."""
+    read_values(rules, x, y, theta, values)
+    for k in range(rules.kind.shape[0]):
+        out[k] = evaluate_packed(k, rules.ops, rules.args, rules.starts, values, stack)
+
+
+@njit(cache=True, nogil=True)
+def advance(
+    rules: Rules, t: int, predicates: NDArray[np.float64], status: NDArray[np.int8], run: NDArray[np.int64]
+) -> None:
+    """Takes the state at step t into the progress, in place.
+
+    predicates (K,) at x_t; status (K,): PENDING, SETTLED or BROKEN; run (K,): how many steps, this one included,
+    an eventually-always predicate has held without a break since its earliest window could begin.
+    """
+    for k in range(rules.kind.shape[0]):
+        if status[k] != PENDING:
+            continue
+        holds = predicates[k] > rules.margin
+        if rules.kind[k] == EVENTUALLY:
+            if holds and rules.a[k] <= t <= rules.b[k]:
+                status[k] = SETTLED
+            elif t >= rules.b[k]:
+                status[k] = BROKEN
+        elif rules.kind[k] == ALWAYS:
+            if not holds and rules.a[k] <= t <= rules.b[k]:
+                status[k] = BROKEN
+            elif t >= rules.b[k]:
+                status[k] = SETTLED
+        else:
+            # F[a,c1] G[c2,b]: the predicate holds on [s + c2, s + b] for some witness time s in [a, c1].
+            run[k] = run[k] + 1 if holds and t >= rules.a[k] + rules.c2[k] else 0
+            if run[k] > rules.b[k] - rules.c2[k] and t >= rules.a[k] + rules.b[k]:
+                status[k] = SETTLED
+            elif t + 1 - run[k] > rules.c1[k] + rules.c2[k]:
+                status[k] = BROKEN
+
+
+@njit(cache=True, nogil=True)
+def replay(
+    rules: Rules, poses: NDArray[np.float64], status: NDArray[np.int8], run: NDArray[np.int64]
+) -> None:
+    """The progress after the states x_0..x_t. poses (t + 1, 3); status, run (K,) are overwritten."""
+    values, stack = np.empty(value_count(rules)), np.empty(STACK)
+    predicates = np.empty(rules.kind.shape[0])
+    status[:] = PENDING
+    run[:] = 0
+    for t in range(poses.shape[0]):
+        read_predicates(rules, poses[t, 0], poses[t, 1], poses[t, 2], values, stack, predicates)
+        advance(rules, t, predicates, status, run)

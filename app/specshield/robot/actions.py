@@ -1,0 +1,169 @@
+"""Action sets: what a robot can do in one step, and the shape it does it with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.errors import RobotError
+
+MAX_ACTIONS = 256
+MAX_TRANSLATE = 10.0  # [m] a step
+
+
+@dataclass(frozen=True)
+class Action:
+    """One action: move `translate` [m] along the heading, then turn `rotate` [rad] counter-clockwise.
+
+    A `terminal` action ends the main task: it moves nothing and consumes no step.
+    """
+
+    name: str
+    translate: float = 0.0
+    rotate: float = 0.0
+    terminal: bool = False
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A unicycle with a circular footprint.
+
+    radius: of the footprint [m]. offset: its centre in the robot's frame, x ahead, y to the left [m].
+    on_contact: `stay` (a move that would touch leaves the pose as it was) or `stop` (it stops at contact).
+    """
+
+    name: str
+    radius: float
+    offset: tuple[float, float]
+    on_contact: str
+    actions: tuple[Action, ...]
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        return tuple(action.name for action in self.actions)
+
+    @cached_property
+    def terminal(self) -> NDArray[np.bool_]:
+        """Shape (A,)."""
+        return np.array([action.terminal for action in self.actions])
+
+    @cached_property
+    def motions(self) -> tuple[tuple[float, float], ...]:
+        """The distinct (translate, rotate) pairs of the non-terminal actions, in order of first use."""
+        return tuple(dict.fromkeys((a.translate, a.rotate) for a in self.actions if not a.terminal))
+
+    @cached_property
+    def motion_of(self) -> NDArray[np.int64]:
+        """Index into `motions` of each action, -1 for a terminal one. Shape (A,)."""
+        index = {motion: i for i, motion in enumerate(self.motions)}
+        return np.array([-1 if a.terminal else index[a.translate, a.rotate] for a in self.actions])
+
+    @cached_property
+    def representative(self) -> NDArray[np.int64]:
+        """The lowest action index of each motion. Shape (M,)."""
+        return np.array([int(np.argmax(self.motion_of == i)) for i in range(len(self.motions))])
+
+
+def _stretch() -> Robot:
+    turn, nudge = math.radians(30), math.radians(6)
+    moves = {
+        "m": (0.2, 0.0),
+        "r": (0.0, -turn),
+        "l": (0.0, turn),
+        "b": (-0.2, 0.0),
+        "ls": (0.0, nudge),
+        "rs": (0.0, -nudge),
+    }
+    tokens = "m r l b end sub_done ls rs p zm zp yp ym wp wm yms zms zps yps d".split()
+    actions = tuple(Action(name, *moves.get(name, (0.0, 0.0)), terminal=name == "end") for name in tokens)
+    return Robot("stretch", radius=0.1855, offset=(-0.109, 0.0), on_contact="stop", actions=actions)
+
+
+STRETCH = _stretch()
+"""The 20 tokens of SPOC, PoliFormer and FLaRe on a Hello Robot Stretch (DESIGN.md, section 4)."""
+
+PRESETS = {"stretch": STRETCH}
+
+
+def robot_from_json(spec: Any) -> Robot:
+    """A preset's name, or {"footprint": {"radius", "offset"}, "on_contact", "actions": [...]}.
+
+    Raises RobotError with the path of the field at fault.
+    """
+    if isinstance(spec, str):
+        if spec not in PRESETS:
+            raise RobotError(f"unknown robot {spec!r}", got=spec, expected=f"one of {sorted(PRESETS)}, or an object")
+        return PRESETS[spec]
+    _keys(spec, "", {"footprint", "actions"}, {"on_contact"})
+    footprint = spec["footprint"]
+    _keys(footprint, "footprint", {"radius"}, {"offset"})
+    radius = _number(footprint["radius"], "footprint.radius", low=0.0, high=5.0)
+    offset = footprint.get("offset", [0.0, 0.0])
+    if not isinstance(offset, (list, tuple)) or len(offset) != 2:
+        raise RobotError("an offset is two numbers", path="footprint.offset", got=offset, expected="[x, y] in metres")
+    ox, oy = (_number(v, f"footprint.offset[{i}]", low=-5.0, high=5.0) for i, v in enumerate(offset))
+    on_contact = spec.get("on_contact", "stay")
+    if on_contact not in ("stay", "stop"):
+        raise RobotError("unknown contact rule", path="on_contact", got=on_contact, expected="'stay' or 'stop'")
+    items = spec["actions"]
+    if not isinstance(items, list) or not 1 <= len(items) <= MAX_ACTIONS:
+        raise RobotError(
+            "a robot has a list of actions", path="actions", got=type(items).__name__, expected=f"1 to {MAX_ACTIONS} actions"
+        )
+    actions = tuple(_action(item, f"actions[{i}]") for i, item in enumerate(items))
+    names = [action.name for action in actions]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise RobotError("two actions have one name", path=f"actions[{i}].name", got=name, expected="unique names")
+    if all(action.terminal for action in actions):
+        raise RobotError("every action is terminal", path="actions", got=names, expected="at least one that is not")
+    return Robot("custom", radius, (ox, oy), on_contact, actions)
+
+
+def robot_to_json(robot: Robot) -> str | dict[str, Any]:
+    """What `robot_from_json` reads back to an equal robot."""
+    if PRESETS.get(robot.name) == robot:
+        return robot.name
+    actions: list[dict[str, Any]] = [
+        {"name": a.name, "terminal": True}
+        if a.terminal
+        else {"name": a.name, "translate": a.translate, "rotate": a.rotate}
+        for a in robot.actions
+    ]
+    footprint = {"radius": robot.radius, "offset": list(robot.offset)}
+    return {"footprint": footprint, "on_contact": robot.on_contact, "actions": actions}
+
+
+def _action(item: Any, path: str) -> Action:
+    _keys(item, path, {"name"}, {"translate", "rotate", "terminal"})
+    name = item["name"]
+    if not isinstance(name, str) or not 1 <= len(name) <= 64:
+        raise RobotError("an action needs a name", path=f"{path}.name", got=name, expected="1 to 64 characters")
+    terminal = item.get("terminal", False)
+    if not isinstance(terminal, bool):
+        raise RobotError("terminal is true or false", path=f"{path}.terminal", got=terminal, expected="a boolean")
+    translate = _number(item.get("translate", 0.0), f"{path}.translate", low=-MAX_TRANSLATE, high=MAX_TRANSLATE)
+    rotate = _number(item.get("rotate", 0.0), f"{path}.rotate", low=-2 * math.pi, high=2 * math.pi)
+    if terminal and (translate or rotate):
+        raise RobotError("a terminal action moves nothing", path=path, got=item, expected="no translate, no rotate")
+    return Action(name, translate, rotate, terminal)
+
+
+def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
+    if not isinstance(item, dict):
+        raise RobotError("not an object", path=path or None, got=type(item).__name__, expected=f"an object with {sorted(required)}")
+    missing, unknown = required - item.keys(), item.keys() - required - optional
+    if missing or unknown:
+        said = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(map(str, unknown))}"
+        raise RobotError(said, path=path or None, got=sorted(map(str, item)), expected=f"{sorted(required | optional)}")
+
+
+def _number(value: Any, path: str, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        raise RobotError("not a number in range", path=path, got=value, expected=f"a number from {low:g} to {high:g}")
+    return float(value)

@@ -1,0 +1,1 @@
+"""The shield: feasibility of actions, the shaped distribution, and Algorithm 1."""

@@ -1,0 +1,138 @@
+"""What goes into a decision and what comes out of one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.errors import InputError, PolicyError, Unsupported
+from specshield.policy.policy import Proposer
+from specshield.robot.unicycle import Body, make_body
+from specshield.stl import Verdict
+from specshield.task import Task
+
+Floats = NDArray[np.float64]
+Mode = Literal["prior", "shaped", "completion", "fallback", "violated"]
+Reason = Literal["infeasible", "zero_prior_mass", "margin_unattainable"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """A session's settings. Raises InputError or Unsupported with the field's path.
+
+    threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho > margin
+    [m]. max_steps: None is max(600, T + 1). seed: of the drawn actions.
+    """
+
+    threshold: float = 1.0
+    margin: float = 0.0
+    evaluation: str = "feasibility"
+    shaping: str = "projection"
+    max_steps: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.evaluation not in ("feasibility", "robustness"):
+            raise InputError(
+                "unknown evaluation", path="evaluation", got=self.evaluation, expected="'feasibility' or 'robustness'"
+            )
+        if self.shaping == "lookahead":
+            raise Unsupported(
+                "look-ahead shaping is not there yet", path="shaping", got=self.shaping, expected="'projection'"
+            )
+        if self.shaping != "projection":
+            raise InputError("unknown shaping", path="shaping", got=self.shaping, expected="'projection'")
+        binary = self.evaluation == "feasibility"
+        if not math.isfinite(self.threshold) or (binary and not 0.0 < self.threshold <= 1.0):
+            raise InputError(
+                "the threshold is out of range", path="threshold", got=self.threshold,
+                expected="above 0 and at most 1" if binary else "a finite number of metres",
+            )  # fmt: skip
+        if not (math.isfinite(self.margin) and self.margin >= 0.0):
+            raise InputError("the margin is out of range", path="margin", got=self.margin, expected="0 or more metres")
+
+
+@dataclass(frozen=True)
+class Shield:
+    """A task, the policies that certify it and a session's settings, prepared once."""
+
+    task: Task
+    policies: tuple[Proposer, ...]
+    config: Config
+    body: Body = field(repr=False)
+
+    @property
+    def max_steps(self) -> int:
+        return self.config.max_steps or max(600, self.task.horizon + 1)
+
+
+def make_shield(policies: Sequence[Proposer], config: Config | None = None) -> Shield:
+    """A shield for the task that the policies share. Raises PolicyError where they were made for different tasks."""
+    if not policies:
+        raise PolicyError("a shield needs a policy", path="policy_ids", got=[], expected="at least one policy")
+    task = policies[0].task
+    for i, policy in enumerate(policies):
+        if policy.task.content_hash != task.content_hash:
+            raise PolicyError(
+                "the policies were made for different tasks", path=f"policy_ids[{i}]",
+                got=policy.task.content_hash, expected=f"task {task.content_hash}, as policy_ids[0]",
+            )  # fmt: skip
+    return Shield(task, tuple(policies), config or Config(), make_body(task.robot, task.grid))
+
+
+@dataclass(frozen=True)
+class Carry:
+    """What one decision hands to the next: for each motion the pose it leads to and its certified continuation.
+
+    next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it, None where it is not certified.
+    """
+
+    t: int
+    next_poses: Floats
+    witnesses: tuple[bytes | None, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        witnesses = [None if w is None else w.hex() for w in self.witnesses]
+        return {"t": self.t, "next_poses": self.next_poses.tolist(), "witnesses": witnesses}
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Carry:
+        witnesses = tuple(None if w is None else bytes.fromhex(w) for w in value["witnesses"])
+        return Carry(value["t"], np.array(value["next_poses"], dtype=np.float64).reshape(-1, 3), witnesses)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The answer to one step; A actions. The fields are those of the HTTP contract (DESIGN.md, section 3).
+
+    distribution [A]: pi*. j_values, robustness: one an action, None where nothing was evaluated; robustness is rho of
+    the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t), kl [nats]: of the answer
+    from the prior, None where it leaves the prior's support or no logits were sent. next_poses [A, 3].
+    residual: (m, rad) between x_t and the nearest pose the last decision foresaw, None where there was none.
+    witness: the action indices that follow `action`; witnesses: the same for every action.
+    """
+
+    t: int
+    mode: Mode
+    distribution: Floats
+    j_values: tuple[float | None, ...]
+    robustness: tuple[float | None, ...]
+    action: int
+    action_name: str
+    completion_action: int | None
+    spec_status: Verdict
+    feasible_mass: float | None
+    kl: float | None
+    reason: Reason | None
+    finished: bool
+    next_poses: Floats
+    residual: tuple[float, float] | None
+    in_collision: bool
+    witness: tuple[int, ...] | None
+    witnesses: tuple[tuple[int, ...] | None, ...]
+    carry: Carry

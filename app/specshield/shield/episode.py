@@ -1,0 +1,321 @@
+"""Algorithm 1 as a pure function: history and logits in, a decision out. It keeps no state of its own.
+
+The robot's history, and what the last decision handed on (its `Carry`), decide everything; so a decision can be made
+anywhere, and made again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from specshield.errors import InfeasibleStart, LogitsError, PoseError
+from specshield.robot.unicycle import in_collision, successors
+from specshield.shield import shaping
+from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
+from specshield.shield.feasibility import Best, Futures, best_of, futures
+from specshield.shield.residual import residuals
+from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
+
+__all__ = ["Carry", "Config", "Decision", "Shield", "close", "decide", "make_shield", "start"]
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Signals = Mapping[str, Floats]
+SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
+
+
+def start(shield: Shield, pose: Sequence[float]) -> None:
+    """Checks that an episode can begin at `pose` (x, y, theta): some first action has a satisfying future.
+
+    Raises PoseError for a pose that is not finite, outside the map or in collision, else InfeasibleStart.
+    """
+    grid = shield.task.grid
+    if not all(math.isfinite(v) for v in pose):
+        raise PoseError("a pose is finite", path="initial_pose", got=str(list(pose)), expected="[x, y, theta]")
+    u, v = grid.to_grid(pose[:2])
+    if not (0.0 <= u < grid.width * grid.resolution and 0.0 <= v < grid.height * grid.resolution):
+        raise PoseError(
+            "the pose is outside the map", path="initial_pose", got=list(pose),
+            expected=f"within {list(grid.bounds)} (xmin, ymin, xmax, ymax)",
+        )  # fmt: skip
+    history = _history([pose])
+    if in_collision(shield.body, *history[0]):
+        raise PoseError(
+            "the footprint touches an obstacle", path="initial_pose", got=list(pose),
+            expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
+        )  # fmt: skip
+    tried = futures(shield.task, shield.body, shield.policies, history, {}, None, shield.config.margin)
+    best = best_of(shield.task, shield.task.formula, tried, {}, len(shield.task.robot.motions))
+    if not np.any(best.robustness > SATISFIED_ABOVE):
+        raise InfeasibleStart(
+            f"no action from here has a future that satisfies the formula: the best robustness is "
+            f"{best.robustness.max():.3f}", path="initial_pose", got=list(pose),
+            expected="a pose from which some action, followed by a policy, satisfies it; or allow_infeasible",
+        )  # fmt: skip
+
+
+def close(shield: Shield, history: ArrayLike, signals: Signals | None = None) -> tuple[Verdict, tuple[float, float]]:
+    """The verdict on an episode's states [t + 1, 3], and the bounds on its robustness."""
+    prefix = shield.task.samples(_history(history), signals)
+    low, high = (float(v) for v in robustness_bounds(shield.task.formula, prefix))
+    return _verdict(low, high), (low, high)
+
+
+def decide(
+    shield: Shield,
+    history: ArrayLike,
+    logits: ArrayLike | None,
+    main_task_done: bool = False,
+    signals: Signals | None = None,
+    carry: Carry | None = None,
+    witnesses: bool = False,
+) -> Decision:
+    """One decision of Algorithm 1, at t = len(history) - 1.
+
+    history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main task is
+    over; signals {name: [t + 1]}; carry: what the decision at t - 1 handed on; witnesses: give every action's.
+    Raises LogitsError for logits that are missing, NaN, +inf, all -inf or of the wrong number.
+    """
+    task, robot = shield.task, shield.task.robot
+    poses = _history(history)
+    t, signals = len(poses) - 1, signals or {}
+    log_prior = _log_prior(shield, logits, main_task_done)
+    nexts = np.empty((len(robot.motions), 3))
+    successors(shield.body, poses[-1], nexts)
+    tail, residual = _follow(carry, poses)
+    prefix = task.samples(poses, signals)
+    low, high = (float(v) for v in robustness_bounds(task.formula, prefix))
+    spec_status = _verdict(low, high)
+    margin = SATISFIED_ABOVE + shield.config.margin
+    kept_margin = low > margin or high <= margin  # nothing the robot still does can change whether it is kept
+
+    answer: _Answer
+    if t >= task.horizon or (spec_status == "satisfied" and kept_margin):
+        judged = None
+        answer = _unmodified(shield, log_prior)
+    else:
+        judged = _judge(shield, poses, signals, tail, prefix, violated=spec_status == "violated")
+        answer = _answer(shield, log_prior, judged, main_task_done)
+        if spec_status == "violated":
+            answer = _Answer(answer.distribution, "violated", answer.reason)
+
+    action = _draw(answer.distribution, shield.config.seed, t)
+    moved = judged.completion if judged is not None and robot.terminal[action] else action
+    certified = _witnesses(shield, judged)
+    return Decision(
+        t=t,
+        mode=answer.mode,
+        distribution=answer.distribution,
+        j_values=_j_values(shield, judged),
+        robustness=_robustness(shield, judged),
+        action=action,
+        action_name=robot.actions[action].name,
+        completion_action=None if judged is None else judged.completion,
+        spec_status=spec_status,
+        feasible_mass=_feasible_mass(shield, log_prior, judged),
+        kl=None if log_prior is None else shaping.divergence(answer.distribution, log_prior),
+        reason=answer.reason,
+        finished=(spec_status != "pending" and main_task_done) or t >= shield.max_steps,
+        next_poses=np.where(robot.terminal[:, None], poses[-1], nexts[robot.motion_of]),
+        residual=residual,
+        in_collision=bool(in_collision(shield.body, *poses[-1])),
+        witness=_as_actions(shield, certified, moved),
+        witnesses=tuple(_as_actions(shield, certified, a) for a in range(len(robot.actions))) if witnesses else (),
+        carry=Carry(t, nexts, certified),
+    )
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """The actions' futures at one step. feasible [A] is S_t; margin_unattainable: the margin asked for was lowered."""
+
+    tried: Futures
+    best: Best
+    feasible_motion: Bools  # [M]
+    feasible: Bools  # [A], false for a terminal action
+    robustness: Floats  # [A], -inf for a terminal action
+    completion: int
+    margin_unattainable: bool
+
+
+@dataclass(frozen=True)
+class _Answer:
+    distribution: Floats
+    mode: Mode
+    reason: Reason | None
+
+
+def _judge(
+    shield: Shield, poses: Floats, signals: Signals, tail: bytes | None, prefix: Mapping[str, Floats], violated: bool
+) -> _Judged:
+    task, robot, asked = shield.task, shield.task.robot, shield.config.margin
+    tried = futures(task, shield.body, shield.policies, poses, signals, tail, asked)
+    whole = best_of(task, task.formula, tried, signals, len(robot.motions))
+    best, feasible, lowered = whole, np.zeros(len(robot.motions), bool), False
+    for formula in residuals(task.formula, prefix) if violated else (task.formula,):
+        best = best_of(task, formula, tried, signals, len(robot.motions)) if violated else whole
+        feasible = best.robustness > SATISFIED_ABOVE + asked
+        highest = best.robustness.max()
+        lowered = not feasible.any() and highest > SATISFIED_ABOVE
+        if lowered:  # the largest margin that can be had
+            feasible = best.robustness >= highest
+        if feasible.any():
+            break
+    first = tried.preferred
+    if tail and feasible[tail[0]]:
+        first = tail[0]
+    elif feasible.any() and not feasible[first]:
+        first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
+    of = robot.motion_of
+    return _Judged(
+        tried=tried,
+        best=best,
+        feasible_motion=feasible,
+        feasible=feasible[of] & ~robot.terminal,
+        robustness=np.where(robot.terminal, -np.inf, whole.robustness[of]),
+        completion=int(robot.representative[first]),
+        margin_unattainable=lowered,
+    )
+
+
+def _answer(shield: Shield, log_prior: Floats | None, judged: _Judged, main_task_done: bool) -> _Answer:
+    """Steps 4 to 6 of a decision. A terminal action keeps exactly its prior mass, and has none in `completion`."""
+    terminal = shield.task.robot.terminal
+    any_feasible = bool(judged.feasible.any())
+    said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
+    certified = np.zeros(len(terminal))
+    certified[judged.completion] = 1.0
+    if main_task_done or log_prior is None:
+        return _Answer(certified, "completion" if any_feasible else "fallback", said if any_feasible else "infeasible")
+    prior = np.exp(log_prior)
+    ending = float(prior[terminal].sum())
+    going_on = np.where(terminal, -np.inf, log_prior)
+    if not np.isfinite(going_on).any():  # the model ends for certain
+        return _Answer(prior, "shaped" if any_feasible else "fallback", None if any_feasible else "infeasible")
+    conditional = shaping.log_softmax(going_on)
+    config = shield.config
+    if config.evaluation == "robustness":
+        shaped = shaping.tilt(conditional, judged.robustness, config.threshold)
+    elif config.threshold == 1.0:
+        shaped = shaping.restrict(conditional, judged.feasible)
+    else:
+        shaped = shaping.soften(conditional, judged.feasible, config.threshold)
+    reason: Reason | None = said
+    if shaped is None:
+        reason = "zero_prior_mass" if any_feasible and config.evaluation == "feasibility" else "infeasible"
+    mode: Mode = "fallback" if shaped is None else "shaped"
+    body = certified if shaped is None else shaped
+    return _Answer(np.where(terminal, prior, (1.0 - ending) * body), mode, reason)
+
+
+def _unmodified(shield: Shield, log_prior: Floats | None) -> _Answer:
+    """The prior; without logits there is nothing left to do: `end`, or else the first action."""
+    if log_prior is not None:
+        return _Answer(np.exp(log_prior), "prior", None)
+    idle = np.zeros(len(shield.task.robot.actions))
+    idle[int(np.argmax(shield.task.robot.terminal))] = 1.0
+    return _Answer(idle, "prior", None)
+
+
+def _verdict(low: float, high: float) -> Verdict:
+    return "satisfied" if low > SATISFIED_ABOVE else "violated" if high <= SATISFIED_ABOVE else "pending"
+
+
+def _history(poses: ArrayLike) -> Floats:
+    """Poses [t + 1, 3] with theta in (-pi, pi], as f has it."""
+    array = np.array(poses, dtype=np.float64)
+    theta = array[:, 2]
+    outside = ~((theta > -math.pi) & (theta <= math.pi))
+    theta[outside] -= 2.0 * math.pi * np.ceil((theta[outside] - math.pi) / (2.0 * math.pi))
+    return array
+
+
+def _log_prior(shield: Shield, logits: ArrayLike | None, main_task_done: bool) -> Floats | None:
+    n = len(shield.task.robot.actions)
+    if logits is None:
+        if main_task_done:
+            return None
+        raise LogitsError(
+            "logits are missing", path="logits", got=None, expected=f"{n} numbers; null once main_task_done is true"
+        )
+    array = np.asarray(logits, dtype=np.float64)
+    if array.shape != (n,):
+        raise LogitsError(
+            "the wrong number of logits", path="logits", got=array.shape[0] if array.ndim == 1 else list(array.shape),
+            expected=f"{n}, one for each of {', '.join(shield.task.robot.action_names)}",
+        )  # fmt: skip
+    wrong = np.flatnonzero(np.isnan(array) | np.isposinf(array))
+    if len(wrong):
+        i = int(wrong[0])
+        raise LogitsError(
+            "a logit is NaN or +infinity", path=f"logits[{i}]", got=str(array[i]), expected="a number, or null for -inf"
+        )
+    if not np.isfinite(array).any():
+        raise LogitsError("every logit is null", path="logits", got="all null", expected="at least one finite logit")
+    return shaping.log_softmax(array)
+
+
+def _follow(carry: Carry | None, poses: Floats) -> tuple[bytes | None, tuple[float, float] | None]:
+    """The tail of the witness that the robot followed to x_t, and how far x_t is from where f leads."""
+    if carry is None or carry.t != len(poses) - 2:
+        return None, None
+    offset = carry.next_poses - poses[-1]
+    turn = np.abs(np.remainder(offset[:, 2] + math.pi, 2.0 * math.pi) - math.pi)
+    move = np.hypot(offset[:, 0], offset[:, 1])
+    gap = move + turn
+    near = np.flatnonzero(gap <= gap.min() + SAME_POSE)  # a blocked move leads where waiting does
+    certified = [m for m in near if carry.witnesses[m] is not None]
+    nearest = int(np.argmin(gap))
+    tail = carry.witnesses[certified[0]] if certified else None
+    return tail or None, (float(move[nearest]), float(turn[nearest]))
+
+
+def _witnesses(shield: Shield, judged: _Judged | None) -> tuple[bytes | None, ...]:
+    """Each motion's certified continuation, as the motions that follow it."""
+    if judged is None:
+        return (None,) * len(shield.task.robot.motions)
+    rows = judged.tried.motions[judged.best.row, 1:].astype(np.uint8)
+    return tuple(rows[m].tobytes() if ok else None for m, ok in enumerate(judged.feasible_motion))
+
+
+def _as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
+    motion = int(shield.task.robot.motion_of[action])
+    found = certified[motion] if motion >= 0 else None
+    return None if found is None else tuple(shield.task.robot.representative[list(found)].tolist())
+
+
+def _j_values(shield: Shield, judged: _Judged | None) -> tuple[float | None, ...]:
+    terminal = shield.task.robot.terminal
+    if judged is None:
+        return (None,) * len(terminal)
+    binary = shield.config.evaluation == "feasibility"
+    values = judged.feasible.astype(np.float64) if binary else judged.robustness
+    return tuple(np.where(terminal, values[~terminal].max(), values).tolist())
+
+
+def _robustness(shield: Shield, judged: _Judged | None) -> tuple[float | None, ...]:
+    terminal = shield.task.robot.terminal
+    if judged is None:
+        return (None,) * len(terminal)
+    return tuple(None if end else v for end, v in zip(terminal, judged.robustness.tolist(), strict=True))
+
+
+def _feasible_mass(shield: Shield, log_prior: Floats | None, judged: _Judged | None) -> float | None:
+    if log_prior is None or judged is None:
+        return None
+    going_on = np.where(shield.task.robot.terminal, -np.inf, log_prior)
+    if not np.isfinite(going_on).any():
+        return None
+    return shaping.feasible_mass(shaping.log_softmax(going_on), judged.feasible)
+
+
+def _draw(distribution: Floats, seed: int, t: int) -> int:
+    """An action drawn with the session's seed and t, so that a replay draws the same."""
+    edges = np.cumsum(distribution)
+    point = np.random.default_rng([seed, t]).random() * edges[-1]
+    return int(min(np.searchsorted(edges, point, side="right"), np.flatnonzero(distribution)[-1]))

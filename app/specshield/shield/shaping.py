@@ -1,0 +1,94 @@
+"""The closest distribution to the model's own, in KL, that meets the specification: three closed forms.
+
+pi* = argmin KL(pi || prior) subject to E_pi[J] >= threshold (paper, Problem 1). All take log-probabilities, so that
+no large multiplier is ever exponentiated, and condition on not ending: a terminal action keeps exactly its prior
+mass and takes no part (DESIGN.md, section 1).
+
+Only threshold = 1 with binary J carries a guarantee: a threshold holds per step, and 0.99 ** 150 = 0.22.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+def log_softmax(logits: Floats) -> Floats:
+    """Log-probabilities of logits in which -inf means impossible. At least one is finite. Shape (A,)."""
+    top = np.max(logits)
+    result: Floats = logits - top - np.log(np.sum(np.exp(logits - top)))
+    return result
+
+
+def feasible_mass(log_prior: Floats, feasible: Bools) -> float:
+    """pi_FM(S_t): the prior's mass on the feasible actions, log_prior conditional on not ending."""
+    return float(min(np.sum(np.exp(log_prior[feasible])), 1.0))
+
+
+def restrict(log_prior: Floats, feasible: Bools) -> Floats | None:
+    """Threshold 1: the prior on S_t, renormalised (paper, the limit of eq. 16). None if it has no mass there."""
+    logits = np.where(feasible, log_prior, -np.inf)
+    if not np.any(np.isfinite(logits)):
+        return None
+    return np.exp(log_softmax(logits))
+
+
+def soften(log_prior: Floats, feasible: Bools, threshold: float) -> Floats | None:
+    """Binary J, threshold below 1: mass `threshold` on S_t, the rest off it, each in proportion to the prior.
+
+    Unchanged where the prior has that much already; None where it has no mass on S_t.
+    """
+    if feasible_mass(log_prior, feasible) >= threshold:
+        return np.exp(log_prior)
+    on = restrict(log_prior, feasible)
+    off = restrict(log_prior, ~feasible)
+    if on is None:
+        return None
+    return on if off is None else threshold * on + (1.0 - threshold) * off
+
+
+def tilt(log_prior: Floats, values: Floats, threshold: float) -> Floats | None:
+    """Real-valued J: prior exp(lambda J) / Z with the smallest lambda >= 0 whose mean J reaches `threshold`.
+
+    values: J of each action, shape (A,). None where the threshold is above max J on the prior's support; where it
+    equals that maximum, the prior restricted to the actions that reach it.
+    """
+    support = np.isfinite(log_prior)
+    if not np.any(support):
+        return None
+    highest = float(np.max(values[support]))
+    if threshold > highest:
+        return None
+    if threshold == highest:
+        return restrict(log_prior, support & (values == highest))
+    gains = np.where(support, values - highest, 0.0)  # <= 0: the tilt never overflows
+
+    def tilted(multiplier: float) -> Floats:
+        return np.exp(log_softmax(log_prior + multiplier * gains))
+
+    def short(multiplier: float) -> float:
+        return float(np.dot(tilted(multiplier), gains)) - (threshold - highest)
+
+    if short(0.0) >= 0.0:
+        return np.exp(log_prior)
+    low, high = 0.0, 1.0
+    while short(high) < 0.0:  # the mean rises to `highest` > threshold, so this ends
+        low, high = high, 2.0 * high
+        if not np.isfinite(high):
+            return restrict(log_prior, support & (values == highest))
+    while True:  # bisect to the last float, keeping the end that meets the constraint
+        middle = 0.5 * (low + high)
+        if middle in (low, high):
+            return tilted(high)
+        low, high = (middle, high) if short(middle) < 0.0 else (low, middle)
+
+
+def divergence(distribution: Floats, log_prior: Floats) -> float | None:
+    """KL(distribution || prior) in nats; None where the distribution leaves the prior's support. Shapes (A,)."""
+    on = distribution > 0.0
+    if np.any(np.isneginf(log_prior[on])):
+        return None
+    return max(float(np.sum(distribution[on] * (np.log(distribution[on]) - log_prior[on]))), 0.0)

@@ -1,0 +1,146 @@
+"""A task: the world, the robot and the rule it has to keep. Immutable, named by the hash of its content."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from specshield.errors import FormulaError, MapError, SampleError
+from specshield.robot import Robot, robot_to_json
+from specshield.stl import Formula, is_name, parse
+from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Region, region_from_json, region_to_json, signed_distance
+
+POSE_NAMES = ("x", "y", "theta")
+MAX_REGIONS = 256
+MAX_HORIZON = 1000
+MAX_NAME = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """regions: those that the formula names, the spec's own and the map's rooms.
+
+    signals: the names of other signals the formula may use, with the value each holds before its first sample.
+    """
+
+    grid: OccupancyGrid
+    robot: Robot
+    formula: Formula
+    regions: Mapping[str, Region]
+    signals: Mapping[str, float]
+
+    @property
+    def horizon(self) -> int:
+        return self.formula.horizon
+
+    @cached_property
+    def content_hash(self) -> str:
+        """sha256 of everything that decides what the task means, as hex."""
+        content = {
+            "grid": self.grid.content_hash,
+            "robot": robot_to_json(self.robot),
+            "formula": str(self.formula),
+            "regions": {name: region_to_json(region) for name, region in sorted(self.regions.items())},
+            "signals": dict(sorted(self.signals.items())),
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def samples(
+        self, poses: ArrayLike, signals: Mapping[str, NDArray[np.float64]] | None = None
+    ) -> dict[str, NDArray[np.float64]]:
+        """The signals of a trajectory, for `stl.robustness`.
+
+        poses [..., N, 3] in metres and radians; signals {name: [n]} with n <= N, their last value held to N (J is
+        conditional on that), the initial value where none was sent. Result {name: [..., N]}.
+        """
+        array = np.asarray(poses, dtype=np.float64)
+        result: dict[str, NDArray[np.float64]] = {}
+        for name in self.formula.names:
+            if name in self.regions:
+                result[name] = signed_distance(self.regions[name], array[..., :2])
+            elif name in POSE_NAMES:
+                result[name] = array[..., POSE_NAMES.index(name)]
+            else:
+                sent = np.asarray((signals or {}).get(name, ()), dtype=np.float64)
+                held = np.full(array.shape[-2], sent[-1] if len(sent) else self.signals[name])
+                held[: len(sent)] = sent
+                result[name] = np.broadcast_to(held, array.shape[:-1])
+        return result
+
+    def check_signals(self, signals: Mapping[str, float]) -> None:
+        """Raises SampleError for a signal that the task does not declare or a value that is not finite."""
+        for name, value in signals.items():
+            if name not in self.signals:
+                raise SampleError(
+                    f"unknown signal {name!r}", path=f"signals.{name}", got=name,
+                    expected=f"one of {sorted(self.signals)}, as the spec declares them",
+                )  # fmt: skip
+            if not math.isfinite(value):
+                raise SampleError("a signal is finite", path=f"signals.{name}", got=str(value), expected="a number")
+
+
+def make_task(
+    grid: OccupancyGrid,
+    robot: Robot,
+    formula: str,
+    regions: Mapping[str, Any] | None = None,
+    rooms: Mapping[str, Region] | None = None,
+    signals: Mapping[str, float] | None = None,
+    max_horizon: int = MAX_HORIZON,
+) -> Task:
+    """Checks and joins the parts of a task.
+
+    regions: {name: region JSON or Region}, the spec's own; they come before the map's `rooms` of the same name.
+    Raises FormulaError, MapError (regions), SampleError (signals), with the path of the field below the spec.
+    """
+    declared = parse_regions(regions or {})
+    initial = parse_signals(signals or {}, declared)
+    known = {**(rooms or {}), **declared}
+    tree = parse(formula, names=[*known, *POSE_NAMES, *initial], max_horizon=max_horizon)
+    if tree.horizon < 1:
+        raise FormulaError(
+            "the formula looks at no step after the first", path="formula", got=formula, expected="a horizon of at least 1"
+        )
+    used = {name: known[name] for name in tree.names if name in known}
+    return Task(grid, robot, tree, used, {name: initial[name] for name in tree.names if name in initial})
+
+
+def parse_regions(regions: Mapping[str, Any]) -> dict[str, Region]:
+    """Regions by name, from JSON or as they are. Raises MapError with the path of the field."""
+    if len(regions) > MAX_REGIONS:
+        raise MapError("too many regions", path="regions", got=len(regions), expected=f"at most {MAX_REGIONS}")
+    result: dict[str, Region] = {}
+    for name, region in regions.items():
+        _check_name(name, f"regions.{name}")
+        result[name] = region_from_json(region, f"regions.{name}") if isinstance(region, dict) else region
+    return result
+
+
+def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dict[str, float]:
+    """Declared signals with their initial values. Raises MapError or SampleError with the path of the field."""
+    for name, value in signals.items():
+        _check_name(name, f"signals.{name}")
+        if name in taken:
+            raise MapError("a region has this name", path=f"signals.{name}", got=name, expected="a name of its own")
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+            raise SampleError(
+                "a signal's initial value is a number", path=f"signals.{name}", got=value, expected="a finite number"
+            )
+    return {name: float(value) for name, value in signals.items()}
+
+
+def _check_name(name: str, path: str) -> None:
+    if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
+        raise MapError(
+            f"{name!r} cannot be a name", path=path, got=name,
+            expected=f"letters, digits and _ (at most {MAX_NAME}), not a keyword of the formula language, not x, y or theta",
+        )  # fmt: skip
