@@ -17,7 +17,7 @@ from PIL import Image
 
 from specshield.errors import MapError
 from specshield.world import checks
-from specshield.world.occupancy import OccupancyGrid, check_size
+from specshield.world.occupancy import MAX_SIDE, OccupancyGrid, check_size
 
 FREE_AT_MOST = 25  # percent: what nav2's map_saver writes as free by default
 MAX_YAML = 16_384  # characters; a map's YAML has some 150
@@ -78,7 +78,10 @@ def dump_map(grid: OccupancyGrid, image: str = "map.pgm") -> tuple[str, bytes]:
 
 def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
     """nav_msgs/OccupancyGrid: its `info` as an object, its `data` as a flat list, row 0 the lowest y."""
-    width, height = check_size(checks.member(info, "width", "info"), checks.member(info, "height", "info"))
+    width, height = (
+        checks.integer(checks.member(info, key, "info"), f"info.{key}", 1, MAX_SIDE)
+        for key in ("width", "height")
+    )
     resolution = checks.number(checks.member(info, "resolution", "info"), "info.resolution", 1e-4, 100.0)
     origin = checks.member(info, "origin", "info")
     position = checks.member(origin, "position", "info.origin")
@@ -167,8 +170,13 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[NDArray[np.float64], 
         if picture.mode[0] in "IF":  # 16 bits
             shade = np.asarray(picture, dtype=np.float64) / 65535
             return shade, np.ones_like(shade)
-        transparent = "A" in picture.mode or "transparency" in picture.info
-        channels = np.asarray(picture.convert("RGBA" if transparent else "RGB"), dtype=np.float64) / 255
+        if "A" in picture.mode or "transparency" in picture.info:
+            pixels = np.asarray(picture.convert("RGBA"))
+            return pixels[..., : 4 if alpha_counts else 3].mean(axis=-1) / 255, pixels[..., 3] / 255
+        grey = picture.mode in ("1", "L")
+        pixels = np.asarray(picture.convert("L" if grey else "RGB"))
+        shade = (pixels if grey else pixels.mean(axis=-1)) / 255
+        return shade, np.ones_like(shade)
     except Exception as error:
         raise MapError(
             "the image is broken or cut off",
@@ -176,8 +184,6 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[NDArray[np.float64], 
             got=f"{len(image)} bytes",
             expected="a whole PGM or PNG",
         ) from error
-    opacity = channels[..., 3] if transparent else np.ones(channels.shape[:2])
-    return channels[..., : None if alpha_counts else 3].mean(axis=-1), opacity
 
 
 def _yaw(orientation: Any) -> float:

@@ -6,7 +6,6 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numba
 import numpy as np
@@ -115,9 +114,16 @@ class OccupancyGrid:
         return self.to_map(np.stack([columns, rows], axis=-1) * self.resolution)
 
 
-def check_size(width: Any, height: Any) -> tuple[int, int]:
-    """(width, height), both from 1 to MAX_SIDE cells, or MapError."""
-    return checks.integer(width, "width", 1, MAX_SIDE), checks.integer(height, "height", 1, MAX_SIDE)
+def check_size(width: int, height: int) -> None:
+    """MapError unless both are from 1 to MAX_SIDE cells."""
+    for path, side in (("width", width), ("height", height)):
+        if not 1 <= side <= MAX_SIDE:
+            raise MapError(
+                f"a map cannot have {width} x {height} cells",
+                path=path,
+                got=side,
+                expected=f"1 to {MAX_SIDE} cells",
+            )
 
 
 @numba.njit(cache=True, nogil=True)
