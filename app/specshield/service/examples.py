@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-PROBLEM = {
+PROBLEM: dict[str, Any] = {
     "type": "history-gap",
     "title": "History gap",
     "status": 409,
@@ -30,7 +30,10 @@ GRID_MAP: dict[str, Any] = {
         "resolution": 1.0,
         "width": 5,
         "height": 4,
-        "origin": {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}},
+        "origin": {
+            "position": {"x": 0.0, "y": 0.0, "z": 0.0},
+            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+        },
     },
     "data": [0] * 12 + [100, -1] + [0] * 6,
 }

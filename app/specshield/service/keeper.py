@@ -32,7 +32,13 @@ def main(folder: Path, command: list[str]) -> int:
     with open(folder / "store.log", "ab", buffering=0) as log:
         # The lock's descriptor goes to the store too: it is free only when both are gone.
         store = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=folder, pass_fds=[lock], preexec_fn=follow_parent
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=folder,
+            pass_fds=[lock],
+            preexec_fn=follow_parent,
         )
 
     def watch() -> None:

@@ -11,10 +11,9 @@ from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from starlette.exceptions import HTTPException
-
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
+from starlette.exceptions import HTTPException
 
 MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger("specshield")
@@ -89,13 +88,18 @@ def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -
 def from_validation(found: Sequence[Mapping[str, Any]], body: Any) -> InputError:
     """One error for everything a schema refused: the first in its own words, all of them in `errors`."""
     listed = [
-        {"path": _path(item["loc"], body), "got": plain(item.get("input")), "expected": _expected(item)} for item in found[:20]
+        {"path": _path(item["loc"], body), "got": plain(item.get("input")), "expected": _expected(item)}
+        for item in found[:20]
     ]
     first = listed[0]
     if found[0]["type"] == "json_invalid":
         reason = found[0].get("ctx", {}).get("error", "")
-        return InputError(f"the body is not JSON: {reason}", position=found[0]["loc"][-1], expected="a JSON object")
-    kind = next((FIELD_ERRORS[part] for part in re.split(r"[.\[]", first["path"]) if part in FIELD_ERRORS), InputError)
+        return InputError(
+            f"the body is not JSON: {reason}", position=found[0]["loc"][-1], expected="a JSON object"
+        )
+    kind = next(
+        (FIELD_ERRORS[part] for part in re.split(r"[.\[]", first["path"]) if part in FIELD_ERRORS), InputError
+    )
     message = f"{first['path'] or 'the body'}: {first['expected']}"
     return kind(message, path=first["path"], got=first["got"], expected=first["expected"], errors=listed)
 
@@ -110,13 +114,11 @@ def _path(location: Sequence[str | int], body: Any) -> str:
     parts, here = [], body
     source, *rest = location
     for part in rest:
-        if isinstance(here, Mapping) and part in here:
+        if (isinstance(here, Mapping) and part in here) or (
+            isinstance(here, list) and isinstance(part, int) and part < len(here)
+        ):
             here = here[part]
-        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
-            here = here[part]
-        elif part != rest[-1]:
-            continue
-        elif not isinstance(here, Mapping) and source == "body":
+        elif part != rest[-1] or (not isinstance(here, Mapping) and source == "body"):
             continue
         parts.append(f"[{part}]" if isinstance(part, int) else f".{part}")
     return "".join(parts).removeprefix(".")
@@ -139,12 +141,15 @@ def install(app: FastAPI) -> None:
         assert isinstance(error, HTTPException)
         path = request.url.path
         if error.status_code == 404:
-            return response(errors.NotFound(f"there is no {path} here", got=path, expected="a path listed at /docs"))
+            return response(
+                errors.NotFound(f"there is no {path} here", got=path, expected="a path listed at /docs")
+            )
         if error.status_code == 405:
             allowed = (error.headers or {}).get("Allow", "")
             message = f"{request.method} is not for {path}"
             return response(
-                errors.MethodNotAllowed(message, got=request.method, expected=allowed or "another method"), error.headers
+                errors.MethodNotAllowed(message, got=request.method, expected=allowed or "another method"),
+                error.headers,
             )
         return response(InputError(str(error.detail)))
 

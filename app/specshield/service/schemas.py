@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
-
 from specshield.service import examples
 
 SpecStatus = Literal["pending", "satisfied", "violated"]
@@ -14,7 +13,9 @@ Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 Pose = Annotated[
     list[Coordinate], Field(min_length=3, max_length=3, description="[x, y, theta]: [m, m, rad], map frame.")
 ]
-Point = Annotated[list[Coordinate], Field(min_length=2, max_length=2, description="[x, y] in metres, map frame.")]
+Point = Annotated[
+    list[Coordinate], Field(min_length=2, max_length=2, description="[x, y] in metres, map frame.")
+]
 Name = Annotated[str, Field(min_length=1, max_length=64)]
 
 
@@ -49,7 +50,9 @@ class Problem(Answer):
     path: str | None = Field(None, description="The field at fault.")
     got: JsonValue = Field(None, description="What the field held, shortened.")
     expected: str | None = Field(None, description="What is valid there.")
-    errors: list[FieldError] | None = Field(None, description="Every field that failed, where there are several.")
+    errors: list[FieldError] | None = Field(
+        None, description="Every field that failed, where there are several."
+    )
 
 
 # --- specifications
@@ -89,11 +92,17 @@ class Union(Strict):
 Region = Annotated[Circle | Rectangle | Polygon | Union, Field(discriminator="type")]
 Regions = Annotated[
     dict[str, Region],
-    Field(max_length=256, description="Regions by name; in a formula a name is the signed distance [m], positive inside."),
+    Field(
+        max_length=256,
+        description="Regions by name; in a formula a name is the signed distance [m], positive inside.",
+    ),
 ]
 Signals = Annotated[
     dict[str, float],
-    Field(max_length=64, description="Other signals by name, each with the value it holds before its first sample."),
+    Field(
+        max_length=64,
+        description="Other signals by name, each with the value it holds before its first sample.",
+    ),
 ]
 Formula = Annotated[
     str,
@@ -134,7 +143,9 @@ class HouseMap(Strict):
 
     format: Literal["procthor"]
     house: dict[str, Any] = Field(description="The house's JSON.")
-    asset_sizes: dict[str, Any] = Field(description="Bounding box of every asset it uses, by asset id: x, y, z [m].")
+    asset_sizes: dict[str, Any] = Field(
+        description="Bounding box of every asset it uses, by asset id: x, y, z [m]."
+    )
     resolution: float = Field(0.05, ge=0.01, le=1.0, description="Side of a cell [m].")
 
 
@@ -191,7 +202,9 @@ class ActionSpec(Strict):
 
 class RobotSpec(Strict):
     footprint: Footprint
-    on_contact: Literal["stay", "stop"] = Field("stay", description="What a move that would touch something does.")
+    on_contact: Literal["stay", "stop"] = Field(
+        "stay", description="What a move that would touch something does."
+    )
     actions: list[ActionSpec] = Field(min_length=1, max_length=256)
 
 
@@ -204,7 +217,9 @@ class PolicyRequest(Strict):
     method: Literal["dqn", "reachability"] = Field("dqn", description="How the policy is made.")
     seed: int = Field(0, ge=0, lt=2**63)
     options: dict[str, bool | int | float | str] = Field(
-        default_factory=dict, max_length=64, description="Settings of the method that differ from its defaults."
+        default_factory=dict,
+        max_length=64,
+        description="Settings of the method that differ from its defaults.",
     )
 
 
@@ -239,7 +254,10 @@ class SessionRequest(Strict):
 
     policy_id: Id | None = Field(None, description="Id or name of the policy.")
     policy_ids: list[Id] | None = Field(
-        None, min_length=1, max_length=8, description="Several policies for one task: an action is feasible if any says so."
+        None,
+        min_length=1,
+        max_length=8,
+        description="Several policies for one task: an action is feasible if any says so.",
     )
     initial_pose: Pose = Field(description="x_0: [m, m, rad], map frame; inside the map and free.")
     id: Id | None = Field(None, description="An id of your own; the server makes one up otherwise.")
@@ -249,12 +267,16 @@ class SessionRequest(Strict):
         gt=0.0,
         description="delta: least expected J a step. Only 1 carries a guarantee: delta holds for one step (0.99^150 = 0.22).",
     )
-    margin: float = Field(0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m].")
+    margin: float = Field(
+        0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
+    )
     evaluation: Literal["feasibility", "robustness"] = Field(
         "feasibility", description="J is 1 or 0 (the rule can be kept or not), or the robustness itself."
     )
     shaping: Literal["projection", "lookahead"] = Field("projection", description="How the prior is bent.")
-    max_steps: int | None = Field(None, ge=1, description="The session ends there [steps]. Default: max(600, T + 1).")
+    max_steps: int | None = Field(
+        None, ge=1, description="The session ends there [steps]. Default: max(600, T + 1)."
+    )
     allow_infeasible: bool = Field(False, description="Start even where no action has a satisfying future.")
 
     @model_validator(mode="after")
@@ -299,7 +321,11 @@ class SessionList(Answer):
 class StepRequest(Strict):
     model_config = ConfigDict(json_schema_extra={"examples": [examples.STEP]})
 
-    t: int = Field(ge=0, le=1_000_000, description="The step to decide. It is the lock: sent again, it returns the stored answer.")
+    t: int = Field(
+        ge=0,
+        le=1_000_000,
+        description="The step to decide. It is the lock: sent again, it returns the stored answer.",
+    )
     poses: list[Pose] = Field(
         min_length=1,
         max_length=10_001,
@@ -312,7 +338,9 @@ class StepRequest(Strict):
     )
     main_task_done: bool = Field(False, description="The main task is over; stays true once it is.")
     signals: dict[str, float] | None = Field(
-        None, max_length=64, description="Samples at t of the signals that the spec declares; one left out holds its last value."
+        None,
+        max_length=64,
+        description="Samples at t of the signals that the spec declares; one left out holds its last value.",
     )
     witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
 
@@ -329,24 +357,38 @@ class StepResponse(Answer):
     )
     distribution: list[float] = Field(description="pi*: the probability of each action.")
     j_values: list[float | None] = Field(description="J of each action; null where it was not evaluated.")
-    robustness: list[float | None] = Field(description="rho of the joint trajectory that certifies (or fails) each action.")
+    robustness: list[float | None] = Field(
+        description="rho of the joint trajectory that certifies (or fails) each action."
+    )
     action: int = Field(description="Drawn from `distribution` by the session's seed and t.")
     action_name: str
-    completion_action: int | None = Field(description="The certified continuation; null once the specification is settled.")
+    completion_action: int | None = Field(
+        description="The certified continuation; null once the specification is settled."
+    )
     spec_status: SpecStatus
     feasible_mass: float | None = Field(description="pi_FM(S_t), of the non-terminal actions.")
-    kl: float | None = Field(description="KL(pi* || pi_FM) in nats; null where pi* leaves the prior's support.")
+    kl: float | None = Field(
+        description="KL(pi* || pi_FM) in nats; null where pi* leaves the prior's support."
+    )
     reason: str | None = Field(description="Why the mode is a fallback, or what else there is to know.")
     finished: bool = Field(description="No further step will be taken.")
     next_poses: list[Pose] = Field(description="f(x_t, a) for each action.")
-    residual: Residual | None = Field(description="How far x_t is from where the executed action should have led.")
+    residual: Residual | None = Field(
+        description="How far x_t is from where the executed action should have led."
+    )
     witness: list[int] | None = Field(description="Action indices that follow `action` to the horizon.")
-    witnesses: list[list[int] | None] | None = Field(None, description="The same for each action, if asked for.")
+    witnesses: list[list[int] | None] | None = Field(
+        None, description="The same for each action, if asked for."
+    )
 
 
 class CloseRequest(Strict):
-    t: int | None = Field(None, ge=0, le=1_000_000, description="The last step reached. Default: the last one stored.")
-    poses: list[Pose] | None = Field(None, min_length=1, max_length=10_001, description="Ends with x_t, joined as in a step.")
+    t: int | None = Field(
+        None, ge=0, le=1_000_000, description="The last step reached. Default: the last one stored."
+    )
+    poses: list[Pose] | None = Field(
+        None, min_length=1, max_length=10_001, description="Ends with x_t, joined as in a step."
+    )
 
     @model_validator(mode="after")
     def _both_or_neither(self) -> CloseRequest:
@@ -365,7 +407,9 @@ class TrajectoryItem(Answer):
     t: int
     pose: Pose
     signals: dict[str, float] = Field(description="The samples held at t.")
-    decision: StepResponse | None = Field(description="The answer given; null for a pose sent later or by close.")
+    decision: StepResponse | None = Field(
+        description="The answer given; null for a pose sent later or by close."
+    )
 
 
 class Trajectory(Answer):

@@ -16,16 +16,22 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix="SPECSHIELD_", frozen=True, extra="ignore")
 
-    data_dir: Path = Field(Path("data"), description="Uploaded maps, trained policies and the embedded store.")
+    data_dir: Path = Field(
+        Path("data"), description="Uploaded maps, trained policies and the embedded store."
+    )
     models_dir: Path = Field(REPOSITORY / "models", description="Policies there at start, one folder each.")
-    maps_dir: Path = Field(REPOSITORY / "maps", description="Maps there at start, <name>.yaml beside its image.")
+    maps_dir: Path = Field(
+        REPOSITORY / "maps", description="Maps there at start, <name>.yaml beside its image."
+    )
     redis_url: str | None = Field(
         None,
         validation_alias=AliasChoices("redis_url", "REDIS_URL"),
         description="redis://, rediss:// or unix:// of the store; unset, the server starts its own in the data folder.",
     )
     store_timeout: float = Field(2.0, gt=0, description="Longest wait for one answer of the store [s].")
-    api_key: SecretStr | None = Field(None, description="Asked for as `Authorization: Bearer <key>`; unset, none is.")
+    api_key: SecretStr | None = Field(
+        None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
+    )
 
     max_horizon: int = Field(1000, ge=1, description="Longest horizon of a formula [steps].")
     max_steps: int = Field(10_000, ge=1, description="Most steps that a session may ask for.")
@@ -34,7 +40,9 @@ class Settings(BaseSettings):
     max_maps: int = Field(1000, ge=1, description="Most uploaded maps kept.")
     max_policies: int = Field(1000, ge=1, description="Most policies kept.")
     max_sessions: int = Field(100_000, ge=1, description="Most sessions kept.")
-    session_ttl: int = Field(7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s].")
+    session_ttl: int = Field(
+        7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
+    )
     shield_cache: int = Field(32, ge=1, description="Prepared shields kept in memory.")
 
     worker: bool | None = Field(
