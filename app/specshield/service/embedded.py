@@ -108,7 +108,7 @@ class EmbeddedStore:
             "dir": str(self.folder),
             "save": "",
             "appendonly": "yes",
-            # Every answer waits for its write to reach the disk: 0.24 ms a step against 0.07 ms without (SSD).
+            # An answer waits until its write is on the disk: 0.24 ms a step, 0.07 ms without (SSD).
             "appendfsync": "always",
             "databases": "1",
         }

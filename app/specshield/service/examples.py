@@ -38,8 +38,6 @@ GRID_MAP: dict[str, Any] = {
     "data": [0] * 12 + [100, -1] + [0] * 6,
 }
 
-MAP_YAML = "image: map.pgm\nresolution: 0.05\norigin: [0.0, 0.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
-
 POLICY: dict[str, Any] = {
     "map_id": "case1",
     "robot": "stretch",

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
 from specshield.errors import HistoryConflict, HistoryGap, PoseError
 
 TOLERANCE = 1e-6  # m or rad

@@ -11,9 +11,10 @@ from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
-from starlette.exceptions import HTTPException
 
 MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger("specshield")
@@ -47,7 +48,7 @@ def status_of(error: SpecshieldError) -> int:
 
 
 def document(error: SpecshieldError) -> dict[str, Any]:
-    """The problem document: type, title, status, detail, then path, got, expected and the error's own members."""
+    """type, title, status, detail; path, got and expected where there are; the error's own members."""
     body: dict[str, Any] = {
         "type": error.type,
         "title": error.type.replace("-", " ").capitalize(),
@@ -110,18 +111,29 @@ def _expected(item: Mapping[str, Any]) -> str:
 
 
 def _path(location: Sequence[str | int], body: Any) -> str:
-    """'poses[0][2]'. Names that pydantic puts in for the branch of a union are not part of the body: left out."""
-    parts, here = [], body
+    """'poses[0][2]'. Left out: the names that pydantic puts in for the branch of a union."""
     source, *rest = location
-    for part in rest:
-        if (isinstance(here, Mapping) and part in here) or (
-            isinstance(here, list) and isinstance(part, int) and part < len(here)
-        ):
-            here = here[part]
-        elif part != rest[-1] or (not isinstance(here, Mapping) and source == "body"):
+    parts: list[str] = []
+    here = body
+    for i, part in enumerate(rest):
+        held = _held(here, part)
+        last_of_object = i == len(rest) - 1 and isinstance(here, Mapping)  # missing there, or not to be there
+        if held is _ABSENT and source == "body" and not last_of_object:
             continue
+        here = held
         parts.append(f"[{part}]" if isinstance(part, int) else f".{part}")
     return "".join(parts).removeprefix(".")
+
+
+_ABSENT = object()
+
+
+def _held(value: Any, part: str | int) -> Any:
+    if isinstance(value, Mapping):
+        return value.get(part, _ABSENT)
+    if isinstance(value, list) and isinstance(part, int) and part < len(value):
+        return value[part]
+    return _ABSENT
 
 
 def install(app: FastAPI) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+
 from specshield.service import examples
 
 SpecStatus = Literal["pending", "satisfied", "violated"]
@@ -55,6 +56,10 @@ class Problem(Answer):
     )
 
 
+class Health(Answer):
+    status: Literal["ok"]
+
+
 # --- specifications
 
 
@@ -76,7 +81,7 @@ class Polygon(Strict):
     """Simple: the edges touch only at their ends. The last vertex joins the first."""
 
     type: Literal["polygon"]
-    vertices: list[Point] = Field(min_length=3, max_length=1024)
+    vertices: list[Point] = Field(min_length=3, max_length=10_000)
 
 
 Shape = Annotated[Circle | Rectangle | Polygon, Field(discriminator="type")]
@@ -146,15 +151,15 @@ class HouseMap(Strict):
     asset_sizes: dict[str, Any] = Field(
         description="Bounding box of every asset it uses, by asset id: x, y, z [m]."
     )
-    resolution: float = Field(0.05, ge=0.01, le=1.0, description="Side of a cell [m].")
+    resolution: float = Field(0.05, gt=0, description="Side of a cell [m].")
 
 
 class GridMap(Strict):
-    """A nav_msgs/OccupancyGrid. Unknown cells (-1) count as occupied, and so does everything outside the map."""
+    """A nav_msgs/OccupancyGrid. Unknown cells (-1) count as occupied, and so does all outside the map."""
 
     format: Literal["occupancy_grid"]
     info: dict[str, Any] = Field(
-        description="`resolution` [m], `width`, `height` [cells], `origin`: {position, orientation} of the cell (0, 0)."
+        description="`resolution` [m], `width`, `height` [cells], `origin`: {position, orientation}."
     )
     data: list[int] = Field(description="Row-major from the lowest y: -1 unknown, 0..100 occupancy [%].")
 
@@ -216,11 +221,26 @@ class PolicyRequest(Strict):
     spec: Spec
     method: Literal["dqn", "reachability"] = Field("dqn", description="How the policy is made.")
     seed: int = Field(0, ge=0, lt=2**63)
-    options: dict[str, bool | int | float | str] = Field(
+    options: dict[str, bool | int | float | str | list[float]] = Field(
         default_factory=dict,
         max_length=64,
         description="Settings of the method that differ from its defaults.",
     )
+
+
+class Card(BaseModel):
+    """What has to be in a policy's card.json; whatever else it tells is kept."""
+
+    model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
+
+    map_id: Id
+    robot: Name | RobotSpec
+    spec: Spec
+    method: Literal["dqn"]
+    seed: int = Field(ge=0, lt=2**63)
+    options: dict[str, bool | int | float | str | list[float]] = Field(max_length=64)
+    task_hash: Name
+    metrics: dict[str, JsonValue] = Field(max_length=256)
 
 
 class PolicyResponse(Answer):
@@ -265,7 +285,7 @@ class SessionRequest(Strict):
     threshold: float = Field(
         1.0,
         gt=0.0,
-        description="delta: least expected J a step. Only 1 carries a guarantee: delta holds for one step (0.99^150 = 0.22).",
+        description="delta, the least expected J of a step. Only 1 carries a guarantee: 0.99^150 is 0.22.",
     )
     margin: float = Field(
         0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
@@ -334,7 +354,7 @@ class StepRequest(Strict):
     logits: list[float | None] | None = Field(
         None,
         max_length=256,
-        description="The model's logits, one an action; null is minus infinity. May be null once main_task_done is true.",
+        description="The model's logits, one an action; null is minus infinity. Not needed after the main task.",
     )
     main_task_done: bool = Field(False, description="The main task is over; stays true once it is.")
     signals: dict[str, float] | None = Field(
@@ -372,6 +392,7 @@ class StepResponse(Answer):
     )
     reason: str | None = Field(description="Why the mode is a fallback, or what else there is to know.")
     finished: bool = Field(description="No further step will be taken.")
+    in_collision: bool = Field(description="x_t touches an obstacle: the world is what it is.")
     next_poses: list[Pose] = Field(description="f(x_t, a) for each action.")
     residual: Residual | None = Field(
         description="How far x_t is from where the executed action should have led."
@@ -399,7 +420,7 @@ class CloseRequest(Strict):
 
 class CloseResponse(SessionResponse):
     robustness_bounds: list[float | None] = Field(
-        description="[lo, hi] on the robustness over every continuation; equal once the horizon is reached; null is unbounded."
+        description="[lo, hi] on the robustness over every continuation; equal at the horizon; null is infinite."
     )
 
 

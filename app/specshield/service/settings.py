@@ -12,44 +12,50 @@ REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 class Settings(BaseSettings):
-    """Environment variables are the field names in upper case after `SPECSHIELD_`; `REDIS_URL` stands alone."""
+    """Environment variables: the field names in upper case after `SPECSHIELD_`, and `REDIS_URL`."""
 
     model_config = SettingsConfigDict(env_prefix="SPECSHIELD_", frozen=True, extra="ignore")
 
     data_dir: Path = Field(
-        Path("data"), description="Uploaded maps, trained policies and the embedded store."
+        default=Path("data"), description="Uploaded maps, trained policies and the embedded store."
     )
-    models_dir: Path = Field(REPOSITORY / "models", description="Policies there at start, one folder each.")
+    models_dir: Path = Field(
+        default=REPOSITORY / "models", description="Policies there at start, one folder each."
+    )
     maps_dir: Path = Field(
-        REPOSITORY / "maps", description="Maps there at start, <name>.yaml beside its image."
+        default=REPOSITORY / "maps", description="Maps there at start, <name>.yaml beside its image."
     )
     redis_url: str | None = Field(
-        None,
+        default=None,
         validation_alias=AliasChoices("redis_url", "REDIS_URL"),
-        description="redis://, rediss:// or unix:// of the store; unset, the server starts its own in the data folder.",
+        description="redis://, rediss:// or unix:// of the store; unset, the server starts its own.",
     )
-    store_timeout: float = Field(2.0, gt=0, description="Longest wait for one answer of the store [s].")
+    store_timeout: float = Field(
+        default=2.0, gt=0, description="Longest wait for one answer of the store [s]."
+    )
     api_key: SecretStr | None = Field(
-        None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
+        default=None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
     )
 
-    max_horizon: int = Field(1000, ge=1, description="Longest horizon of a formula [steps].")
-    max_steps: int = Field(10_000, ge=1, description="Most steps that a session may ask for.")
-    max_body_bytes: int = Field(1 << 20, ge=1024, description="Largest request body [bytes].")
-    max_upload_bytes: int = Field(64 << 20, ge=1024, description="Largest map or policy sent [bytes].")
-    max_maps: int = Field(1000, ge=1, description="Most uploaded maps kept.")
-    max_policies: int = Field(1000, ge=1, description="Most policies kept.")
-    max_sessions: int = Field(100_000, ge=1, description="Most sessions kept.")
-    session_ttl: int = Field(
-        7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
+    max_horizon: int = Field(default=1000, ge=1, description="Longest horizon of a formula [steps].")
+    max_steps: int = Field(default=10_000, ge=1, description="Most steps that a session may ask for.")
+    max_body_bytes: int = Field(default=1 << 20, ge=1024, description="Largest request body [bytes].")
+    max_upload_bytes: int = Field(
+        default=64 << 20, ge=1024, description="Largest map or policy sent [bytes]."
     )
-    shield_cache: int = Field(32, ge=1, description="Prepared shields kept in memory.")
+    max_maps: int = Field(default=1000, ge=1, description="Most uploaded maps kept.")
+    max_policies: int = Field(default=1000, ge=1, description="Most policies kept.")
+    max_sessions: int = Field(default=100_000, ge=1, description="Most sessions kept.")
+    session_ttl: int = Field(
+        default=7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
+    )
+    shield_cache: int = Field(default=32, ge=1, description="Prepared shields kept in memory.")
 
     worker: bool | None = Field(
-        None,
-        description="Start a training worker beside the server. Unset: where the store is embedded and torch is installed.",
+        default=None,
+        description="Start a training worker too. Unset: where the store is embedded and torch installed.",
     )
-    training_timeout: int = Field(6 * 3600, ge=1, description="Longest training run [s].")
+    training_timeout: int = Field(default=6 * 3600, ge=1, description="Longest training run [s].")
 
     def environment(self) -> dict[str, str]:
         """The environment that gives a child process these same settings."""

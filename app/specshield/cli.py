@@ -1,0 +1,93 @@
+"""The `specshield` command. Each command imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from typing import Annotated, Any
+
+try:
+    import typer
+except ImportError:  # the base install is the client
+    typer = None  # type: ignore[assignment]
+
+NEEDS_SERVER = "This command needs the server's parts: pip install 'specshield[server]'"
+
+
+def main() -> None:
+    """The console script."""
+    if typer is None:
+        sys.exit(NEEDS_SERVER)
+    try:
+        _commands()()
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in ("torch",):
+            sys.exit("This command needs torch: pip install 'specshield[train]'")
+        if (error.name or "").split(".")[0] in (
+            "fastapi",
+            "fastapi_offline",
+            "uvicorn",
+            "numba",
+            "pydantic_settings",
+            "rq",
+        ):
+            sys.exit(NEEDS_SERVER)
+        raise
+
+
+def _commands() -> Any:
+    app = typer.Typer(
+        help="Keeps robot foundation models inside their operating rules.", no_args_is_help=True
+    )
+    for command in (serve, worker, openapi):
+        app.command()(command)
+    return app
+
+
+def serve(
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen on.", min=0, max=65535)] = 8000,
+    workers: Annotated[int, typer.Option(help="Server processes; they share one store.", min=1)] = 1,
+) -> None:
+    """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
+    import uvicorn
+
+    with tempfile.TemporaryDirectory(prefix="specshield-metrics-") as folder:
+        if workers > 1:
+            os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder  # before prometheus_client is imported
+        uvicorn.run(
+            "specshield.service.app:create_app",
+            factory=True,
+            host=host,
+            port=port,
+            workers=workers,
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=10,
+        )
+
+
+def worker(
+    until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
+) -> None:
+    """Train policies that are asked for, until stopped."""
+    import torch  # noqa: F401  (to say so now rather than with the first policy)
+
+    from specshield.service.settings import Settings
+    from specshield.service.worker import serve as work
+
+    work(Settings(), until_eof)
+
+
+def openapi() -> None:
+    """Print the API's description."""
+    from specshield.service.app import create_app
+    from specshield.service.settings import Settings
+
+    print(json.dumps(create_app(Settings()).openapi(), indent=1, sort_keys=True))
+
+
+if __name__ == "__main__":
+    main()

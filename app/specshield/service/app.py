@@ -1,0 +1,147 @@
+"""The application: its parts, their life, and its description."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import logging
+import multiprocessing
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi_offline import FastAPIOffline
+
+from specshield import __version__
+from specshield.service import problems
+from specshield.service.children import TrainingWorker, tend, wants_worker
+from specshield.service.embedded import EmbeddedStore
+from specshield.service.jobs import Jobs
+from specshield.service.maps import Maps
+from specshield.service.middleware import Guard, Observe
+from specshield.service.policies import Policies
+from specshield.service.routes import maps, policies, sessions, specs, system
+from specshield.service.schemas import Problem
+from specshield.service.sessions import Sessions
+from specshield.service.settings import Settings
+from specshield.service.state import Server
+from specshield.service.store import Store
+from specshield.service.warmup import warm_up
+
+DESCRIPTION = """\
+Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
+set of actions; the service answers the closest distribution that still lets a Signal Temporal Logic
+specification be satisfied over the whole remaining horizon. The model is never retrained.
+
+Metres, radians, counter-clockwise, map frame (REP-103). Errors are problem documents (RFC 9457): `type` is a
+stable word, and for bad input `path`, `got` and `expected` say what was wrong. The examples work in this
+order: check a formula, send a map, begin a session, decide a step, close, read the trajectory, erase.
+"""
+TAGS = [
+    {"name": "specifications", "description": "Formulas of Signal Temporal Logic."},
+    {"name": "maps", "description": "Occupancy grids with named areas."},
+    {"name": "policies", "description": "What certifies that an action still has a satisfying future."},
+    {"name": "sessions", "description": "Episodes: one robot, one specification, one decision a step."},
+    {"name": "system", "description": "Life, readiness, metrics."},
+]
+log = logging.getLogger("specshield")
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The application. Nothing is opened before it starts."""
+    settings = settings or Settings()
+    app = FastAPIOffline(
+        title="specshield",
+        version=__version__,
+        description=DESCRIPTION,
+        openapi_tags=TAGS,
+        lifespan=lambda app: _life(app, settings),
+        redoc_url=None,
+        swagger_ui_parameters={"defaultModelsExpandDepth": 0, "tryItOutEnabled": True},
+    )
+    for module in (specs, maps, policies, sessions, system):
+        app.include_router(module.router)
+    problems.install(app)
+    api_key = None if settings.api_key is None else settings.api_key.get_secret_value()
+    app.add_middleware(
+        Guard, api_key=api_key, max_body=settings.max_body_bytes, max_upload=settings.max_upload_bytes
+    )
+    app.add_middleware(Observe)  # the outermost
+    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    return app
+
+
+@asynccontextmanager
+async def _life(app: FastAPI, settings: Settings) -> AsyncIterator[None]:
+    _follow_supervisor()
+    embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
+    if embedded is not None:
+        await asyncio.to_thread(embedded.join)
+    url = embedded.url if embedded is not None else str(settings.redis_url)
+    store, library = Store(url, settings.store_timeout, settings.session_ttl), Maps(settings)
+    known = Policies(settings, library)
+    worker = TrainingWorker(settings) if wants_worker(settings) else None
+    server = Server(
+        settings, store, library, known, Sessions(settings, store, known), Jobs(url, settings), worker
+    )
+    app.state.server = server
+    tasks = [asyncio.create_task(tend(embedded, worker)), asyncio.create_task(_warm(server))]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.gather(*tasks)
+        if worker is not None:
+            await asyncio.to_thread(worker.stop)
+        await store.aclose()
+        if embedded is not None:
+            embedded.leave()
+
+
+async def _warm(server: Server) -> None:
+    try:
+        await asyncio.to_thread(warm_up)
+        server.ready = True
+    except Exception as error:
+        log.exception("warming up")
+        server.failure = f"the kernels cannot be compiled: {type(error).__name__}"
+
+
+def _follow_supervisor() -> None:
+    """Linux: a worker process of uvicorn is told to stop when its supervisor was killed."""
+    if sys.platform == "linux" and multiprocessing.parent_process() is not None:
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+
+def _openapi(app: FastAPI) -> dict[str, Any]:
+    if app.openapi_schema is None:
+        schema = get_openapi(
+            title=app.title,
+            version=app.version,
+            description=app.description,
+            routes=app.routes,
+            tags=app.openapi_tags,
+        )
+        schemas = schema["components"]["schemas"]
+        for name in (
+            "HTTPValidationError",
+            "ValidationError",
+        ):  # FastAPI's own, which never leave this server
+            schemas.pop(name, None)
+        for model in (Problem, *maps.MODELS, *policies.MODELS):  # referred to by hand
+            described = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(described.pop("$defs", {}))
+            schemas[model.__name__] = described
+        schema["components"]["securitySchemes"] = {
+            "key": {"type": "http", "scheme": "bearer", "description": "Where the server asks for one."}
+        }
+        schema["security"] = [{}, {"key": []}]
+        app.openapi_schema = schema
+    return app.openapi_schema

@@ -1,0 +1,127 @@
+"""Folders that several processes share: each appears whole, by rename, under the hash of its content."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import tempfile
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from specshield.errors import LimitReached
+
+HASH = re.compile(r"[0-9a-f]{64}")
+V = TypeVar("V")
+
+
+def ids(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir() if HASH.fullmatch(entry.name))
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_bytes())
+
+
+def to_json(value: Any) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
+
+
+def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """All of it on disk, or nothing. A folder that is there already (the same content) stays."""
+    draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".draft-"))
+    try:
+        for name, content in files.items():
+            _write(draft / name, content)
+        os.rename(draft, folder)
+        _sync(folder.parent)
+    except OSError:
+        if not folder.is_dir():
+            raise
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Replaces the file, whole."""
+    draft = path.with_name(f".draft-{path.name}")
+    _write(draft, content)
+    os.replace(draft, path)
+    _sync(path.parent)
+
+
+def remove_folder(folder: Path) -> None:
+    """Gone at once for others, then erased."""
+    grave = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".deleted-"))
+    if folder.is_dir():
+        os.rename(folder, grave / folder.name)
+    shutil.rmtree(grave, ignore_errors=True)
+
+
+def check_room(folder: Path, limit: int, what: str) -> None:
+    """Raises LimitReached where `folder` holds `limit` of them."""
+    if len(ids(folder)) >= limit:
+        raise LimitReached(
+            f"the server keeps no more than {limit} {what}", got=limit + 1, expected=f"at most {limit}"
+        )
+
+
+def page(keys: Sequence[str], after: str | None, limit: int) -> tuple[list[str], str | None]:
+    """Up to `limit` of the keys in order, those after `after`; the one to go on after, None at the end."""
+    rest = sorted(key for key in keys if after is None or key > after)
+    return rest[:limit], rest[limit - 1] if len(rest) > limit else None
+
+
+def now() -> str:
+    return rfc3339(datetime.now(timezone.utc).timestamp())
+
+
+def rfc3339(seconds: float) -> str:
+    return (
+        datetime.fromtimestamp(seconds, timezone.utc)
+        .isoformat(timespec="milliseconds")
+        .replace("+00:00", "Z")
+    )
+
+
+class Recent(Generic[V]):
+    """The values used last, up to a number of them. Threads may share it; two may make one value at once."""
+
+    def __init__(self, room: int) -> None:
+        self._room, self._values, self._lock = room, OrderedDict[Hashable, V](), threading.Lock()
+
+    def get(self, key: Hashable, make: Callable[[], V]) -> V:
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+        value = make()
+        with self._lock:
+            self._values[key] = value
+            while len(self._values) > self._room:
+                self._values.popitem(last=False)
+        return value
+
+    def drop(self, key: Hashable) -> None:
+        with self._lock:
+            self._values.pop(key, None)
+
+
+def _write(path: Path, content: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,159 @@
+"""/v1/sessions: episodes, decided step by step."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterator
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi.responses import StreamingResponse
+
+from specshield.service import examples, metrics
+from specshield.service.schemas import (
+    CloseRequest,
+    CloseResponse,
+    Id,
+    SessionList,
+    SessionRequest,
+    SessionResponse,
+    StepRequest,
+    StepResponse,
+    Trajectory,
+)
+from specshield.service.state import Cursor, Limit, ServerState, problems
+
+router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
+SessionId = Annotated[Id, Path(description="Id of a session.", examples=[examples.SESSION["id"]])]
+NDJSON = "application/x-ndjson"
+GONE = {"_404": "No such session; it may have expired.", "_503": "The store is away: try again."}
+
+
+@router.post(
+    "",
+    status_code=201,
+    response_model=SessionResponse,
+    summary="Begin a session",
+    responses=problems(
+        _404="No such policy.",
+        _409="`session-exists`: the id is taken.",
+        _429="The server keeps no more sessions.",
+        _503="The store is away: try again.",
+    ),
+)
+async def create(request: SessionRequest, server: ServerState) -> Any:
+    """A session is one episode of one robot: it holds the trajectory, and every answer given.
+
+    Refused with `invalid-pose` where x_0 is outside the map or in collision, with `infeasible-start` where no
+    action from x_0 has a future that satisfies the specification (unless `allow_infeasible`). It is erased
+    when it has not changed for the server's time to live.
+    """
+    return await server.sessions.create(request)
+
+
+@router.get(
+    "", response_model=SessionList, summary="List the sessions", responses=problems(_503="The store is away.")
+)
+async def list_sessions(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
+    """In order of id; ids that the server makes up are in order of time."""
+    found, following = await server.sessions.page(cursor, limit)
+    return {"items": found, "next": following}
+
+
+@router.get(
+    "/{session_id}", response_model=SessionResponse, summary="Read a session", responses=problems(**GONE)
+)
+async def read(session_id: SessionId, server: ServerState) -> Any:
+    """Where it stands; `next_t` is the step to ask for."""
+    return await server.sessions.read(session_id)
+
+
+@router.delete("/{session_id}", status_code=204, summary="Erase a session", responses=problems(**GONE))
+async def delete(session_id: SessionId, server: ServerState) -> Response:
+    """Its trajectory and answers with it."""
+    await server.sessions.delete(session_id)
+    return Response(status_code=204)
+
+
+@router.post(
+    "/{session_id}/steps",
+    response_class=Response,
+    summary="Decide one step",
+    responses={
+        200: {
+            "model": StepResponse,
+            "description": "The decision. `Server-Timing` has total, rollout and store in ms.",
+        },
+        **problems(
+            **GONE,
+            _409="`history-gap` (with `expected_t`), `history-conflict`, `step-conflict`, `session-finished`",
+        ),
+    },
+)
+async def step(session_id: SessionId, body: StepRequest, request: Request, server: ServerState) -> Response:
+    """Send where the robot is and what its model proposes; get the closest distribution that keeps the rule.
+
+    `poses` ends with x_t and holds any newest part of the history that joins what the server has. A step that
+    was decided, sent again with equal x_t, logits, signals and main_task_done, returns the stored answer byte
+    for byte, so a lost answer can be asked for again. Nothing is stored on an error.
+    """
+    timing = request.scope["state"]["timing"]
+    answer, mode = await server.sessions.step(session_id, body, timing)
+    if mode is not None:
+        metrics.decisions.labels(mode).inc()
+        for part, seconds in timing.items():
+            metrics.part_seconds.labels(part).observe(seconds)
+    return Response(answer, media_type="application/json")
+
+
+@router.post(
+    "/{session_id}/close",
+    response_model=CloseResponse,
+    summary="End a session",
+    responses=problems(
+        **GONE, _409="`history-gap`, `history-conflict`, or `session-finished` for states after a close."
+    ),
+)
+async def close(session_id: SessionId, body: CloseRequest, server: ServerState) -> Any:
+    """Hand in the last states, which no decision follows, and get the verdict. The trajectory stays."""
+    return await server.sessions.close(session_id, body)
+
+
+@router.get(
+    "/{session_id}/trajectory",
+    response_class=Response,
+    summary="Read a trajectory back",
+    responses={
+        200: {
+            "model": Trajectory,
+            "content": {NDJSON: {"schema": {"type": "string", "description": "One item a line."}}},
+            "description": "Every state with the answer given there.",
+        },
+        **problems(**GONE),
+    },
+)
+async def trajectory(
+    session_id: SessionId,
+    server: ServerState,
+    accept: Annotated[str, Header(include_in_schema=False)] = "",
+    format: Annotated[
+        Literal["json", "ndjson"] | None,
+        Query(description="Or by `Accept: application/x-ndjson`."),
+    ] = None,
+) -> Response:
+    """x_0 to x_t with the answers, streamed: as one JSON object, or newline-delimited."""
+    lines = await server.sessions.trajectory(session_id)
+    if format == "ndjson" or (format is None and NDJSON in accept):
+        return StreamingResponse(_each(lines), media_type=NDJSON)
+    return StreamingResponse(_listed(lines), media_type="application/json")
+
+
+async def _each(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
+    for line in lines:
+        yield line + b"\n"
+
+
+async def _listed(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
+    yield b'{"items":['
+    for i, line in enumerate(lines):
+        yield b"," + line if i else line
+    yield b'],"next":null}'

@@ -1,0 +1,51 @@
+"""What every route of one server process shares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Depends, Query, Request
+
+from specshield.service.children import TrainingWorker
+from specshield.service.jobs import Jobs
+from specshield.service.maps import Maps
+from specshield.service.policies import Policies
+from specshield.service.sessions import Sessions
+from specshield.service.settings import Settings
+from specshield.service.store import Store
+
+
+@dataclass
+class Server:
+    """ready: the kernels are compiled; failure: why not. worker: this server's own, if it has one."""
+
+    settings: Settings
+    store: Store
+    maps: Maps
+    policies: Policies
+    sessions: Sessions
+    jobs: Jobs
+    worker: TrainingWorker | None
+    ready: bool = False
+    failure: str | None = None
+
+
+def _server(request: Request) -> Server:
+    server: Server = request.app.state.server
+    return server
+
+
+ServerState = Annotated[Server, Depends(_server)]
+Cursor = Annotated[
+    str | None,
+    Query(max_length=64, description="`next` of the page before; leave it out for the first page."),
+]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Items a page.")]
+
+
+def problems(**said: str) -> dict[int | str, dict[str, Any]]:
+    """The problem documents a route may answer: problems(_409="history-gap, ...")."""
+    content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    said = {"_422": "Bad input: the field, what it held, what is valid.", **said}
+    return {int(status[1:]): {"description": text, "content": content} for status, text in said.items()}

@@ -1,0 +1,173 @@
+"""Sessions in a store of the Redis protocol. Bytes in, bytes out; what they mean is for sessions.py.
+
+A session is three keys of one slot, `specshield:{id}:session`, `:history` and `:steps`, expiring together.
+Ids are also in `specshield:sessions`, a sorted set for listing; it may name sessions that have expired.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import redis.asyncio as redis
+from redis.asyncio.retry import Retry
+from redis.backoff import ExponentialBackoff
+
+from specshield.errors import SessionExists, StoreError
+
+INDEX = "specshield:sessions"
+APPEND = Path(__file__).with_name("append.lua").read_text()
+
+
+@dataclass(frozen=True)
+class Record:
+    """A session as one read saw it. rows: its history. step: what a step left, None if not decided."""
+
+    config: bytes
+    state: bytes
+    version: bytes
+    rows: bytes
+    step: bytes | None
+
+
+@dataclass(frozen=True)
+class Change:
+    """What one write adds: `rows` from byte `offset` on, the answer to step `t`, the state after it."""
+
+    state: bytes
+    rows: bytes = b""
+    offset: int = 0
+    t: int | None = None
+    step: bytes = b""
+
+
+class Store:
+    """Every method raises StoreError where the store cannot be reached in time."""
+
+    def __init__(self, url: str, timeout: float, ttl: int) -> None:
+        pool: Any = redis.BlockingConnectionPool.from_url(
+            url,
+            max_connections=64,
+            timeout=timeout,
+            socket_timeout=timeout,
+            socket_connect_timeout=timeout,
+            # Sent twice, an append changes nothing: the second finds the version gone on.
+            retry=Retry(ExponentialBackoff(cap=0.2, base=0.02), 3),
+            retry_on_error=[redis.ConnectionError, redis.TimeoutError],
+        )
+        self.redis: Any = redis.Redis(
+            connection_pool=pool
+        )  # redis-py's types admit str where bytes come back
+        self._append = self.redis.register_script(APPEND)
+        self._ttl = ttl
+
+    async def aclose(self) -> None:
+        await self.redis.aclose()
+        await self.redis.connection_pool.disconnect()
+
+    async def ping(self) -> None:
+        async with reaching():
+            await self.redis.ping()
+
+    async def create(self, id: str, config: bytes, change: Change) -> None:
+        """Raises SessionExists. `config` has to be unlike any other, so that a retry knows its own."""
+        async with reaching():
+            begun = await self._write(id, b"", change, config)
+            if (
+                begun or await self.redis.hget(_keys(id)[0], "config") == config
+            ):  # a try whose answer was lost
+                await self.redis.zadd(INDEX, {id: 0})
+                return
+        raise SessionExists(
+            f"there is a session {id!r} already", path="id", got=id, expected="an id not in use"
+        )
+
+    async def append(self, id: str, version: bytes, change: Change) -> bool:
+        """All of the change, or nothing and False where `version` is no longer the latest."""
+        async with reaching():
+            return await self._write(id, version, change, b"")
+
+    async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bool:
+        field = "" if change.t is None else change.t
+        args: list[Any] = [
+            version,
+            change.offset,
+            change.rows,
+            field,
+            change.step,
+            change.state,
+            config,
+            self._ttl * 1000,
+        ]
+        return bool(await self._append(keys=_keys(id), args=args))
+
+    async def load(self, id: str, t: int | None = None) -> Record | None:
+        """The session, with what step t left; None where there is none. One round trip."""
+        session, history, steps = _keys(id)
+        async with reaching(), self.redis.pipeline(transaction=False) as pipe:
+            # In this order a write in between is harmless: rows past what the state counts are not looked at,
+            # and a step that is there is the answer, whatever the state says.
+            pipe.hmget(session, "config", "state", "version")
+            pipe.get(history)
+            if t is not None:
+                pipe.hget(steps, t)
+            (config, state, version), rows, *step = await pipe.execute()
+        if config is None or rows is None:
+            return None
+        return Record(config, state, version, rows, step[0] if step else None)
+
+    async def steps(self, id: str) -> dict[int, bytes]:
+        """What every decided step left."""
+        async with reaching():
+            return {int(t): step for t, step in (await self.redis.hgetall(_keys(id)[2])).items()}
+
+    async def delete(self, id: str) -> bool:
+        """Erase all of it. False where there was nothing."""
+        async with reaching():
+            found = await self.redis.unlink(*_keys(id))
+            await self.redis.zrem(INDEX, id)
+        return bool(found)
+
+    async def page(self, after: str | None, limit: int) -> tuple[list[tuple[bytes, bytes]], str | None]:
+        """Up to `limit` of (config, state) in order of id, and the id to go on after, None at the end."""
+        listed: list[tuple[bytes, bytes]] = []
+        async with reaching():
+            while len(listed) < limit:
+                low = "-" if after is None else f"({after}"
+                ids = await self.redis.zrangebylex(INDEX, low, "+", 0, limit - len(listed))
+                if not ids:
+                    return listed, None
+                listed += await self._configs(ids)
+                after = ids[-1].decode()
+        return listed, after
+
+    async def count(self) -> int:
+        """How many sessions there are; some may have expired."""
+        async with reaching():
+            return int(await self.redis.zcard(INDEX))
+
+    async def _configs(self, ids: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
+        async with self.redis.pipeline(transaction=False) as pipe:
+            for id in ids:
+                pipe.hmget(_keys(id.decode())[0], "config", "state")
+            found = await pipe.execute()
+        expired = [id for id, (config, _) in zip(ids, found, strict=True) if config is None]
+        if expired:
+            await self.redis.zrem(INDEX, *expired)
+        return [(config, state) for config, state in found if config is not None]
+
+
+@asynccontextmanager
+async def reaching() -> AsyncIterator[None]:
+    """Whatever the store's client raises becomes a StoreError."""
+    try:
+        yield
+    except (redis.RedisError, OSError) as error:
+        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+
+
+def _keys(id: str) -> list[str]:
+    return [f"specshield:{{{id}}}:{part}" for part in ("session", "history", "steps")]

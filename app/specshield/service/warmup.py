@@ -1,0 +1,55 @@
+"""Compiles every kernel a decision needs, on a world of a few cells, before the server says it is ready."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from specshield.policy.network import make_network
+from specshield.policy.observation import observation_size
+from specshield.policy.policy import Policy
+from specshield.policy.progress import make_rules
+from specshield.robot import STRETCH
+from specshield.robot.unicycle import make_body
+from specshield.shield import episode
+from specshield.shield.decision import Shield, make_shield
+from specshield.task import Task, make_task
+from specshield.world.occupancy import OccupancyGrid
+
+FORMULA = "F[0,3] A and F[0,2] G[0,1] B and G[0,4] not C"
+REGIONS = {
+    "A": {"type": "circle", "center": [1.0, 1.0], "radius": 1.0},
+    "B": {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 2.0]},
+    "C": {"type": "polygon", "vertices": [[1.8, 1.8], [1.9, 1.8], [1.9, 1.9]]},
+}
+START = (1.0, 1.0, 0.0)
+
+
+def warm_up() -> None:
+    """Seconds at the very first start of an installation; afterwards the kernels come from numba's cache."""
+    shield = _shield()
+    episode.start(shield, START)
+    logits = np.zeros(len(STRETCH.actions))
+    first = episode.decide(shield, [START], logits)
+    episode.decide(shield, [START, first.next_poses[0].tolist()], logits, carry=first.carry)
+
+
+def _shield() -> Shield:
+    occupied = np.zeros((20, 20), bool)
+    occupied[0] = True
+    task = make_task(OccupancyGrid(occupied, 0.1), STRETCH, FORMULA, REGIONS)
+    return make_shield([Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))])
+
+
+def _sizes(task: Task) -> tuple[int, int]:
+    body = make_body(task.robot, task.grid)
+    return observation_size(make_rules(task), body), len(body.translate)
+
+
+def _weights(task: Task) -> dict[str, np.ndarray]:
+    inputs, outputs = _sizes(task)
+    sizes = [inputs, 4, 4, outputs]
+    weights: dict[str, np.ndarray] = {}
+    for i in range(3):
+        weights[f"w{i + 1}"] = np.zeros((sizes[i], sizes[i + 1]), np.float32)
+        weights[f"b{i + 1}"] = np.zeros(sizes[i + 1], np.float32)
+    return weights

@@ -1,0 +1,156 @@
+"""The training worker: `specshield worker`. One process takes jobs, a fork of it runs each."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rq import Worker
+from rq.job import Job
+from rq.serializers import JSONSerializer
+
+from specshield.errors import SpecshieldError, StoreError
+from specshield.policy.settings import read_settings
+from specshield.service.embedded import EmbeddedStore
+from specshield.service.jobs import QUEUE, SIGN_OF_LIFE, Jobs
+from specshield.service.maps import Maps
+from specshield.service.policies import Policies
+from specshield.service.settings import Settings
+
+log = logging.getLogger("specshield")
+
+
+def serve(settings: Settings, until_eof: bool) -> None:
+    """Work until told to stop, or until standard input ends: the server that started this one is gone."""
+    if settings.redis_url is None:
+        embedded = EmbeddedStore(settings.data_dir)
+        embedded.join()
+        os.environ["REDIS_URL"] = embedded.url  # for the runs
+    jobs = Jobs(os.environ.get("REDIS_URL") or str(settings.redis_url), settings)
+    if until_eof:
+        threading.Thread(target=_stop_at_eof, daemon=True).start()
+    with _signs_of_life(jobs, None):
+        _Worker(jobs).work(logging_level="WARNING")
+
+
+class _Worker(Worker):
+    """rq's worker, which on SIGTERM ends the run at once: what it has learned is in its checkpoint."""
+
+    def __init__(self, jobs: Jobs) -> None:
+        super().__init__(
+            [QUEUE],
+            connection=jobs.redis,
+            serializer=JSONSerializer,
+            work_horse_killed_handler=self._killed,
+            worker_ttl=60,
+        )
+        self._jobs = jobs
+        self._running: Any = None
+
+    def execute_job(self, job: Job, queue: Any) -> None:
+        self._running = job.args
+        super().execute_job(job, queue)
+        self._running = None
+
+    def request_stop(self, signum: int, frame: Any) -> None:
+        if self._running is not None:
+            self._fail(
+                self._running, "the worker was stopped; ask for it again and it goes on from its checkpoint"
+            )
+            self.kill_horse()
+        raise SystemExit(0)
+
+    def _killed(self, job: Job, pid: int, status: int, usage: Any) -> None:
+        how = (
+            f"by signal {os.WTERMSIG(status)}"
+            if status and os.WIFSIGNALED(status)
+            else f"with status {status}"
+        )
+        if status and os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
+            how += " (the kernel does this when memory runs out)"
+        self._fail(
+            job.args, f"the training process ended {how}; ask for it again and it goes on from its checkpoint"
+        )
+
+    def _fail(self, args: Any, reason: str) -> None:
+        id, attempt = args
+        self._jobs.report(id, attempt, status="failed", error=reason, eta_s="")
+
+
+def train(id: str, attempt: str) -> None:
+    """One run, in a process of its own. Whatever ends it is said in the policy's `error`."""
+    settings = Settings()
+    jobs = Jobs(str(settings.redis_url), settings)
+    if not jobs.report(id, attempt, status="training"):
+        return  # cancelled, or asked for again
+    with _signs_of_life(jobs, id):
+        try:
+            if _train(settings, jobs, id, attempt):
+                jobs.report(id, attempt, status="ready", progress=1, eta_s=0)
+        except SpecshieldError as error:
+            jobs.report(id, attempt, status="failed", error=error.message, eta_s="")
+        except Exception as error:
+            log.exception("training of %s", id)
+            jobs.report(id, attempt, status="failed", error=f"{type(error).__name__}: {error}", eta_s="")
+
+
+def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> bool:
+    from specshield.policy import dqn  # torch: in this process alone
+
+    policies = Policies(settings, Maps(settings))
+    record = policies.record(id)
+    about = record.about
+    wanted = True
+
+    def on_progress(progress: dqn.Progress) -> None:
+        nonlocal wanted
+        done = progress.update / progress.updates
+        wanted = jobs.report(id, attempt, progress=round(done, 4), eta_s=round(progress.eta_s, 1))
+
+    try:
+        policy = dqn.train(
+            policies.task(about),
+            read_settings(about.options),
+            about.seed,
+            on_progress,
+            policies.checkpoints(id),
+            lambda: not wanted,
+            about.spec,
+        )
+    except dqn.Stopped:
+        return False
+    policies.finish(id, policy.weights(), {**policy.card, "map_id": about.map_id})
+    return True
+
+
+@contextmanager
+def _signs_of_life(jobs: Jobs, id: str | None) -> Iterator[None]:
+    over = threading.Event()
+
+    def beat() -> None:
+        while not over.is_set():
+            try:
+                jobs.sign_of_life(id)
+            except StoreError as error:
+                log.warning("%s", error)
+            over.wait(SIGN_OF_LIFE / 4)
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(1.0)
+
+
+def _stop_at_eof() -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
