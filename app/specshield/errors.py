@@ -46,7 +46,13 @@ class SpecshieldError(Exception):
     type: ClassVar[str] = "error"
 
     def __init__(
-        self, message: str, *, path: str | None = None, got: Any = None, expected: str | None = None, **details: Any
+        self,
+        message: str,
+        *,
+        path: str | None = None,
+        got: Any = None,
+        expected: str | None = None,
+        **details: Any,
     ) -> None:
         super().__init__(message)
         self.message = message

@@ -29,7 +29,8 @@ MAX_NAME = 64
 class Task:
     """regions: those that the formula names, the spec's own and the map's rooms.
 
-    signals: the names of other signals the formula may use, with the value each holds before its first sample.
+    signals: the names of other signals the formula may use, with the value each holds before its first
+    sample.
     """
 
     grid: OccupancyGrid
@@ -59,8 +60,8 @@ class Task:
     ) -> dict[str, NDArray[np.float64]]:
         """The signals of a trajectory, for `stl.robustness`.
 
-        poses [..., N, 3] in metres and radians; signals {name: [n]} with n <= N, their last value held to N (J is
-        conditional on that), the initial value where none was sent. Result {name: [..., N]}.
+        poses [..., N, 3] in metres and radians; signals {name: [n]} with n <= N, their last value held to N
+        (J is conditional on that), the initial value where none was sent. Result {name: [..., N]}.
         """
         array = np.asarray(poses, dtype=np.float64)
         result: dict[str, NDArray[np.float64]] = {}
@@ -85,7 +86,9 @@ class Task:
                     expected=f"one of {sorted(self.signals)}, as the spec declares them",
                 )  # fmt: skip
             if not math.isfinite(value):
-                raise SampleError("a signal is finite", path=f"signals.{name}", got=str(value), expected="a number")
+                raise SampleError(
+                    "a signal is finite", path=f"signals.{name}", got=str(value), expected="a number"
+                )
 
 
 def make_task(
@@ -99,8 +102,9 @@ def make_task(
 ) -> Task:
     """Checks and joins the parts of a task.
 
-    regions: {name: region JSON or Region}, the spec's own; they come before the map's `rooms` of the same name.
-    Raises FormulaError, MapError (regions), SampleError (signals), with the path of the field below the spec.
+    regions: {name: region JSON or Region}, the spec's own; they come before the map's `rooms` of the same
+    name. Raises FormulaError, MapError (regions), SampleError (signals), with the path of the field below the
+    spec.
     """
     declared = parse_regions(regions or {})
     initial = parse_signals(signals or {}, declared)
@@ -108,7 +112,10 @@ def make_task(
     tree = parse(formula, names=[*known, *POSE_NAMES, *initial], max_horizon=max_horizon)
     if tree.horizon < 1:
         raise FormulaError(
-            "the formula looks at no step after the first", path="formula", got=formula, expected="a horizon of at least 1"
+            "the formula looks at no step after the first",
+            path="formula",
+            got=formula,
+            expected="a horizon of at least 1",
         )
     used = {name: known[name] for name in tree.names if name in known}
     return Task(grid, robot, tree, used, {name: initial[name] for name in tree.names if name in initial})
@@ -117,7 +124,9 @@ def make_task(
 def parse_regions(regions: Mapping[str, Any]) -> dict[str, Region]:
     """Regions by name, from JSON or as they are. Raises MapError with the path of the field."""
     if len(regions) > MAX_REGIONS:
-        raise MapError("too many regions", path="regions", got=len(regions), expected=f"at most {MAX_REGIONS}")
+        raise MapError(
+            "too many regions", path="regions", got=len(regions), expected=f"at most {MAX_REGIONS}"
+        )
     result: dict[str, Region] = {}
     for name, region in regions.items():
         _check_name(name, f"regions.{name}")
@@ -126,14 +135,19 @@ def parse_regions(regions: Mapping[str, Any]) -> dict[str, Region]:
 
 
 def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dict[str, float]:
-    """Declared signals with their initial values. Raises MapError or SampleError with the path of the field."""
+    """Signals with their initial values. Raises MapError or SampleError with the path of the field."""
     for name, value in signals.items():
         _check_name(name, f"signals.{name}")
         if name in taken:
-            raise MapError("a region has this name", path=f"signals.{name}", got=name, expected="a name of its own")
+            raise MapError(
+                "a region has this name", path=f"signals.{name}", got=name, expected="a name of its own"
+            )
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             raise SampleError(
-                "a signal's initial value is a number", path=f"signals.{name}", got=value, expected="a finite number"
+                "a signal's initial value is a number",
+                path=f"signals.{name}",
+                got=value,
+                expected="a finite number",
             )
     return {name: float(value) for name, value in signals.items()}
 
@@ -142,5 +156,5 @@ def _check_name(name: str, path: str) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
         raise MapError(
             f"{name!r} cannot be a name", path=path, got=name,
-            expected=f"letters, digits and _ (at most {MAX_NAME}), not a keyword of the formula language, not x, y or theta",
+            expected=f"up to {MAX_NAME} letters, digits and _; no word of the formula language, no x, y, theta",
         )  # fmt: skip

@@ -51,14 +51,14 @@ class Environment:
         self.step(np.zeros(robots, dtype=np.int64))
 
     def step(self, motions: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Every robot takes one motion (N,). Rewards (N,) and whether its episode ended (N,); ended ones begin anew."""
+        """Each robot takes a motion (N,). Rewards, and which episodes ended, (N,); those robots begin anew."""
         n, k = self.status.shape
         fresh = free_poses(self.task, self.body, n, self.random)
         times = np.where(self.random.random(n) < 0.5, 0, self.random.integers(0, self.task.horizon, n))
         rewards, ended = np.zeros(n, np.float32), np.zeros(n, np.bool_)
         _step_all(
-            self.body, self.rules, self.sight, self.funnels, self.pose, self.t, self.status, self.run, self.nexts,
-            self.observations, motions, fresh, times, self.random.random((n, k)), rewards, ended,
+            self.body, self.rules, self.sight, self.funnels, self.pose, self.t, self.status, self.run,
+            self.nexts, self.observations, motions, fresh, times, self.random.random((n, k)), rewards, ended,
         )  # fmt: skip
         return rewards, ended
 

@@ -3,10 +3,10 @@
     gamma(t) = (gamma_0 - gamma_inf) exp(-l t) + gamma_inf                      (eq. 4)
     r(x_t)   = rho(x_t, predicate) + gamma(t) - rho_max                         (eq. 5)
 
-Two rewards for a conjunction of obligations. `paper`: the minimum of r over the obligations not yet settled, taken
-literally. `progress`, the default: the share of goals settled plus the current goal's funnel along free space, in the
-minimum with the `always` obligations' robustness, capped: uncapped, the farthest distance from a forbidden region
-rules the minimum, and the straight-line distance to a region behind a wall misleads.
+Two rewards for a conjunction of obligations. `paper`: the minimum of r over the obligations not yet settled,
+taken literally. `progress`, the default: the share of goals settled plus the current goal's funnel along free
+space, in the minimum with the `always` obligations' robustness, capped: uncapped, the farthest distance from
+a forbidden region rules the minimum, and the straight-line distance to a region behind a wall misleads.
 """
 
 from __future__ import annotations
@@ -40,13 +40,15 @@ class Funnels(NamedTuple):
 def decay_rate(gamma_0: float, gamma_inf: float, rho_max: float, t_star: float) -> float:
     """Table I's l: the funnel's boundary reaches zero robustness at t_star steps.
 
-    t_star is at least 1 (G[0,b] would divide by zero), and l at least 0 (where min rho > gamma_inf the logarithm is
-    negative: the whole space is already inside).
+    t_star is at least 1 (G[0,b] would divide by zero), and l at least 0 (where min rho > gamma_inf the
+    logarithm is negative: the whole space is already inside).
     """
     return max(math.log((gamma_0 - gamma_inf) / (rho_max - gamma_inf)) / max(t_star, 1.0), 0.0)
 
 
-def make_funnels(rules: Rules, sight: Sight, lowest: NDArray[np.float64], highest: NDArray[np.float64], literal: bool) -> Funnels:
+def make_funnels(
+    rules: Rules, sight: Sight, lowest: NDArray[np.float64], highest: NDArray[np.float64], literal: bool
+) -> Funnels:
     """Funnels of a task's obligations. lowest, highest (K,): each predicate's robustness over free space.
 
     Each clock starts at its own window: t* is Table I's, halfway through it, counted from the window's start.
@@ -74,7 +76,8 @@ def make_funnels(rules: Rules, sight: Sight, lowest: NDArray[np.float64], highes
 def gamma(funnels: Funnels, k: int, t: int) -> float:
     """Eq. 4 at step t; gamma_0 before the window."""
     elapsed = max(t - funnels.clock[k], 0)
-    return (funnels.gamma_0[k] - funnels.gamma_inf[k]) * math.exp(-funnels.rate[k] * elapsed) + funnels.gamma_inf[k]
+    decayed = (funnels.gamma_0[k] - funnels.gamma_inf[k]) * math.exp(-funnels.rate[k] * elapsed)
+    return float(decayed + funnels.gamma_inf[k])
 
 
 @njit(cache=True, nogil=True)

@@ -32,12 +32,19 @@ class Network(NamedTuple):
 def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, outputs: int) -> Network:
     """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
     if sorted(weights) != sorted(NAMES):
-        raise PolicyError("not the tensors of a Q-network", path="weights", got=sorted(weights), expected=str(sorted(NAMES)))
+        raise PolicyError(
+            "not the tensors of a Q-network", path="weights", got=sorted(weights), expected=str(sorted(NAMES))
+        )
     for name, array in weights.items():
-        if array.dtype != np.float32 or array.ndim != (2 if name[0] == "w" else 1) or not np.isfinite(array).all():
+        if (
+            array.dtype != np.float32
+            or array.ndim != (2 if name[0] == "w" else 1)
+            or not np.isfinite(array).all()
+        ):
             raise PolicyError(
                 "a tensor is not finite float32 of the right rank", path=f"weights.{name}",
-                got=f"{array.dtype} {list(array.shape)}", expected="float32, w [inputs, outputs], b [outputs]",
+                got=f"{array.dtype} {list(array.shape)}",
+                expected="float32, w [inputs, outputs], b [outputs]",
             )  # fmt: skip
     sizes = [inputs, weights["w1"].shape[1], weights["w2"].shape[1], outputs]
     for i in range(3):
@@ -51,7 +58,9 @@ def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, output
 
 
 @njit(cache=True, nogil=True)
-def _layer(x: NDArray[np.float32], w: NDArray[np.float32], b: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+def _layer(
+    x: NDArray[np.float32], w: NDArray[np.float32], b: NDArray[np.float32], out: NDArray[np.float32]
+) -> None:
     for j in range(out.shape[0]):
         out[j] = b[j]
     for i in range(x.shape[0]):

@@ -1,4 +1,4 @@
-"""What pi_phi sees: time, pose, the formula's progress, and the ways along free space to what is still to be visited."""
+"""What pi_phi sees: time, pose, the formula's progress, the ways along free space to its goals."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ NEAR_ALWAYS = 0.3  # [m] an always-predicate farther from its boundary than this
 
 
 class Sight(NamedTuple):
-    """What an observation needs of the task, prepared once. G goals: the obligations that are not `always`."""
+    """What an observation needs of a task, prepared once. G goals: the obligations that are not `always`."""
 
-    distance: NDArray[np.float64]  # [G, height, width] metres along free space to where the goal's predicate holds
+    distance: NDArray[np.float64]  # [G, height, width] metres along free space to where the predicate holds
     goal: NDArray[np.int64]  # [K] index into `distance`, -1 for an `always`
     centre_x: float
     centre_y: float
@@ -44,7 +44,7 @@ class Sight(NamedTuple):
 
 
 def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
-    """Distances along free space, fields of shape [height, width] each, with cells that an `always` forbids closed.
+    """Distances along free space, [height, width] each; cells that an `always` forbids are closed.
 
     The straight-line distance to a region behind a wall misleads a learner; J and rho never use these.
     """
@@ -53,7 +53,7 @@ def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
     free = grid.clearance >= task.robot.radius - 0.5 * grid.resolution
     goals = [k for k in range(len(rules.kind)) if rules.kind[k] != ALWAYS]
     index = np.full(len(rules.kind), -1, dtype=np.int64)
-    fields = []
+    fields: list[NDArray[np.float64]] = []
     for k in goals:
         index[k] = len(fields)
         allowed = free.copy()
@@ -84,7 +84,7 @@ def observation_size(rules: Rules, body: Body) -> int:
 
 
 def _fill(distance: NDArray[np.float64], resolution: float) -> NDArray[np.float64]:
-    """Cells no path reaches take the nearest reached cell's distance and the way to it, so that fields are finite."""
+    """Cells no path reaches take the nearest reached cell's distance and the way to it: fields are finite."""
     reached = np.isfinite(distance)
     if not reached.any():
         return np.full_like(distance, 1e3)
@@ -114,11 +114,11 @@ def field_at(body: Body, field: NDArray[np.float64], x: float, y: float) -> floa
     v = min(max(v, 0.0), field.shape[0] - 1.0)
     i, j = min(int(u), field.shape[1] - 2), min(int(v), field.shape[0] - 2)
     if i < 0 or j < 0:  # a grid one cell wide
-        return field[int(v), int(u)]
+        return float(field[int(v), int(u)])
     p, q = u - i, v - j
     low = field[j, i] * (1.0 - p) + field[j, i + 1] * p
     high = field[j + 1, i] * (1.0 - p) + field[j + 1, i + 1] * p
-    return low * (1.0 - q) + high * q
+    return float(low * (1.0 - q) + high * q)
 
 
 @njit(cache=True, nogil=True)
@@ -126,7 +126,11 @@ def current_goal(rules: Rules, status: NDArray[np.int8]) -> int:
     """The pending goal with the earliest deadline, -1 where none is left."""
     best = -1
     for k in range(rules.kind.shape[0]):
-        if rules.kind[k] != ALWAYS and status[k] == PENDING and (best < 0 or rules.last[k] < rules.last[best]):
+        if (
+            rules.kind[k] != ALWAYS
+            and status[k] == PENDING
+            and (best < 0 or rules.last[k] < rules.last[best])
+        ):
             best = k
     return best
 

@@ -1,4 +1,6 @@
-"""A trained pi_phi: its card, its weights, and what it proposes. Weights are safetensors; nothing is unpickled."""
+"""A trained pi_phi: its card, its weights, and what it proposes. Weights are safetensors; nothing is
+unpickled.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,8 @@ FORMAT = 1
 class Proposal:
     """What pi_phi would do: a continuation to the horizon after each first motion.
 
-    motions [M, T - t]: row m begins with motion m; indices into `Robot.motions`. poses [M, T - t, 3]: after each.
-    preferred: the motion pi_phi itself takes at x_t.
+    motions [M, T - t]: row m begins with motion m; indices into `Robot.motions`. poses [M, T - t, 3]: after
+    each. preferred: the motion pi_phi itself takes at x_t.
     """
 
     motions: NDArray[np.int64]
@@ -50,14 +52,18 @@ class Proposer(Protocol):
     @property
     def task(self) -> Task: ...
 
-    def propose(self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float) -> Proposal:
+    def propose(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> Proposal:
         """history [t + 1, 3] with t < T; signals {name: [t + 1]}; margin: robustness to aim above."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A DQN's greedy policy pi_phi(x, t) = argmax_a Q(x, a, t), with the formula's progress in its observation."""
+    """A DQN's greedy policy pi_phi(x, t) = argmax_a Q(x, a, t), with the formula's progress in its
+    observation.
+    """
 
     task: Task
     card: Card
@@ -72,7 +78,9 @@ class Policy:
         body, rules = make_body(self.task.robot, self.task.grid), make_rules(self.task)
         return body, rules, make_sight(self.task, rules, body)
 
-    def propose(self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float) -> Proposal:
+    def propose(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> Proposal:
         body, rules, sight = self._prepared
         rules = hold_signals(rules, self.task, signals)._replace(margin=margin)
         t, wait = len(history) - 1, wait_motion(self.task.robot)
@@ -98,7 +106,9 @@ def wait_motion(robot: Robot) -> int:
 
 def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:
     """The hash of task, method, options and seed, as hex."""
-    content = json.dumps({"task": task_hash, "method": method, "options": options, "seed": seed}, sort_keys=True)
+    content = json.dumps(
+        {"task": task_hash, "method": method, "options": options, "seed": seed}, sort_keys=True
+    )
     return hashlib.sha256(content.encode()).hexdigest()
 
 
@@ -154,7 +164,10 @@ def load_policy(weights: bytes, card: Card, task: Task) -> Policy:
         tensors = load_tensors(weights)
     except Exception as error:  # the parser raises its own types for hostile bytes
         raise PolicyError(
-            f"not a safetensors file: {error}", path="weights", got=f"{len(weights)} bytes", expected="safetensors"
+            f"not a safetensors file: {error}",
+            path="weights",
+            got=f"{len(weights)} bytes",
+            expected="safetensors",
         ) from error
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     return Policy(task, card, make_network(tensors, observation_size(rules, body), len(body.translate)))

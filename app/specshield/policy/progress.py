@@ -1,7 +1,8 @@
-"""The formula's progress: which obligations are settled, which are broken, as compiled code steps along a trajectory.
+"""The formula's progress: which obligations are settled, which are broken, as compiled code steps along a
+trajectory.
 
-pi_phi sees time and pose, but phi depends on history (a charger already visited): progress is what of the history
-still matters to a formula of the paper's fragment.
+pi_phi sees time and pose, but phi depends on history (a charger already visited): progress is what of the
+history still matters to a formula of the paper's fragment.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ def hold_signals(rules: Rules, task: Task, signals: Mapping[str, NDArray[np.floa
 
 @njit(cache=True, nogil=True)
 def value_count(rules: Rules) -> int:
-    return 3 + rules.region_starts.shape[0] - 1 + rules.signals.shape[0]
+    return int(3 + rules.region_starts.shape[0] - 1 + rules.signals.shape[0])
 
 
 @njit(cache=True, nogil=True)
@@ -128,8 +129,8 @@ def advance(
 ) -> None:
     """Takes the state at step t into the progress, in place.
 
-    predicates (K,) at x_t; status (K,): PENDING, SETTLED or BROKEN; run (K,): how many steps, this one included,
-    an eventually-always predicate has held without a break since its earliest window could begin.
+    predicates (K,) at x_t; status (K,): PENDING, SETTLED or BROKEN; run (K,): how many steps, this one
+    included, an eventually-always predicate has held without a break since its earliest window could begin.
     """
     for k in range(rules.kind.shape[0]):
         if status[k] != PENDING:

@@ -29,9 +29,9 @@ def rollout(
 ) -> int:
     """pi_phi from (x_t, t) to the horizon, after the motion `first` (-1: pi_phi chooses that one too).
 
-    status, run (K,): the progress after x_t, left as they are. wait: a motion that leaves the pose alone, -1 if
-    there is none; once the formula is settled or broken the robot waits. Writes motions (T - t,) and the poses
-    after each (T - t, 3). Returns the progress reached: PENDING, SETTLED or BROKEN.
+    status, run (K,): the progress after x_t, left as they are. wait: a motion that leaves the pose alone, -1
+    if there is none; once the formula is settled or broken the robot waits. Writes motions (T - t,) and the
+    poses after each (T - t, 3). Returns the progress reached: PENDING, SETTLED or BROKEN.
     """
     status, run = status.copy(), run.copy()
     here = pose.copy()
@@ -53,7 +53,21 @@ def rollout(
         else:
             successors(body, here, nexts)
             read_predicates(rules, here[0], here[1], here[2], values, stack, predicates)
-            observe(body, rules, sight, t + k, here, status, run, predicates, nexts, values, stack, after, observation)
+            observe(
+                body,
+                rules,
+                sight,
+                t + k,
+                here,
+                status,
+                run,
+                predicates,
+                nexts,
+                values,
+                stack,
+                after,
+                observation,
+            )
             motion = greedy(net, observation, h1, h2, q)
         motions[k] = motion
         here[:] = nexts[motion]
@@ -92,7 +106,9 @@ def satisfies(
     first: bool,
     wait: int,
 ) -> NDArray[np.bool_]:
-    """Whether pi_phi settles the formula from each start (N, 3) at t = 0; with `first`, after some first motion."""
+    """Whether pi_phi settles the formula from each start (N, 3) at t = 0; with `first`, after some first
+    motion.
+    """
     out = np.zeros(starts.shape[0], np.bool_)
     motions, poses = np.empty(sight.horizon, np.int64), np.empty((sight.horizon, 3))
     status, run = np.zeros(rules.kind.shape[0], np.int8), np.zeros(rules.kind.shape[0], np.int64)

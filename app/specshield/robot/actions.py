@@ -79,7 +79,28 @@ def _stretch() -> Robot:
         "ls": (0.0, nudge),
         "rs": (0.0, -nudge),
     }
-    tokens = "m r l b end sub_done ls rs p zm zp yp ym wp wm yms zms zps yps d".split()
+    tokens = [
+        "m",
+        "r",
+        "l",
+        "b",
+        "end",
+        "sub_done",
+        "ls",
+        "rs",
+        "p",
+        "zm",
+        "zp",
+        "yp",
+        "ym",
+        "wp",
+        "wm",
+        "yms",
+        "zms",
+        "zps",
+        "yps",
+        "d",
+    ]
     actions = tuple(Action(name, *moves.get(name, (0.0, 0.0)), terminal=name == "end") for name in tokens)
     return Robot("stretch", radius=0.1855, offset=(-0.109, 0.0), on_contact="stop", actions=actions)
 
@@ -97,7 +118,9 @@ def robot_from_json(spec: Any) -> Robot:
     """
     if isinstance(spec, str):
         if spec not in PRESETS:
-            raise RobotError(f"unknown robot {spec!r}", got=spec, expected=f"one of {sorted(PRESETS)}, or an object")
+            raise RobotError(
+                f"unknown robot {spec!r}", got=spec, expected=f"one of {sorted(PRESETS)}, or an object"
+            )
         return PRESETS[spec]
     _keys(spec, "", {"footprint", "actions"}, {"on_contact"})
     footprint = spec["footprint"]
@@ -105,23 +128,34 @@ def robot_from_json(spec: Any) -> Robot:
     radius = _number(footprint["radius"], "footprint.radius", low=0.0, high=5.0)
     offset = footprint.get("offset", [0.0, 0.0])
     if not isinstance(offset, (list, tuple)) or len(offset) != 2:
-        raise RobotError("an offset is two numbers", path="footprint.offset", got=offset, expected="[x, y] in metres")
+        raise RobotError(
+            "an offset is two numbers", path="footprint.offset", got=offset, expected="[x, y] in metres"
+        )
     ox, oy = (_number(v, f"footprint.offset[{i}]", low=-5.0, high=5.0) for i, v in enumerate(offset))
     on_contact = spec.get("on_contact", "stay")
     if on_contact not in ("stay", "stop"):
-        raise RobotError("unknown contact rule", path="on_contact", got=on_contact, expected="'stay' or 'stop'")
+        raise RobotError(
+            "unknown contact rule", path="on_contact", got=on_contact, expected="'stay' or 'stop'"
+        )
     items = spec["actions"]
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ACTIONS:
         raise RobotError(
-            "a robot has a list of actions", path="actions", got=type(items).__name__, expected=f"1 to {MAX_ACTIONS} actions"
+            "a robot has a list of actions",
+            path="actions",
+            got=type(items).__name__,
+            expected=f"1 to {MAX_ACTIONS} actions",
         )
     actions = tuple(_action(item, f"actions[{i}]") for i, item in enumerate(items))
     names = [action.name for action in actions]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise RobotError("two actions have one name", path=f"actions[{i}].name", got=name, expected="unique names")
+            raise RobotError(
+                "two actions have one name", path=f"actions[{i}].name", got=name, expected="unique names"
+            )
     if all(action.terminal for action in actions):
-        raise RobotError("every action is terminal", path="actions", got=names, expected="at least one that is not")
+        raise RobotError(
+            "every action is terminal", path="actions", got=names, expected="at least one that is not"
+        )
     return Robot("custom", radius, (ox, oy), on_contact, actions)
 
 
@@ -143,27 +177,44 @@ def _action(item: Any, path: str) -> Action:
     _keys(item, path, {"name"}, {"translate", "rotate", "terminal"})
     name = item["name"]
     if not isinstance(name, str) or not 1 <= len(name) <= 64:
-        raise RobotError("an action needs a name", path=f"{path}.name", got=name, expected="1 to 64 characters")
+        raise RobotError(
+            "an action needs a name", path=f"{path}.name", got=name, expected="1 to 64 characters"
+        )
     terminal = item.get("terminal", False)
     if not isinstance(terminal, bool):
-        raise RobotError("terminal is true or false", path=f"{path}.terminal", got=terminal, expected="a boolean")
-    translate = _number(item.get("translate", 0.0), f"{path}.translate", low=-MAX_TRANSLATE, high=MAX_TRANSLATE)
+        raise RobotError(
+            "terminal is true or false", path=f"{path}.terminal", got=terminal, expected="a boolean"
+        )
+    translate = _number(
+        item.get("translate", 0.0), f"{path}.translate", low=-MAX_TRANSLATE, high=MAX_TRANSLATE
+    )
     rotate = _number(item.get("rotate", 0.0), f"{path}.rotate", low=-2 * math.pi, high=2 * math.pi)
     if terminal and (translate or rotate):
-        raise RobotError("a terminal action moves nothing", path=path, got=item, expected="no translate, no rotate")
+        raise RobotError(
+            "a terminal action moves nothing", path=path, got=item, expected="no translate, no rotate"
+        )
     return Action(name, translate, rotate, terminal)
 
 
 def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
     if not isinstance(item, dict):
-        raise RobotError("not an object", path=path or None, got=type(item).__name__, expected=f"an object with {sorted(required)}")
+        raise RobotError(
+            "not an object",
+            path=path or None,
+            got=type(item).__name__,
+            expected=f"an object with {sorted(required)}",
+        )
     missing, unknown = required - item.keys(), item.keys() - required - optional
     if missing or unknown:
         said = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(map(str, unknown))}"
-        raise RobotError(said, path=path or None, got=sorted(map(str, item)), expected=f"{sorted(required | optional)}")
+        raise RobotError(
+            said, path=path or None, got=sorted(map(str, item)), expected=f"{sorted(required | optional)}"
+        )
 
 
 def _number(value: Any, path: str, low: float, high: float) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise RobotError("not a number in range", path=path, got=value, expected=f"a number from {low:g} to {high:g}")
+        raise RobotError(
+            "not a number in range", path=path, got=value, expected=f"a number from {low:g} to {high:g}"
+        )
     return float(value)

@@ -1,11 +1,11 @@
 """The known dynamics x_{t+1} = f(x_t, a_t): a unicycle with a circular footprint on an occupancy grid.
 
-One compiled function, `step`, is f for everything: the rollout that certifies an action, training, simulation.
-It handles one pose at a time, so its result never depends on a batch's shape.
+One compiled function, `step`, is f for everything: the rollout that certifies an action, training,
+simulation. It handles one pose at a time, so its result never depends on a batch's shape.
 
-Contact is exact for moves: the disc is swept along its straight path against each occupied cell's square, so no
-move jumps a thin wall. A turn sweeps an off-centre footprint along an arc, tested as chords of at most 6 degrees,
-and is all or nothing. From inside an obstacle, f permits what does not go deeper.
+Contact is exact for moves: the disc is swept along its straight path against each occupied cell's square, so
+no move jumps a thin wall. A turn sweeps an off-centre footprint along an arc, tested as chords of at most 6
+degrees, and is all or nothing. From inside an obstacle, f permits what does not go deeper.
 """
 
 from __future__ import annotations
@@ -88,25 +88,25 @@ def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
 def _is_occupied(body: Body, row: int, col: int) -> bool:
     if row < 0 or col < 0 or row >= body.occupied.shape[0] or col >= body.occupied.shape[1]:
         return True
-    return body.occupied[row, col] != 0
+    return bool(body.occupied[row, col] != 0)
 
 
 @njit(cache=True, nogil=True)
 def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     """Exact distance [m] from a point (grid metres) to the nearest occupied square, at most `limit`."""
     h = body.resolution
-    col, row = int(math.floor(u / h)), int(math.floor(v / h))
+    col, row = math.floor(u / h), math.floor(v / h)
     if _is_occupied(body, row, col):
         return 0.0
     bound = body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h)
     if bound >= limit:
         return limit
     best = limit * limit
-    for j in range(int(math.floor((v - limit) / h)), int(math.floor((v + limit) / h)) + 1):
+    for j in range(math.floor((v - limit) / h), math.floor((v + limit) / h) + 1):
         dy = max(j * h - v, 0.0, v - (j + 1) * h)
         if dy * dy >= best:
             continue
-        for i in range(int(math.floor((u - limit) / h)), int(math.floor((u + limit) / h)) + 1):
+        for i in range(math.floor((u - limit) / h), math.floor((u + limit) / h) + 1):
             dx = max(i * h - u, 0.0, u - (i + 1) * h)
             if dx * dx + dy * dy < best and _is_occupied(body, j, i):
                 best = dx * dx + dy * dy
@@ -118,7 +118,7 @@ def _depth(body: Body, u: float, v: float) -> float:
     """How far inside occupied space a point lies [m]: the distance to the nearest free square."""
     h = body.resolution
     height, width = body.occupied.shape
-    row, col = int(math.floor(v / h)), int(math.floor(u / h))
+    row, col = math.floor(v / h), math.floor(u / h)
     half = 4
     while True:  # a window that grows until nothing outside it can be nearer
         best = np.inf
@@ -145,7 +145,9 @@ def _enters_slab(p: float, d: float, low: float, high: float) -> tuple[float, fl
 
 
 @njit(cache=True, nogil=True)
-def _enters_box(pu: float, pv: float, du: float, dv: float, u0: float, u1: float, v0: float, v1: float) -> float:
+def _enters_box(
+    pu: float, pv: float, du: float, dv: float, u0: float, u1: float, v0: float, v1: float
+) -> float:
     a0, a1 = _enters_slab(pu, du, u0, u1)
     b0, b1 = _enters_slab(pv, dv, v0, v1)
     enter, leave = max(a0, b0), min(a1, b1)
@@ -171,18 +173,18 @@ def _enters_disc(pu: float, pv: float, du: float, dv: float, cu: float, cv: floa
 
 @njit(cache=True, nogil=True)
 def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length: float, r: float) -> float:
-    """How far [m] a disc of radius r moves from (u, v) along the unit vector before it overlaps; inf if it never does."""
+    """How far [m] a disc of radius r moves from (u, v) along a unit vector until it overlaps; inf: never."""
     h = body.resolution
     mu, mv = u + 0.5 * length * du, v + 0.5 * length * dv
-    col, row = int(math.floor(mu / h)), int(math.floor(mv / h))
+    col, row = math.floor(mu / h), math.floor(mv / h)
     if 0 <= row < body.occupied.shape[0] and 0 <= col < body.occupied.shape[1]:
         bound = body.clearance[row, col] - math.hypot(mu - (col + 0.5) * h, mv - (row + 0.5) * h)
         if bound >= r + 0.5 * length:
             return np.inf
     eu, ev = u + length * du, v + length * dv
     first = np.inf
-    for j in range(int(math.floor((min(v, ev) - r) / h)), int(math.floor((max(v, ev) + r) / h)) + 1):
-        for i in range(int(math.floor((min(u, eu) - r) / h)), int(math.floor((max(u, eu) + r) / h)) + 1):
+    for j in range(math.floor((min(v, ev) - r) / h), math.floor((max(v, ev) + r) / h) + 1):
+        for i in range(math.floor((min(u, eu) - r) / h), math.floor((max(u, eu) + r) / h) + 1):
             if not _is_occupied(body, j, i):
                 continue
             u0, u1, v0, v1 = i * h, (i + 1) * h, j * h, (j + 1) * h
@@ -205,7 +207,8 @@ def _move(body: Body, x: float, y: float, theta: float, distance: float) -> floa
     gap = free_distance(body, u, v, body.radius)
     if gap == 0.0:
         return sign * _escape(body, u, v, du, dv, length)
-    # The radius tested is never more than the gap there is: what overlaps already may slide or leave, not go deeper.
+    # The radius tested is never more than the gap there is: what overlaps already may slide or leave, not go
+    # deeper.
     r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
     contact = _first_contact(body, u, v, du, dv, length, r)
     if contact == np.inf:
@@ -216,7 +219,7 @@ def _move(body: Body, x: float, y: float, theta: float, distance: float) -> floa
 @njit(cache=True, nogil=True)
 def _escape(body: Body, u: float, v: float, du: float, dv: float, length: float) -> float:
     """From a centre inside an obstacle: as far as the way never leads deeper, in steps of a quarter cell."""
-    n = int(math.ceil(length / (0.25 * body.resolution)))
+    n = math.ceil(length / (0.25 * body.resolution))
     depth = _depth(body, u, v)
     for k in range(1, n + 1):
         s = length * k / n
@@ -235,7 +238,7 @@ def _can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> boo
     gap = free_distance(body, u, v, body.radius)
     inside = _depth(body, u, v) if gap == 0.0 else 0.0
     r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
-    n = int(math.ceil(abs(angle) / CHORD - 1e-9))
+    n = math.ceil(abs(angle) / CHORD - 1e-9)
     for k in range(1, n + 1):
         eu, ev = centre(body, x, y, theta + angle * k / n)
         length = math.hypot(eu - u, ev - v)
@@ -268,7 +271,9 @@ def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[flo
 
 
 @njit(cache=True, nogil=True)
-def simulate(body: Body, pose: NDArray[np.float64], motions: NDArray[np.int64], out: NDArray[np.float64]) -> None:
+def simulate(
+    body: Body, pose: NDArray[np.float64], motions: NDArray[np.int64], out: NDArray[np.float64]
+) -> None:
     """The trajectory of a list of motions. pose (3,), motions (n,), out (n, 3): the poses after each."""
     x, y, theta = pose[0], pose[1], pose[2]
     for k in range(motions.shape[0]):
@@ -286,7 +291,7 @@ def successors(body: Body, pose: NDArray[np.float64], out: NDArray[np.float64]) 
 
 @njit(cache=True, nogil=True)
 def overlap(body: Body, x: float, y: float, theta: float) -> float:
-    """How deep [m] the footprint overlaps an obstacle: 0 where it is free, radius where its centre is inside."""
+    """How deep [m] the footprint overlaps an obstacle: 0 where free, radius where its centre is inside."""
     u, v = centre(body, x, y, theta)
     return body.radius - free_distance(body, u, v, body.radius)
 

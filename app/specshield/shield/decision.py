@@ -25,8 +25,8 @@ Reason = Literal["infeasible", "zero_prior_mass", "margin_unattainable"]
 class Config:
     """A session's settings. Raises InputError or Unsupported with the field's path.
 
-    threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho > margin
-    [m]. max_steps: None is max(600, T + 1). seed: of the drawn actions.
+    threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho
+    > margin [m]. max_steps: None is max(600, T + 1). seed: of the drawn actions.
     """
 
     threshold: float = 1.0
@@ -39,11 +39,17 @@ class Config:
     def __post_init__(self) -> None:
         if self.evaluation not in ("feasibility", "robustness"):
             raise InputError(
-                "unknown evaluation", path="evaluation", got=self.evaluation, expected="'feasibility' or 'robustness'"
+                "unknown evaluation",
+                path="evaluation",
+                got=self.evaluation,
+                expected="'feasibility' or 'robustness'",
             )
         if self.shaping == "lookahead":
             raise Unsupported(
-                "look-ahead shaping is not there yet", path="shaping", got=self.shaping, expected="'projection'"
+                "look-ahead shaping is not there yet",
+                path="shaping",
+                got=self.shaping,
+                expected="'projection'",
             )
         if self.shaping != "projection":
             raise InputError("unknown shaping", path="shaping", got=self.shaping, expected="'projection'")
@@ -54,7 +60,9 @@ class Config:
                 expected="above 0 and at most 1" if binary else "a finite number of metres",
             )  # fmt: skip
         if not (math.isfinite(self.margin) and self.margin >= 0.0):
-            raise InputError("the margin is out of range", path="margin", got=self.margin, expected="0 or more metres")
+            raise InputError(
+                "the margin is out of range", path="margin", got=self.margin, expected="0 or more metres"
+            )
 
 
 @dataclass(frozen=True)
@@ -72,9 +80,11 @@ class Shield:
 
 
 def make_shield(policies: Sequence[Proposer], config: Config | None = None) -> Shield:
-    """A shield for the task that the policies share. Raises PolicyError where they were made for different tasks."""
+    """A shield for the task that the policies share. Raises PolicyError where they do not share one."""
     if not policies:
-        raise PolicyError("a shield needs a policy", path="policy_ids", got=[], expected="at least one policy")
+        raise PolicyError(
+            "a shield needs a policy", path="policy_ids", got=[], expected="at least one policy"
+        )
     task = policies[0].task
     for i, policy in enumerate(policies):
         if policy.task.content_hash != task.content_hash:
@@ -87,9 +97,9 @@ def make_shield(policies: Sequence[Proposer], config: Config | None = None) -> S
 
 @dataclass(frozen=True)
 class Carry:
-    """What one decision hands to the next: for each motion the pose it leads to and its certified continuation.
+    """What one decision hands to the next: each motion's next pose and its certified continuation.
 
-    next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it, None where it is not certified.
+    next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it; None: not certified.
     """
 
     t: int
@@ -110,11 +120,12 @@ class Carry:
 class Decision:
     """The answer to one step; A actions. The fields are those of the HTTP contract (DESIGN.md, section 3).
 
-    distribution [A]: pi*. j_values, robustness: one an action, None where nothing was evaluated; robustness is rho of
-    the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t), kl [nats]: of the answer
-    from the prior, None where it leaves the prior's support or no logits were sent. next_poses [A, 3].
-    residual: (m, rad) between x_t and the nearest pose the last decision foresaw, None where there was none.
-    witness: the action indices that follow `action`; witnesses: the same for every action.
+    distribution [A]: pi*. j_values, robustness: one an action, None where nothing was evaluated; robustness
+    is rho of the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t), kl
+    [nats]: of the answer from the prior, None where it leaves the prior's support or no logits were sent.
+    next_poses [A, 3]. residual: (m, rad) between x_t and the nearest pose the last decision foresaw, None
+    where there was none. witness: the action indices that follow `action`; witnesses: the same for every
+    action.
     """
 
     t: int

@@ -1,7 +1,7 @@
 """Algorithm 1 as a pure function: history and logits in, a decision out. It keeps no state of its own.
 
-The robot's history, and what the last decision handed on (its `Carry`), decide everything; so a decision can be made
-anywhere, and made again.
+The robot's history, and what the last decision handed on (its `Carry`), decide everything; so a decision can
+be made anywhere, and made again.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
     """
     grid = shield.task.grid
     if not all(math.isfinite(v) for v in pose):
-        raise PoseError("a pose is finite", path="initial_pose", got=str(list(pose)), expected="[x, y, theta]")
+        raise PoseError(
+            "a pose is finite", path="initial_pose", got=str(list(pose)), expected="[x, y, theta]"
+        )
     u, v = grid.to_grid(pose[:2])
     if not (0.0 <= u < grid.width * grid.resolution and 0.0 <= v < grid.height * grid.resolution):
         raise PoseError(
@@ -59,7 +61,9 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
         )  # fmt: skip
 
 
-def close(shield: Shield, history: ArrayLike, signals: Signals | None = None) -> tuple[Verdict, tuple[float, float]]:
+def close(
+    shield: Shield, history: ArrayLike, signals: Signals | None = None
+) -> tuple[Verdict, tuple[float, float]]:
     """The verdict on an episode's states [t + 1, 3], and the bounds on its robustness."""
     prefix = shield.task.samples(_history(history), signals)
     low, high = (float(v) for v in robustness_bounds(shield.task.formula, prefix))
@@ -77,9 +81,9 @@ def decide(
 ) -> Decision:
     """One decision of Algorithm 1, at t = len(history) - 1.
 
-    history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main task is
-    over; signals {name: [t + 1]}; carry: what the decision at t - 1 handed on; witnesses: give every action's.
-    Raises LogitsError for logits that are missing, NaN, +inf, all -inf or of the wrong number.
+    history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main
+    task is over; signals {name: [t + 1]}; carry: what the decision at t - 1 handed on; witnesses: give every
+    action's. Raises LogitsError for logits that are missing, NaN, +inf, all -inf or of the wrong number.
     """
     task, robot = shield.task, shield.task.robot
     poses = _history(history)
@@ -125,14 +129,16 @@ def decide(
         residual=residual,
         in_collision=bool(in_collision(shield.body, *poses[-1])),
         witness=_as_actions(shield, certified, moved),
-        witnesses=tuple(_as_actions(shield, certified, a) for a in range(len(robot.actions))) if witnesses else (),
+        witnesses=tuple(_as_actions(shield, certified, a) for a in range(len(robot.actions)))
+        if witnesses
+        else (),
         carry=Carry(t, nexts, certified),
     )
 
 
 @dataclass(frozen=True)
 class _Judged:
-    """The actions' futures at one step. feasible [A] is S_t; margin_unattainable: the margin asked for was lowered."""
+    """The actions' futures at one step. feasible [A] is S_t; margin_unattainable: the margin was lowered."""
 
     tried: Futures
     best: Best
@@ -151,7 +157,12 @@ class _Answer:
 
 
 def _judge(
-    shield: Shield, poses: Floats, signals: Signals, tail: bytes | None, prefix: Mapping[str, Floats], violated: bool
+    shield: Shield,
+    poses: Floats,
+    signals: Signals,
+    tail: bytes | None,
+    prefix: Mapping[str, Floats],
+    violated: bool,
 ) -> _Judged:
     task, robot, asked = shield.task, shield.task.robot, shield.config.margin
     tried = futures(task, shield.body, shield.policies, poses, signals, tail, asked)
@@ -184,19 +195,23 @@ def _judge(
 
 
 def _answer(shield: Shield, log_prior: Floats | None, judged: _Judged, main_task_done: bool) -> _Answer:
-    """Steps 4 to 6 of a decision. A terminal action keeps exactly its prior mass, and has none in `completion`."""
+    """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`."""
     terminal = shield.task.robot.terminal
     any_feasible = bool(judged.feasible.any())
     said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
     certified = np.zeros(len(terminal))
     certified[judged.completion] = 1.0
     if main_task_done or log_prior is None:
-        return _Answer(certified, "completion" if any_feasible else "fallback", said if any_feasible else "infeasible")
+        return _Answer(
+            certified, "completion" if any_feasible else "fallback", said if any_feasible else "infeasible"
+        )
     prior = np.exp(log_prior)
     ending = float(prior[terminal].sum())
     going_on = np.where(terminal, -np.inf, log_prior)
     if not np.isfinite(going_on).any():  # the model ends for certain
-        return _Answer(prior, "shaped" if any_feasible else "fallback", None if any_feasible else "infeasible")
+        return _Answer(
+            prior, "shaped" if any_feasible else "fallback", None if any_feasible else "infeasible"
+        )
     conditional = shaping.log_softmax(going_on)
     config = shield.config
     if config.evaluation == "robustness":
@@ -241,22 +256,31 @@ def _log_prior(shield: Shield, logits: ArrayLike | None, main_task_done: bool) -
         if main_task_done:
             return None
         raise LogitsError(
-            "logits are missing", path="logits", got=None, expected=f"{n} numbers; null once main_task_done is true"
+            "logits are missing",
+            path="logits",
+            got=None,
+            expected=f"{n} numbers; null once main_task_done is true",
         )
     array = np.asarray(logits, dtype=np.float64)
     if array.shape != (n,):
         raise LogitsError(
-            "the wrong number of logits", path="logits", got=array.shape[0] if array.ndim == 1 else list(array.shape),
+            "the wrong number of logits", path="logits",
+            got=array.shape[0] if array.ndim == 1 else list(array.shape),
             expected=f"{n}, one for each of {', '.join(shield.task.robot.action_names)}",
         )  # fmt: skip
     wrong = np.flatnonzero(np.isnan(array) | np.isposinf(array))
     if len(wrong):
         i = int(wrong[0])
         raise LogitsError(
-            "a logit is NaN or +infinity", path=f"logits[{i}]", got=str(array[i]), expected="a number, or null for -inf"
+            "a logit is NaN or +infinity",
+            path=f"logits[{i}]",
+            got=str(array[i]),
+            expected="a number, or null for -inf",
         )
     if not np.isfinite(array).any():
-        raise LogitsError("every logit is null", path="logits", got="all null", expected="at least one finite logit")
+        raise LogitsError(
+            "every logit is null", path="logits", got="all null", expected="at least one finite logit"
+        )
     return shaping.log_softmax(array)
 
 

@@ -1,7 +1,8 @@
 """J: does a candidate action have a future that satisfies the formula? (paper, Def. 2 and eq. 6)
 
-Policies propose continuations; each is joined to the executed prefix and judged by its robustness: always the joint
-trajectory, since one future has to satisfy every conjunct. A continuation that certifies an action is its witness.
+Policies propose continuations; each is joined to the executed prefix and judged by its robustness: always the
+joint trajectory, since one future has to satisfy every conjunct. A continuation that certifies an action is
+its witness.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ Signals = Mapping[str, Floats]
 class Futures:
     """The joint trajectories that were tried at one step, several a motion.
 
-    motions [N, T - t]: the continuations, each beginning with the motion it is for. trajectories [N, T + 1, 3]: the
-    prefix x_{0:t} and what follows. preferred: the motion that the first policy would take itself.
+    motions [N, T - t]: the continuations, each beginning with the motion it is for. trajectories
+    [N, T + 1, 3]: the prefix x_{0:t} and what follows. preferred: what the first policy would do itself.
     """
 
     motions: Ints
@@ -52,9 +53,10 @@ def futures(
     tail: bytes | None,
     margin: float,
 ) -> Futures:
-    """Every continuation worth trying from x_t: the tail of the stored witness first, then what each policy proposes.
+    """Every continuation worth trying from x_t: the stored witness's tail, then what each policy proposes.
 
-    history [t + 1, 3], t < T. tail: motions from x_t to the horizon, one a byte, T - t of them, re-simulated from the pose there is.
+    history [t + 1, 3], t < T. tail: motions from x_t to the horizon, one a byte, T - t of them, re-simulated
+    from the pose there is.
     """
     steps = task.horizon + 1 - len(history)
     proposals = [policy.propose(history, signals, margin) for policy in policies]

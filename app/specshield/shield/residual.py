@@ -7,14 +7,24 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, Not, conjuncts, robustness_bounds
+from specshield.stl import (
+    SATISFIED_ABOVE,
+    Always,
+    And,
+    Eventually,
+    Formula,
+    Not,
+    conjuncts,
+    robustness_bounds,
+)
 
 
 def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]]) -> Iterator[Formula]:
     """What is left to keep after a violating prefix, the most demanding first.
 
-    prefix {name: [t + 1]}. The broken conjuncts are dropped, a broken G is enforced again from t + 1; and where even
-    that cannot be (the robot is still inside), without those. Nothing is yielded where no conjunct is left.
+    prefix {name: [t + 1]}. The broken conjuncts are dropped, a broken G is enforced again from t + 1; and
+    where even that cannot be (the robot is still inside), without those. Nothing is yielded where no conjunct
+    is left.
     """
     t = next(iter(prefix.values())).shape[-1] - 1
     kept: list[Formula] = []

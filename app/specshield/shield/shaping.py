@@ -1,8 +1,8 @@
 """The closest distribution to the model's own, in KL, that meets the specification: three closed forms.
 
-pi* = argmin KL(pi || prior) subject to E_pi[J] >= threshold (paper, Problem 1). All take log-probabilities, so that
-no large multiplier is ever exponentiated, and condition on not ending: a terminal action keeps exactly its prior
-mass and takes no part (DESIGN.md, section 1).
+pi* = argmin KL(pi || prior) subject to E_pi[J] >= threshold (paper, Problem 1). All take log-probabilities,
+so that no large multiplier is ever exponentiated, and condition on not ending: a terminal action keeps
+exactly its prior mass and takes no part (DESIGN.md, section 1).
 
 Only threshold = 1 with binary J carries a guarantee: a threshold holds per step, and 0.99 ** 150 = 0.22.
 """
@@ -29,7 +29,7 @@ def feasible_mass(log_prior: Floats, feasible: Bools) -> float:
 
 
 def restrict(log_prior: Floats, feasible: Bools) -> Floats | None:
-    """Threshold 1: the prior on S_t, renormalised (paper, the limit of eq. 16). None if it has no mass there."""
+    """Threshold 1: the prior on S_t, renormalised (the limit of eq. 16). None if it has no mass there."""
     logits = np.where(feasible, log_prior, -np.inf)
     if not np.any(np.isfinite(logits)):
         return None
@@ -53,8 +53,8 @@ def soften(log_prior: Floats, feasible: Bools, threshold: float) -> Floats | Non
 def tilt(log_prior: Floats, values: Floats, threshold: float) -> Floats | None:
     """Real-valued J: prior exp(lambda J) / Z with the smallest lambda >= 0 whose mean J reaches `threshold`.
 
-    values: J of each action, shape (A,). None where the threshold is above max J on the prior's support; where it
-    equals that maximum, the prior restricted to the actions that reach it.
+    values: J of each action, shape (A,). None where the threshold is above max J on the prior's support;
+    where it equals that maximum, the prior restricted to the actions that reach it.
     """
     support = np.isfinite(log_prior)
     if not np.any(support):
@@ -87,7 +87,7 @@ def tilt(log_prior: Floats, values: Floats, threshold: float) -> Floats | None:
 
 
 def divergence(distribution: Floats, log_prior: Floats) -> float | None:
-    """KL(distribution || prior) in nats; None where the distribution leaves the prior's support. Shapes (A,)."""
+    """KL(distribution || prior) in nats; None where it leaves the prior's support. Shapes (A,)."""
     on = distribution > 0.0
     if np.any(np.isneginf(log_prior[on])):
         return None
