@@ -15,6 +15,8 @@ except ImportError:  # the base install is the client
 
 NEEDS_SERVER = "This command needs the server's parts: pip install 'specshield[server]'"
 
+NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
+
 
 def main() -> None:
     """The console script."""
@@ -24,7 +26,7 @@ def main() -> None:
         _commands()()
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in ("torch",):
-            sys.exit("This command needs torch: pip install 'specshield[train]'")
+            sys.exit(NEEDS_TORCH)
         if (error.name or "").split(".")[0] in (
             "fastapi",
             "fastapi_offline",
@@ -73,11 +75,13 @@ def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
 ) -> None:
     """Train policies that are asked for, until stopped."""
-    import torch  # noqa: F401  (to say so now rather than with the first policy)
+    from importlib.util import find_spec
 
     from specshield.service.settings import Settings
     from specshield.service.worker import serve as work
 
+    if find_spec("torch") is None:
+        sys.exit(NEEDS_TORCH)
     work(Settings(), until_eof)
 
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from specshield.errors import NotFound, PolicyError, SpecshieldError
+from specshield.errors import FormulaError, NotFound, PolicyError, SpecshieldError
 from specshield.policy.policy import Policy, load_policy, policy_id
 from specshield.robot import robot_from_json
 from specshield.service import files
@@ -90,6 +90,8 @@ class Policies:
                 spec.get("signals"),
                 self._max_horizon,
             )
+        except FormulaError as error:
+            raise error.at("formula").at("spec") if error.path is None else error.at("spec") from None
         except SpecshieldError as error:
             raise error.at("spec") from None
 
@@ -105,6 +107,10 @@ class Policies:
         folder = self._models / record.name if record.name else self._folder / record.id
         return load_policy((folder / "policy.safetensors").read_bytes(), record.card, self.task(record.about))
 
+    def resolve(self, about: Description) -> Description:
+        """The same with the map's id, whatever it was called. Raises NotFound."""
+        return replace(about, map_id=self._maps.get(about.map_id).id)
+
     def find(self, about: Description, task: Task) -> Record | None:
         """The policy of this description, if there is one."""
         try:
@@ -119,6 +125,7 @@ class Policies:
     def add_card(self, about: Description, card: Mapping[str, Any], weights: bytes) -> Record:
         """A policy trained elsewhere, checked whole before it is kept. Raises PolicyError."""
         try:
+            about = self.resolve(about)
             task = self.task(about)
         except SpecshieldError as error:
             raise PolicyError(error.message, path=error.path, got=error.got, expected=error.expected).at(
@@ -170,7 +177,7 @@ class Policies:
         for path in sorted(self._models.glob("*/card.json")):
             with _left_out(path.parent):
                 card = files.read_json(path)
-                about = describe(card)
+                about = self.resolve(describe(card))
                 yield Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)
 
 

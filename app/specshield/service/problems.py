@@ -142,7 +142,7 @@ def install(app: FastAPI) -> None:
     async def known(request: Request, error: Exception) -> Response:
         assert isinstance(error, SpecshieldError)
         if status_of(error) >= 500:
-            log.warning("%s %s: %s", request.method, request.url.path, error.message, exc_info=error)
+            log.warning("%s %s: %s", request.method, request.url.path, error.message)
         return response(error)
 
     async def invalid(request: Request, error: Exception) -> Response:
@@ -157,11 +157,10 @@ def install(app: FastAPI) -> None:
                 errors.NotFound(f"there is no {path} here", got=path, expected="a path listed at /docs")
             )
         if error.status_code == 405:
-            allowed = (error.headers or {}).get("Allow", "")
+            allowed = (error.headers or {}).get("Allow", "another method")
             message = f"{request.method} is not for {path}"
             return response(
-                errors.MethodNotAllowed(message, got=request.method, expected=allowed or "another method"),
-                error.headers,
+                errors.MethodNotAllowed(message, got=request.method, expected=allowed), error.headers
             )
         return response(InputError(str(error.detail)))
 

@@ -354,7 +354,7 @@ class StepRequest(Strict):
     logits: list[float | None] | None = Field(
         None,
         max_length=256,
-        description="The model's logits, one an action; null is minus infinity. Not needed after the main task.",
+        description="Logits, one an action; null is minus infinity. Not needed after the main task.",
     )
     main_task_done: bool = Field(False, description="The main task is over; stays true once it is.")
     signals: dict[str, float] | None = Field(
@@ -420,7 +420,7 @@ class CloseRequest(Strict):
 
 class CloseResponse(SessionResponse):
     robustness_bounds: list[float | None] = Field(
-        description="[lo, hi] on the robustness over every continuation; equal at the horizon; null is infinite."
+        description="[lo, hi] on the robustness over every continuation; equal at the horizon. Null: infinite."
     )
 
 

@@ -16,11 +16,8 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from specshield.errors import SpecshieldError, StoreError
-from specshield.policy.settings import read_settings
 from specshield.service.embedded import EmbeddedStore
 from specshield.service.jobs import QUEUE, SIGN_OF_LIFE, Jobs
-from specshield.service.maps import Maps
-from specshield.service.policies import Policies
 from specshield.service.settings import Settings
 
 log = logging.getLogger("specshield")
@@ -101,7 +98,11 @@ def train(id: str, attempt: str) -> None:
 
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> bool:
-    from specshield.policy import dqn  # torch: in this process alone
+    # torch, numba and the rest are for the process of the run alone: the worker stays small.
+    from specshield.policy import dqn
+    from specshield.policy.settings import read_settings
+    from specshield.service.maps import Maps
+    from specshield.service.policies import Policies
 
     policies = Policies(settings, Maps(settings))
     record = policies.record(id)

@@ -71,6 +71,7 @@ def _ask(server: Server, content: bytes) -> dict[str, Any]:
     options = options_of(read_settings(asked.options))
     robot = body.get("robot", "stretch")
     about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, options)
+    about = server.policies.resolve(about)
     task = server.policies.task(about)
     try:
         obligations(task.formula)

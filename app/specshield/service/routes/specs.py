@@ -6,6 +6,7 @@ import asyncio
 
 from fastapi import APIRouter
 
+from specshield.errors import FormulaError
 from specshield.service.schemas import SpecRequest, SpecResponse
 from specshield.service.state import ServerState, problems
 from specshield.stl import parse
@@ -31,5 +32,8 @@ def _validate(request: SpecRequest, server: ServerState) -> SpecResponse:
     rooms = server.maps.get(request.map_id).rooms if request.map_id else {}
     declared = any(given is not None for given in (request.regions, request.signals, request.map_id))
     names = [*regions, *rooms, *POSE_NAMES, *signals] if declared else None
-    formula = parse(request.formula, names=names, max_horizon=server.settings.max_horizon)
+    try:
+        formula = parse(request.formula, names=names, max_horizon=server.settings.max_horizon)
+    except FormulaError as error:
+        raise error.at("formula") from None
     return SpecResponse(formula=str(formula), horizon=formula.horizon, names=list(formula.names))
