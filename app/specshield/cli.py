@@ -6,7 +6,10 @@ import json
 import os
 import sys
 import tempfile
+from pathlib import Path
 from typing import Annotated, Any
+
+from specshield.errors import SpecshieldError
 
 try:
     import typer
@@ -24,6 +27,8 @@ def main() -> None:
         sys.exit(NEEDS_SERVER)
     try:
         _commands()()
+    except SpecshieldError as error:
+        sys.exit(f"{error} ({error.path}: got {error.got!r}, expected {error.expected})")
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in ("torch",):
             sys.exit(NEEDS_TORCH)
@@ -43,7 +48,7 @@ def _commands() -> Any:
     app = typer.Typer(
         help="Keeps robot foundation models inside their operating rules.", no_args_is_help=True
     )
-    for command in (serve, worker, openapi):
+    for command in (serve, demo, train, evaluate, worker, openapi):
         app.command()(command)
     return app
 
@@ -67,7 +72,7 @@ def serve(
             workers=workers,
             access_log=False,
             server_header=False,
-            timeout_graceful_shutdown=10,
+            timeout_graceful_shutdown=5,
         )
 
 
@@ -91,6 +96,44 @@ def openapi() -> None:
     from specshield.service.settings import Settings
 
     print(json.dumps(create_app(Settings()).openapi(), indent=1, sort_keys=True))
+
+
+def demo(
+    runs: Annotated[int, typer.Option(help="Episodes a case.", min=1)] = 20,
+    seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
+) -> None:
+    """The paper's two cases with and without the shield: a table, and a picture of each."""
+    from specshield.sim import commands
+
+    raise typer.Exit(commands.demo(runs, seed, out))
+
+
+def evaluate(
+    case: Annotated[str, typer.Option(help="A case of maps/.")],
+    runs: Annotated[int, typer.Option(help="Episodes with and without the shield.", min=1)] = 100,
+    seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Print figures and episodes as JSON.")] = False,
+) -> None:
+    """One case, measured over any number of runs."""
+    from specshield.sim import commands
+
+    raise typer.Exit(commands.evaluate(case, runs, seed, json))
+
+
+def train(
+    case: Annotated[str, typer.Option(help="A case of maps/.")],
+    method: Annotated[str, typer.Option(help="How the policy is made: dqn.")] = "dqn",
+    seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
+    updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
+    option: Annotated[list[str] | None, typer.Option(help="A setting, as units=128; repeatable.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: models/<case>]")] = None,
+    resume: Annotated[bool, typer.Option(help="Take up a run that was killed.")] = False,
+) -> None:
+    """Train a policy for a case; it shows how far it is and how often it satisfies the rule."""
+    from specshield.sim import commands
+
+    raise typer.Exit(commands.train(case, method, seed, updates, option or [], out, resume))
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def test_tolerance_and_the_stored_value_wins(column):
 
 
 def test_headings_agree_modulo_a_turn():
-    sent = TRAJECTORY[:3] + [0, 0, 2 * math.pi]
+    sent = TRAJECTORY[:3] + np.array([0, 0, 2 * math.pi])
     assert len(join(TRAJECTORY[:3], 2, sent)) == 0
     assert len(join(np.array([[0, 0, math.pi]]), 0, np.array([[0, 0, -math.pi + 5e-7]]))) == 0
 

@@ -420,7 +420,7 @@ class CloseRequest(Strict):
 
 class CloseResponse(SessionResponse):
     robustness_bounds: list[float | None] = Field(
-        description="[lo, hi] on the robustness over every continuation; equal at the horizon. Null: infinite."
+        description="[lo, hi] on the robustness over every continuation; equal at the horizon; null: none."
     )
 
 

@@ -1,0 +1,257 @@
+"""Steps over HTTP: answers, replay, races, history, the end, reading back."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from tests.service.world import LOGITS, START, ahead
+
+
+def problem(response, status, type):
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    body = response.json()
+    assert (body["status"], body["type"]) == (status, type)
+    return body
+
+
+def state(client, session):
+    return client.get(f"/v1/sessions/{session['id']}").json()
+
+
+def test_a_session_as_the_contract_has_it(client, policy, begin):
+    session = begin(seed=3)
+    assert session["policy_ids"] == [policy["id"]]
+    assert session["horizon"] == 8
+    assert session["actions"] == ["forward", "left", "right", "wait", "end"]
+    assert session["terminal_actions"] == [4]
+    assert (session["next_t"], session["feasible"], session["spec_status"]) == (0, True, "pending")
+    assert (session["main_task_done"], session["finished"], session["max_steps"]) == (False, False, 600)
+    assert state(client, session) == session
+
+
+def test_an_episode_to_its_end(client, begin, step):
+    session, poses = begin(), [START]
+    for t in range(9):
+        answer = step(session, t, poses[-1:], logits=LOGITS).json()
+        assert answer["t"] == t
+        assert sum(answer["distribution"]) == pytest.approx(1.0)
+        assert answer["distribution"][4] == 0.0
+        poses.append(answer["next_poses"][0])
+    assert answer["spec_status"] == "satisfied"
+    assert not answer["finished"]
+    answer = step(session, 9, poses[-1:], logits=None, main_task_done=True).json()
+    assert answer["finished"]
+    assert state(client, session)["finished"]
+    problem(step(session, 10, [START]), 409, "session-finished")
+
+
+def test_timings_are_told(begin, step):
+    session = begin()
+    timing = dict(
+        part.split(";dur=") for part in step(session, 0, [START]).headers["server-timing"].split(", ")
+    )
+    assert set(timing) == {"total", "rollout", "store"}
+    assert float(timing["total"]) >= float(timing["rollout"]) > 0
+
+
+def test_a_replay_is_the_same_bytes_and_changes_nothing(client, begin, step):
+    session = begin(seed=5)
+    first = step(session, 0, [START], witnesses=True)
+    second = step(session, 1, ahead(1))
+    before = state(client, session)
+    again = step(session, 0, [START])  # asking for less is no other request
+    assert again.content == first.content
+    assert step(session, 1, ahead(1)[1:]).content == second.content
+    assert state(client, session) == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"logits": [1.0, 0.0, 0.5, -1.0, 0.0]},
+        {"logits": [1.0, 0.0, 0.5, -1.0000000000000002, None]},
+        {"main_task_done": True},
+        {"signals": {"battery": 80.0}},
+        {"poses": [[1.0000001, 1.5, 0.0]]},
+    ],
+)
+def test_a_step_decided_and_sent_otherwise_is_a_conflict(client, begin, step, change):
+    session = begin()
+    step(session, 0, [START])
+    before = state(client, session)
+    answer = step(session, 0, **{"poses": [START], **change})
+    assert problem(answer, 409, "step-conflict")["expected_t"] == 1
+    assert state(client, session) == before
+
+
+def test_of_two_racing_callers_one_wins_and_the_other_is_told(begin, step):
+    session = begin()
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(
+            pool.map(
+                lambda i: step(session, 0, [START], logits=[1.0, 0.0, 0.1 * (i % 2), 0.0, None]), range(8)
+            )
+        )
+    won = {answer.content for answer in answers if answer.status_code == 200}
+    lost = [answer for answer in answers if answer.status_code != 200]
+    assert len(won) == 1
+    assert len(lost) == 4
+    for answer in lost:
+        problem(answer, 409, "step-conflict")
+
+
+def test_back_filled_steps_carry_no_decision(client, begin, step):
+    session = begin()
+    step(session, 0, [START])
+    answer = step(session, 3, ahead(3)[1:])
+    assert answer.status_code == 200
+    assert state(client, session)["next_t"] == 4
+    assert problem(step(session, 2, ahead(2)), 409, "step-conflict")["expected_t"] == 4
+    items = client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]
+    assert [item["decision"] is None for item in items] == [False, True, True, False]
+    assert [item["pose"] for item in items] == ahead(3)
+    assert items[3]["decision"] == answer.json()
+
+
+def test_a_gap_and_a_differing_overlap_change_nothing(client, begin, step):
+    session = begin()
+    step(session, 0, [START])
+    before = state(client, session)
+    gap = problem(step(session, 3, ahead(3)[2:]), 409, "history-gap")
+    assert gap["expected_t"] == 1
+    wrong = [[1.1, 1.5, 0.0], *ahead(1)[1:]]
+    conflict = problem(step(session, 1, wrong), 409, "history-conflict")
+    assert (conflict["path"], conflict["t"]) == ("poses[0]", 0)
+    assert state(client, session) == before
+    assert len(client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]) == 1
+
+
+def test_the_main_task_stays_over(client, begin, step):
+    session = begin()
+    assert step(session, 0, [START], logits=None, main_task_done=True).json()["mode"] == "completion"
+    assert problem(step(session, 1, ahead(1)), 409, "step-conflict")["path"] == "main_task_done"
+    assert step(session, 1, ahead(1), main_task_done=True).status_code == 200
+    assert state(client, session)["main_task_done"]
+
+
+def test_the_last_step_is_max_steps(client, begin, step):
+    session = begin(max_steps=2)
+    for t in range(3):
+        answer = step(session, t, ahead(t)[-1:]).json()
+    assert answer["finished"]
+    problem(step(session, 3, ahead(3)), 409, "session-finished")
+    assert step(session, 2, ahead(2)[-1:]).json() == answer  # a replay
+
+
+def test_signals_hold_and_count(client, begin, step):
+    session = begin()
+    step(session, 0, [START], signals={"battery": 50.0})
+    step(session, 2, ahead(2)[1:])
+    answer = step(session, 3, ahead(3)[-1:], signals={"battery": 5.0}).json()
+    assert answer["spec_status"] == "violated"
+    assert answer["mode"] == "violated"
+    items = client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]
+    assert [item["signals"]["battery"] for item in items] == [50.0, 50.0, 50.0, 5.0]
+    problem(step(session, 4, ahead(4)[-1:], signals={"fuel": 1.0}), 422, "invalid-samples")
+
+
+def test_later_poses_may_be_in_collision(begin, step):
+    session = begin()
+    step(session, 0, [START])
+    assert step(session, 1, [[0.05, 1.5, 0.0]]).json()["in_collision"]
+
+
+def test_close_gives_the_verdict_and_keeps_the_trajectory(client, begin, step):
+    session = begin()
+    step(session, 0, [START])
+    path = f"/v1/sessions/{session['id']}/close"
+    gap = problem(client.post(path, json={"t": 9, "poses": ahead(9)[-1:]}), 409, "history-gap")
+    assert gap["expected_t"] == 1
+    verdict = client.post(path, json={"t": 8, "poses": ahead(8)[1:]})
+    assert verdict.status_code == 200, verdict.text
+    assert verdict.json()["spec_status"] == "satisfied"
+    low, high = verdict.json()["robustness_bounds"]
+    assert low == high > 0
+    assert client.post(path, json={}).json() == verdict.json()
+    assert client.post(path, json={"t": 8, "poses": ahead(8)[-1:]}).json() == verdict.json()
+    problem(client.post(path, json={"t": 9, "poses": ahead(9)[-1:]}), 409, "session-finished")
+    problem(step(session, 9, ahead(9)[-1:]), 409, "session-finished")
+    assert step(session, 0, [START]).status_code == 200  # a replay
+    assert len(client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]) == 9
+
+
+def test_close_with_nothing_new_is_a_verdict_on_what_there_is(client, begin):
+    closed = client.post(f"/v1/sessions/{begin()['id']}/close", json={}).json()
+    assert (closed["spec_status"], closed["finished"]) == ("pending", True)
+    assert closed["robustness_bounds"][1] is not None
+
+
+def test_the_trajectory_by_lines_is_the_one_by_object(client, begin, step):
+    session = begin()
+    step(session, 0, [START])
+    path = f"/v1/sessions/{session['id']}/trajectory"
+    items = client.get(path).json()["items"]
+    for asked in ({"params": {"format": "ndjson"}}, {"headers": {"Accept": "application/x-ndjson"}}):
+        lines = client.get(path, **asked)
+        assert lines.headers["content-type"] == "application/x-ndjson"
+        assert [json.loads(line) for line in lines.text.splitlines()] == items
+
+
+def test_erased_is_gone(client, begin, step):
+    session = begin()
+    step(session, 0, [START])
+    path = f"/v1/sessions/{session['id']}"
+    assert client.delete(path).status_code == 204
+    for response in (
+        client.get(path),
+        client.get(f"{path}/trajectory"),
+        client.delete(path),
+        step(session, 1, [START]),
+    ):
+        problem(response, 404, "not-found")
+    assert begin(id=session["id"])["next_t"] == 0  # the name is free again
+
+
+def test_an_id_of_ones_own_is_taken_once(client, policy, begin):
+    begin(id="mine")
+    body = {"policy_id": policy["id"], "initial_pose": START, "id": "mine"}
+    problem(client.post("/v1/sessions", json=body), 409, "session-exists")
+
+
+def test_listing_by_pages_finds_each_once(client, begin):
+    made = {begin()["id"] for _ in range(5)}
+    found, cursor = [], None
+    while True:
+        page = client.get(
+            "/v1/sessions", params={"limit": 2, **({"cursor": cursor} if cursor else {})}
+        ).json()
+        found += [item["id"] for item in page["items"]]
+        cursor = page["next"]
+        if cursor is None:
+            break
+    assert len(found) == len(set(found))
+    assert made <= set(found)
+
+
+def test_the_draw_is_the_seeds(begin, step):
+    draws = []
+    for seed in (1, 1, 2, 3, 4, 5):
+        session = begin(seed=seed)
+        draws.append([step(session, t, [START]).json()["action"] for t in range(3)])
+    assert draws[0] == draws[1]
+    assert len({tuple(draw) for draw in draws}) > 1
+
+
+def test_a_policy_in_use_stays_until_its_sessions_are_over(client, begin, policy):
+    session = begin()
+    answer = problem(client.delete(f"/v1/policies/{policy['id']}"), 409, "in-use")
+    assert answer["session_id"]
+    problem(client.delete("/v1/policies/case1"), 409, "in-use")
+    for item in client.get("/v1/sessions", params={"limit": 1000}).json()["items"]:
+        if policy["id"] in item["policy_ids"] and item["id"] != session["id"]:
+            client.delete(f"/v1/sessions/{item['id']}")
+    client.post(f"/v1/sessions/{session['id']}/close", json={})
+    assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
+    problem(client.get(f"/v1/policies/{policy['id']}"), 404, "not-found")
+    assert client.post(f"/v1/sessions/{session['id']}/close", json={}).status_code == 200  # asks no policy

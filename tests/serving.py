@@ -1,0 +1,80 @@
+"""A real server for tests: its own process, port, data folder and embedded store."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+READY_WITHIN = 180.0  # seconds; the first start of an installation compiles the kernels
+
+
+@dataclass
+class RunningServer:
+    url: str
+    data_dir: Path
+    process: subprocess.Popen[bytes]
+    log: Path
+
+    def kill(self) -> None:
+        """SIGKILL: no chance to clean up."""
+        self.process.kill()
+        self.process.wait()
+
+
+@contextmanager
+def serving(data_dir: Path, *options: str, ready: bool = True, **environment: str) -> Iterator[RunningServer]:
+    """`specshield serve` on a free port. environment: settings, as in SPECSHIELD_SESSION_TTL="1"."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
+    data_dir.mkdir(parents=True, exist_ok=True)
+    log = data_dir / "server.log"
+    with open(log, "ab") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "specshield.cli", "serve", "--port", str(port), *options],
+            env={**kept, "SPECSHIELD_DATA_DIR": str(data_dir), "SPECSHIELD_WORKER": "false", **environment},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+        )
+    server = RunningServer(f"http://127.0.0.1:{port}", data_dir, process, log)
+    try:
+        if ready:
+            wait_ready(server)
+        yield server
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(15.0)
+        except subprocess.TimeoutExpired:
+            server.kill()
+            raise AssertionError("the server did not stop when it was told to") from None
+
+
+def wait_ready(server: RunningServer) -> None:
+    def answers() -> bool:
+        assert server.process.poll() is None, server.log.read_text()[-4000:]
+        try:
+            return httpx.get(f"{server.url}/readyz", timeout=2.0).status_code == 200
+        except httpx.TransportError:
+            return False
+
+    wait_for(answers, READY_WITHIN)
+
+
+def wait_for(condition: Callable[[], object], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {seconds} s"
+        time.sleep(0.05)
