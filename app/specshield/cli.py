@@ -28,7 +28,7 @@ def main() -> None:
     try:
         _commands()()
     except SpecshieldError as error:
-        sys.exit(f"{error} ({error.path}: got {error.got!r}, expected {error.expected})")
+        sys.exit(f"{error}; expected {error.expected}" if error.expected else str(error))
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in ("torch",):
             sys.exit(NEEDS_TORCH)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Circle, Polygon, Rectangle, Region, region_to_json

@@ -1,0 +1,1 @@
+"""Simulated robots and foundation models, the paper's cases, campaigns."""

@@ -1,0 +1,83 @@
+"""Many episodes of a case, each start once with the shield and once without, several robots at a time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+
+import numpy as np
+
+from specshield.client import Session, ShieldClient
+from specshield.errors import InfeasibleStart
+from specshield.policy.environment import free_poses
+from specshield.sim.cases import Case
+from specshield.sim.episodes import Episode, with_shield, without_shield
+from specshield.sim.model import GoalSeeker
+from specshield.sim.robot import Pose
+
+DRAWS = 100  # starts tried for one episode before giving up
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Episodes in pairs: `shielded[i]` and `unshielded[i]` share their start and the model's seed.
+
+    refused: starts that the service refused as infeasible; others were drawn in their place.
+    """
+
+    case: Case
+    seed: int
+    shielded: list[Episode]
+    unshielded: list[Episode]
+    refused: int
+
+    @property
+    def kept(self) -> bool:
+        """The promise: every shielded episode satisfied the rule."""
+        return all(episode.spec_status == "satisfied" for episode in self.shielded)
+
+
+def run(
+    client: ShieldClient,
+    case: Case,
+    runs: int,
+    seed: int,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> Campaign:
+    """`runs` pairs of episodes, the i-th decided by `seed` and i alone. on_progress: how many are done."""
+
+    def pair(i: int) -> tuple[Episode, Episode, int]:
+        own = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
+        session, start, refused = _begin(client, case, own)
+        model = GoalSeeker(case.task.robot)
+        return (
+            with_shield(session, case, model, start, own),
+            without_shield(client, case, model, start, own),
+            refused,
+        )
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as robots:
+        futures = [robots.submit(pair, i) for i in range(runs)]
+        try:
+            for done, finished in enumerate(as_completed(futures), 1):
+                finished.result()
+                on_progress(done)
+        except BaseException:
+            robots.shutdown(wait=False, cancel_futures=True)
+            raise
+    pairs = [future.result() for future in futures]
+    return Campaign(case, seed, [p[0] for p in pairs], [p[1] for p in pairs], sum(p[2] for p in pairs))
+
+
+def _begin(client: ShieldClient, case: Case, seed: int) -> tuple[Session, Pose, int]:
+    """A session at the first start that is not refused, of those drawn uniformly over free space."""
+    starts = free_poses(case.task, case.body, DRAWS, np.random.default_rng([seed, 2]))
+    for refused, (x, y, theta) in enumerate(starts.tolist()):
+        start = (x, y, theta)
+        try:
+            return client.sessions.create(policy_id=case.name, initial_pose=start, seed=seed), start, refused
+        except InfeasibleStart:
+            continue
+    raise InfeasibleStart(f"none of {DRAWS} starts in {case.name} can satisfy the rule", path="initial_pose")

@@ -1,0 +1,74 @@
+"""The paper's cases, read from maps/: the apartment, its rule, and what the robot is sent to find."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.errors import NotFound
+from specshield.robot import STRETCH
+from specshield.robot.unicycle import Body, make_body
+from specshield.task import Task, make_task
+from specshield.world.geodesic import geodesic_distance
+from specshield.world.map_server import load_map
+from specshield.world.regions import Region, region_from_json
+
+REPOSITORY = Path(__file__).resolve().parents[3]
+MAPS = REPOSITORY / "maps"
+MODELS = REPOSITORY / "models"
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A task, its spec as written, and the instruction; target: where what it names is, (x, y) [m]."""
+
+    name: str
+    task: Task
+    rooms: Mapping[str, Region]
+    spec: Mapping[str, Any]
+    instruction: str
+    target: tuple[float, float]
+
+    @cached_property
+    def body(self) -> Body:
+        return make_body(self.task.robot, self.task.grid)
+
+    @cached_property
+    def distance(self) -> NDArray[np.float64]:
+        """Metres along free space from each cell to the target, inf in walls. Shape [height, width]."""
+        grid = self.task.grid
+        goal = np.zeros_like(grid.occupied)
+        goal[self.cell(self.target)] = True
+        return geodesic_distance(~grid.occupied, goal, grid.resolution)
+
+    def cell(self, point: Sequence[float]) -> tuple[int, int]:
+        """Row and column of the cell that (x, y) lies in."""
+        column, row = np.floor(self.task.grid.to_grid(point[:2]) / self.task.grid.resolution).astype(int)
+        return int(row), int(column)
+
+
+def case_names(folder: Path = MAPS) -> list[str]:
+    return sorted(path.name.removesuffix(".regions.json") for path in folder.glob("*.regions.json"))
+
+
+def load_case(name: str, folder: Path = MAPS) -> Case:
+    """The case of that name in `folder`. Raises NotFound."""
+    names = case_names(folder)
+    if name not in names:
+        raise NotFound(
+            f"there is no case {name!r}", path="case", got=name, expected=f"one of {', '.join(names)}"
+        )
+    grid = load_map((folder / f"{name}.yaml").read_text(), (folder / f"{name}.pgm").read_bytes())
+    beside = json.loads((folder / f"{name}.regions.json").read_text())
+    rooms = {room: region_from_json(spec, f"rooms.{room}") for room, spec in beside["rooms"].items()}
+    spec = {"formula": beside["formula"], "regions": beside["regions"]}
+    task = make_task(grid, STRETCH, spec["formula"], spec["regions"], rooms)
+    target = next(tuple(point) for name, point in beside["targets"].items() if name in beside["instruction"])
+    return Case(name, task, rooms, spec, beside["instruction"], target)

@@ -1,0 +1,158 @@
+"""What `specshield demo`, `evaluate` and `train` do. Each returns the command's exit status."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from specshield.client import ShieldClient
+from specshield.errors import Unsupported
+from specshield.policy.settings import read_settings
+from specshield.sim import picture, report
+from specshield.sim.campaign import Campaign, run
+from specshield.sim.cases import MODELS, Case, case_names, load_case
+from specshield.sim.service import own_server
+
+PATIENCE = 10.0  # [s] for one decision: other work may share the machine
+
+
+def demo(runs: int, seed: int, out: Path) -> int:
+    """Every case, with and without the shield: a table, and a picture of each case in `out`.
+
+    1 if an episode with the shield broke its rule.
+    """
+    began = time.monotonic()
+    _say("starting the service ...")
+    with own_server() as url, ShieldClient(url, timeout=PATIENCE) as client:
+        campaigns = [_campaign(client, load_case(name), runs, seed) for name in case_names()]
+    for campaign in campaigns:
+        picture.draw(
+            campaign.case, campaign.shielded[0], campaign.unshielded[0], out / f"{campaign.case.name}.png"
+        )
+    _say("")
+    print(f"{runs} episodes a case, seed {seed}, over HTTP\n")
+    for campaign in campaigns:
+        print(
+            f'{campaign.case.name}  {campaign.case.task.formula}\n       model: "{campaign.case.instruction}"'
+        )
+    print(f"\n{report.table([report.summary(campaign) for campaign in campaigns])}\n")
+    for campaign in campaigns:
+        print(f"picture: {out / campaign.case.name}.png")
+    print(f"{time.monotonic() - began:.0f} s")
+    return _status(campaigns)
+
+
+def evaluate(case: str, runs: int, seed: int, as_json: bool) -> int:
+    """One case with any number of runs; the table, or with `as_json` the figures and every episode."""
+    with own_server() as url, ShieldClient(url, timeout=PATIENCE) as client:
+        campaign = _campaign(client, load_case(case), runs, seed)
+    _say("")
+    figures = report.summary(campaign)
+    if as_json:
+        episodes = [episode.to_json() for episode in (*campaign.shielded, *campaign.unshielded)]
+        print(json.dumps({**figures, "episodes": episodes}))
+    else:
+        print(report.table([figures]))
+    return _status([campaign])
+
+
+def train(
+    case: str,
+    method: str,
+    seed: int,
+    updates: int | None,
+    options: Sequence[str],
+    out: Path | None,
+    resume: bool,
+) -> int:
+    """Trains pi_phi for a case and writes policy.safetensors and card.json to `out`.
+
+    options: "name=value", of `policy.settings.Settings`. What is done is saved to `out`/checkpoint at every
+    evaluation; `resume` takes that up after a kill.
+    """
+    if method != "dqn":
+        raise Unsupported("only a DQN is trained", path="method", got=method, expected="'dqn'")
+    from specshield.policy.dqn import Progress, train
+
+    settings = read_settings(_options(options) | ({} if updates is None else {"updates": updates}))
+    loaded, out = load_case(case), out or MODELS / case
+    checkpoint = out / "checkpoint"
+    if not resume:
+        shutil.rmtree(checkpoint, ignore_errors=True)
+
+    def show(progress: Progress) -> None:
+        rate = "not measured yet" if progress.satisfied is None else f"satisfied {progress.satisfied:.1%}"
+        done = f"{case}: update {progress.update} of {progress.updates}"
+        _say(f"{done}, {rate}, {_duration(progress.eta_s)} left")
+
+    policy = train(loaded.task, settings, seed, show, checkpoint, spec=dict(loaded.spec))
+    (out / "policy.safetensors").write_bytes(policy.weights())
+    (out / "card.json").write_text(json.dumps(policy.card, indent=1) + "\n")
+    shutil.rmtree(checkpoint)
+    _say("")
+    metrics = policy.card["metrics"]
+    print(
+        f"{out}: satisfies from {metrics['satisfied']:.1%} of {metrics['starts']} starts, "
+        f"{metrics['feasible_start']:.1%} after some first action; {_duration(metrics['wall_time_s'])}"
+    )
+    return 0
+
+
+def _options(texts: Sequence[str]) -> dict[str, Any]:
+    """The settings that "name=value" texts name, each value read as JSON or else as the text it is."""
+    settings: dict[str, Any] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            settings[name] = json.loads(value)
+        except ValueError:
+            settings[name] = value
+    return settings
+
+
+def _campaign(client: ShieldClient, case: Case, runs: int, seed: int) -> Campaign:
+    _say(f"{case.name}: 0 of {runs} episodes")
+    return run(client, case, runs, seed, _counter(case.name, runs))
+
+
+def _counter(name: str, runs: int) -> Callable[[int], None]:
+    began = time.monotonic()
+
+    def show(done: int) -> None:
+        left = (time.monotonic() - began) / done * (runs - done)
+        _say(f"{name}: {done} of {runs} episodes, {_duration(left)} left")
+
+    return show
+
+
+def _status(campaigns: list[Campaign]) -> int:
+    broken = [
+        episode
+        for campaign in campaigns
+        for episode in campaign.shielded
+        if episode.spec_status != "satisfied"
+    ]
+    for episode in broken:
+        print(
+            f"BROKEN: {episode.case} from {episode.start}, seed {episode.seed}: {episode.spec_status}",
+            file=sys.stderr,
+        )
+    return 1 if broken else 0
+
+
+def _say(line: str) -> None:
+    """Progress, on standard error: one line that is written over, or a line each where nobody looks on."""
+    if sys.stderr.isatty():
+        print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+    elif line:
+        print(line, file=sys.stderr, flush=True)
+
+
+def _duration(seconds: float) -> str:
+    whole = round(seconds)
+    return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60:02d} s"

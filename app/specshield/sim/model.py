@@ -1,0 +1,93 @@
+"""The foundation model as the simulation sees it, and a stand-in that seeks its target and knows no rule."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.robot import Robot
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the robot senses of where it is: egocentric, no pose, no map.
+
+    distance: to the target along free space [m]. bearing: of the way there, from the heading [rad].
+    blocked (A,): actions that something would stop short. last_action: the one executed last, None at first.
+    """
+
+    distance: float
+    bearing: float
+    blocked: NDArray[np.bool_]
+    last_action: int | None
+
+
+class FoundationModel(Protocol):
+    """A policy with a memory of its own: observations in, logits out."""
+
+    def reset(self, random: np.random.Generator) -> None:
+        """Forgets the last episode. All randomness of the next one comes from `random`."""
+        ...
+
+    def logits(self, observation: Observation) -> Floats:
+        """Finite logits, shape (A,)."""
+        ...
+
+
+class GoalSeeker:
+    """Stand-in for a learned model: prefers what brings it nearer, hesitates, and ends near the target.
+
+    A logit is the steps an action saves, times `SHARPNESS`, plus noise that drifts over time (as a learned
+    model's errors do) and a liking for what it did last.
+    """
+
+    SHARPNESS = 2.5
+    NOISE = 0.6
+    DRIFT = 0.5  # of the noise stays from one step to the next
+    HABIT = 0.5
+    IDLE = -4.0  # for tokens that leave the base where it is
+    END_WITHIN = 0.7  # [m]
+    END_NEAR, END_FAR, END_SLOPE = 1.5, -9.0, 30.0  # logits, and logits a metre between them
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._translate = np.array([a.translate for a in robot.actions])
+        self._rotate = np.array([a.rotate for a in robot.actions])
+        self._idle = (self._translate == 0.0) & (self._rotate == 0.0) & ~robot.terminal
+        self._stride, self._turn = np.abs(self._translate).max(), np.abs(self._rotate).max()
+        self.reset(np.random.default_rng(0))
+
+    def reset(self, random: np.random.Generator) -> None:
+        self._random = random
+        self._noise = random.normal(size=len(self._robot.actions))
+
+    def logits(self, observation: Observation) -> Floats:
+        fresh = self._random.normal(size=len(self._noise))
+        self._noise = self.DRIFT * self._noise + math.sqrt(1.0 - self.DRIFT**2) * fresh
+        logits = self.SHARPNESS * self._saved(observation) + self.NOISE * self._noise
+        logits[self._idle] += self.IDLE
+        if observation.last_action is not None:
+            logits[observation.last_action] += self.HABIT
+        beyond = max(observation.distance - self.END_WITHIN, 0.0)
+        logits[self._robot.terminal] = max(self.END_NEAR - self.END_SLOPE * beyond, self.END_FAR)
+        return logits
+
+    def _saved(self, observation: Observation) -> Floats:
+        """The steps each action saves, shape (A,): one for a stride nearer, or for the largest turn."""
+        bearing = observation.bearing
+        nearer = self._translate / self._stride * math.cos(bearing)
+        after = np.abs(np.remainder(bearing - self._rotate + math.pi, 2.0 * math.pi) - math.pi)
+        saved: Floats = nearer + (abs(bearing) - after) / self._turn
+        return np.where(observation.blocked, -1.0, saved)
+
+
+def softmax(logits: Floats) -> Floats:
+    weights = np.exp(logits - logits.max())
+    probabilities: Floats = weights / weights.sum()
+    return probabilities

@@ -1,0 +1,194 @@
+"""A picture of a case: the floor, the named regions, and the two ways from one start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from specshield.sim.cases import Case
+from specshield.sim.episodes import Episode
+from specshield.sim.robot import Pose
+from specshield.stl import Formula, Not, obligations, robustness
+from specshield.world.regions import signed_distance
+
+FINE = 3  # drawn this much larger, then reduced
+PIXELS = 110  # a metre
+BORDER = 14
+LEGEND = 86
+PAPER, WALL, INK, FAINT = (250, 249, 246), (52, 56, 64), (40, 43, 50), (158, 160, 165)
+GOOD, BAD = (43, 138, 90), (198, 60, 60)
+SHIELDED, UNSHIELDED, TARGET = (37, 99, 200), (226, 125, 34), (246, 190, 40)
+
+Color = tuple[int, int, int]
+
+
+def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None:
+    """Writes a PNG."""
+    canvas = _Canvas(case)
+    canvas.floor()
+    for name, region in case.task.regions.items():
+        inside = signed_distance(region, canvas.points()) > 0.0
+        canvas.region(name, inside, BAD if name in _avoided(case.task.formula) else GOOD)
+    canvas.way(unshielded.poses, UNSHIELDED, 2.2)
+    canvas.way(shielded.poses, SHIELDED, 3.0)
+    for t, (x, y, _) in _kept_at(case, shielded.poses):
+        canvas.dot((x, y), 5.0, SHIELDED, PAPER)
+        canvas.text((x, y), f"t={t}", 12, SHIELDED, shift=(9, -9), anchor="ls")
+    canvas.start(shielded.start)
+    canvas.dot(case.target, 8.0, TARGET, INK)
+    canvas.text(case.target, case.instruction.split()[-1], 14, INK, shift=(0, 12), anchor="mt")
+    canvas.legend(case, shielded, unshielded)
+    canvas.save(path)
+
+
+def _avoided(formula: Formula) -> set[str]:
+    """Names that the formula wants not to hold: those below an odd number of `not`s."""
+    found: set[str] = set()
+
+    def walk(node: Formula, negated: bool) -> None:
+        if isinstance(node, Not):
+            walk(node.child, not negated)
+        elif hasattr(node, "children"):
+            for child in node.children:
+                walk(child, negated)
+        elif hasattr(node, "child"):
+            walk(node.child, negated)
+        elif negated:
+            found.update(node.names)
+
+    walk(formula, False)
+    return found
+
+
+def _kept_at(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
+    """Each visit that the rule asks for: the first step in its window that makes it, and the pose there."""
+    for part in obligations(case.task.formula):
+        if part.kind != "eventually":
+            continue
+        for t in range(part.a, min(part.b, len(poses) - 1) + 1):
+            samples = case.task.samples(np.array(poses[t : t + 1]))
+            if robustness(part.predicate, {name: samples[name] for name in part.predicate.names}) > 0.0:
+                yield t, poses[t]
+                break
+
+
+class _Canvas:
+    """Draws in metres of the map frame; sizes in pixels of the finished picture."""
+
+    def __init__(self, case: Case) -> None:
+        self._case = case
+        xmin, ymin, xmax, ymax = case.task.grid.bounds
+        self._corner = (xmin, ymax)
+        self.width, self.map_height = round((xmax - xmin) * PIXELS), round((ymax - ymin) * PIXELS)
+        size = (self.width + 2 * BORDER, self.map_height + 2 * BORDER + LEGEND)
+        self._image = Image.new("RGB", (size[0] * FINE, size[1] * FINE), PAPER)
+        self._pen = ImageDraw.Draw(self._image)
+
+    def points(self) -> NDArray[np.float64]:
+        """The map-frame point of every fine pixel of the map. Shape [rows, columns, 2]."""
+        scale = FINE * PIXELS
+        columns, rows = np.meshgrid(
+            np.arange(self.width * FINE) + 0.5, np.arange(self.map_height * FINE) + 0.5
+        )
+        return np.stack([self._corner[0] + columns / scale, self._corner[1] - rows / scale], axis=-1)
+
+    def floor(self) -> None:
+        case, grid = self._case, self._case.task.grid
+        cells = np.floor(grid.to_grid(self.points()) / grid.resolution).astype(int)
+        columns, rows = cells[..., 0].clip(0, grid.width - 1), cells[..., 1].clip(0, grid.height - 1)
+        self._paint(grid.occupied[rows, columns], WALL, 1.0)
+        for name, room in case.rooms.items():
+            inside = signed_distance(room, grid.centres)
+            free = np.where(grid.clearance > 0.4, np.minimum(inside, grid.clearance), -1.0)
+            row, column = np.unravel_index(np.argmax(free), free.shape)
+            self.text(tuple(grid.centres[row, column]), name, 13, FAINT)
+
+    def region(self, name: str, inside: NDArray[np.bool_], color: Color) -> None:
+        edge = np.zeros_like(inside)
+        thick = 2 * FINE
+        edge[thick:-thick, thick:-thick] = inside[thick:-thick, thick:-thick] & ~(
+            inside[: -2 * thick, thick:-thick] & inside[2 * thick :, thick:-thick]
+            & inside[thick:-thick, : -2 * thick] & inside[thick:-thick, 2 * thick :]
+        )  # fmt: skip
+        self._paint(inside, color, 0.16)
+        self._paint(edge, color, 1.0)
+        rows, columns = np.nonzero(inside)
+        x, y = self.points()[rows.max(), int(columns.mean())]
+        self.text((x, y), name, 13, color, shift=(0, 4), anchor="mt")
+
+    def way(self, poses: Sequence[Pose], color: Color, thickness: float) -> None:
+        line = [self._at(pose) for pose in poses]
+        width = round(thickness * FINE)
+        self._pen.line(line, fill=color, width=width, joint="curve")
+        for u, v in line:
+            self._pen.ellipse((u - width / 2, v - width / 2, u + width / 2, v + width / 2), fill=color)
+
+    def dot(self, point: tuple[float, float], radius: float, fill: Color, edge: Color) -> None:
+        u, v = self._at(point)
+        r = radius * FINE
+        self._pen.ellipse((u - r, v - r, u + r, v + r), fill=fill, outline=edge, width=round(1.5 * FINE))
+
+    def start(self, pose: Pose) -> None:
+        """A triangle that points where the robot looks."""
+        corners = [(0.17, 0.0), (-0.12, 0.11), (-0.06, 0.0), (-0.12, -0.11)]
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        outline = [self._at((pose[0] + c * p - s * q, pose[1] + s * p + c * q)) for p, q in corners]
+        self._pen.polygon(outline, fill=INK, outline=PAPER, width=FINE)
+
+    def text(
+        self,
+        point: Sequence[float],
+        said: str,
+        size: int,
+        color: Color,
+        shift: tuple[int, int] = (0, 0),
+        anchor: str = "mm",
+    ) -> None:
+        u, v = self._at(point)
+        self._write((u + shift[0] * FINE, v + shift[1] * FINE), said, size, color, anchor)
+
+    def legend(self, case: Case, shielded: Episode, unshielded: Episode) -> None:
+        top = (self.map_height + 2 * BORDER) * FINE
+        left = BORDER * FINE
+        self._write((left, top), str(case.task.formula), 15, INK, "lt")
+        for i, (episode, color, said) in enumerate(
+            ((shielded, SHIELDED, "with the shield"), (unshielded, UNSHIELDED, "without"))
+        ):
+            v = top + (32 + 24 * i) * FINE
+            self._pen.line((left, v, left + 34 * FINE, v), fill=color, width=4 * FINE)
+            self._write((left + 44 * FINE, v), f"{said}: {_outcome(episode)}", 14, INK, "lm")
+        right = left + 560 * FINE
+        v = top + 32 * FINE
+        for color, said in ((GOOD, "to visit"), (BAD, "to avoid")):
+            box = (right, v - 7 * FINE, right + 20 * FINE, v + 7 * FINE)
+            tint = tuple(round(0.84 * p + 0.16 * c) for p, c in zip(PAPER, color, strict=True))
+            self._pen.rectangle(box, fill=tint, outline=color, width=2 * FINE)
+            self._write((right + 30 * FINE, v), said, 14, INK, "lm")
+            right += 120 * FINE
+        self._write((left + 560 * FINE, top + 56 * FINE), f'"{case.instruction}"', 14, INK, "lm")
+
+    def save(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._image.reduce(FINE).save(path)
+
+    def _at(self, point: Sequence[float]) -> tuple[float, float]:
+        scale = FINE * PIXELS
+        u, v = (point[0] - self._corner[0]) * scale, (self._corner[1] - point[1]) * scale
+        return float(u) + BORDER * FINE, float(v) + BORDER * FINE
+
+    def _write(self, at: tuple[float, float], said: str, size: int, color: Color, anchor: str) -> None:
+        font = ImageFont.load_default(size * FINE)
+        self._pen.text(at, said, fill=color, font=font, anchor=anchor, stroke_width=FINE, stroke_fill=PAPER)
+
+    def _paint(self, where: NDArray[np.bool_], color: Color, opacity: float) -> None:
+        mask = Image.fromarray((where * round(255 * opacity)).astype(np.uint8))
+        self._image.paste(color, (BORDER * FINE, BORDER * FINE), mask)
+
+
+def _outcome(episode: Episode) -> str:
+    task = f"ended at t={episode.ended_at}" if episode.main_done else "target not found"
+    return f"rule {episode.spec_status}, {task}"

@@ -1,0 +1,94 @@
+"""A simulated robot: it executes actions exactly as the known dynamics say, and senses its way."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.robot.unicycle import step, successors
+from specshield.sim.cases import Case
+from specshield.sim.model import Observation
+from specshield.world.geodesic import geodesic_distance
+
+COMFORT = 0.32  # [m] clearance in which a Stretch turns freely about its origin
+LOOK_AHEAD = 10  # cells along the way
+NEAR = 1.0  # [m] along free space: an `end` within this has found the target
+
+Pose = tuple[float, float, float]
+
+
+class SimulatedRobot:
+    """pose: (x, y, theta) in metres and radians, map frame. last_action: the one executed last."""
+
+    def __init__(self, case: Case, pose: Pose) -> None:
+        self._case = case
+        self.pose = pose
+        self.last_action: int | None = None
+
+    def execute(self, action: int) -> None:
+        """One action, an index into the robot's; a terminal one moves nothing."""
+        motion = self._case.task.robot.motion_of[action]
+        if motion >= 0:
+            self.pose = step(self._case.body, *self.pose, motion)
+        self.last_action = action
+
+    @property
+    def at_target(self) -> bool:
+        return bool(self._distance <= NEAR)
+
+    @property
+    def _distance(self) -> float:
+        return float(self._case.distance[self._case.cell(self.pose)])
+
+    def observe(self) -> Observation:
+        x, y, theta = self.pose
+        way = waypoints(self._case)[self._case.cell(self.pose)] - (x, y)
+        bearing = math.atan2(way[1], way[0]) - theta
+        return Observation(
+            distance=self._distance,
+            bearing=math.remainder(bearing, 2.0 * math.pi),
+            blocked=self._blocked(),
+            last_action=self.last_action,
+        )
+
+    def _blocked(self) -> NDArray[np.bool_]:
+        robot, body = self._case.task.robot, self._case.body
+        after = np.empty((len(robot.motions), 3))
+        successors(body, np.array(self.pose), after)
+        short = np.hypot(*(after[:, :2] - self.pose[:2]).T) < 0.5 * np.abs(body.translate)
+        unturned = (body.rotate != 0.0) & (after[:, 2] == self.pose[2])
+        return np.where(robot.terminal, False, (short | unturned)[robot.motion_of])
+
+
+@lru_cache(maxsize=8)
+def waypoints(case: Case) -> NDArray[np.float64]:
+    """From each cell, the point LOOK_AHEAD cells on along the way, in metres. Shape [height, width, 2].
+
+    The way keeps off the walls, so that the robot can turn on it; from beside a wall it leads off it first.
+    """
+    grid = case.task.grid
+    free, comfortable = ~grid.occupied, grid.clearance > COMFORT
+    goal = np.zeros_like(free)
+    goal[case.cell(case.target)] = True
+    onward = geodesic_distance(comfortable, goal, grid.resolution)
+    reached = np.isfinite(onward)
+    off_the_wall = geodesic_distance(free, reached, grid.resolution)
+    to_go = np.where(reached, onward, onward[reached].max() + grid.resolution + off_the_wall)
+
+    h, w = free.shape
+    padded = np.pad(to_go, 1, constant_values=np.inf)
+    rows, columns = np.indices((h, w))
+    best, following = np.zeros((h, w)), rows * w + columns
+    for i, j in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+        with np.errstate(invalid="ignore"):
+            steepness = (to_go - padded[1 + i : 1 + i + h, 1 + j : 1 + j + w]) / math.hypot(i, j)
+        better = steepness > best
+        best[better] = steepness[better]
+        following[better] = ((rows + i) * w + columns + j)[better]
+    cell = np.arange(h * w)
+    for _ in range(LOOK_AHEAD):
+        cell = following.ravel()[cell]
+    return grid.centres.reshape(-1, 2)[cell].reshape(h, w, 2)

@@ -1,0 +1,75 @@
+"""A specshield server of one's own, for as long as a block lasts."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+
+READY_WITHIN = 180.0  # [s] the first start of an installation compiles the kernels
+
+
+@contextmanager
+def own_server() -> Iterator[str]:
+    """Starts `specshield serve` on a free port, its data in a temporary folder; yields its address.
+
+    Raises RuntimeError with the server's log where it does not come up.
+    """
+    with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
+        log = Path(folder) / "server.log"
+        url = f"http://127.0.0.1:{_free_port()}"
+        with open(log, "wb") as output:
+            server = subprocess.Popen(
+                [sys.executable, "-m", "specshield.cli", "serve", "--port", url.rpartition(":")[2]],
+                env=_environment(Path(folder)),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+            )
+        try:
+            _wait_until_ready(url, server, log)
+            yield url
+        finally:
+            server.terminate()
+            try:
+                server.wait(15.0)
+            except subprocess.TimeoutExpired:
+                server.kill()
+                server.wait()
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """This process's, without what would join the server to another's store or lock it."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith("SPECSHIELD_") and name != "REDIS_URL"
+    }
+    return {**kept, "SPECSHIELD_DATA_DIR": str(folder / "data"), "SPECSHIELD_WORKER": "false"}
+
+
+def _wait_until_ready(url: str, server: subprocess.Popen[bytes], log: Path) -> None:
+    deadline = time.monotonic() + READY_WITHIN
+    while time.monotonic() < deadline and server.poll() is None:
+        try:
+            if httpx.get(f"{url}/readyz", timeout=2.0).status_code == 200:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.05)
+    raise RuntimeError(f"the server did not come up:\n{log.read_text(errors='replace')[-4000:]}")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
