@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +22,8 @@ POSE_NAMES = ("x", "y", "theta")
 MAX_REGIONS = 256
 MAX_HORIZON = 1000
 MAX_NAME = 64
+LARGEST = 1e100  # a signal's value, so that arithmetic on it stays finite
+SIGNAL = f"a number from {-LARGEST:g} to {LARGEST:g}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +72,17 @@ class Task:
             elif name in POSE_NAMES:
                 result[name] = array[..., POSE_NAMES.index(name)]
             else:
-                sent = np.asarray((signals or {}).get(name, ()), dtype=np.float64)
-                held = np.full(array.shape[-2], sent[-1] if len(sent) else self.signals[name])
-                held[: len(sent)] = sent
-                result[name] = np.broadcast_to(held, array.shape[:-1])
+                result[name] = np.broadcast_to(self.signal(name, signals, array.shape[-2]), array.shape[:-1])
         return result
+
+    def signal(
+        self, name: str, signals: Mapping[str, NDArray[np.float64]] | None, n: int
+    ) -> NDArray[np.float64]:
+        """A signal's first n samples, shape (n,), its last value held where fewer were sent."""
+        sent = np.asarray((signals or {}).get(name, ()), dtype=np.float64)
+        held = np.full(n, sent[-1] if len(sent) else self.signals[name])
+        held[: len(sent)] = sent
+        return held
 
     def check_signals(self, signals: Mapping[str, float]) -> None:
         """Raises SampleError for a signal that the task does not declare or a value that is not finite."""
@@ -85,9 +92,9 @@ class Task:
                     f"unknown signal {name!r}", path=f"signals.{name}", got=name,
                     expected=f"one of {sorted(self.signals)}, as the spec declares them",
                 )  # fmt: skip
-            if not math.isfinite(value):
+            if not -LARGEST <= value <= LARGEST:
                 raise SampleError(
-                    "a signal is finite", path=f"signals.{name}", got=str(value), expected="a number"
+                    "a signal is out of range", path=f"signals.{name}", got=str(value), expected=SIGNAL
                 )
 
 
@@ -102,13 +109,13 @@ def make_task(
 ) -> Task:
     """Checks and joins the parts of a task.
 
-    regions: {name: region JSON or Region}, the spec's own; they come before the map's `rooms` of the same
-    name. Raises FormulaError, MapError (regions), SampleError (signals), with the path of the field below the
-    spec.
+    regions: {name: region JSON or Region}, the spec's own; they and `signals` come before the map's `rooms`
+    of the same name. Raises FormulaError, MapError (regions), SampleError (signals), with the path of the
+    field below the spec.
     """
     declared = parse_regions(regions or {})
     initial = parse_signals(signals or {}, declared)
-    known = {**(rooms or {}), **declared}
+    known = {name: room for name, room in (rooms or {}).items() if name not in initial} | declared
     tree = parse(formula, names=[*known, *POSE_NAMES, *initial], max_horizon=max_horizon)
     if tree.horizon < 1:
         raise FormulaError(
@@ -142,12 +149,12 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
             raise MapError(
                 "a region has this name", path=f"signals.{name}", got=name, expected="a name of its own"
             )
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not -LARGEST <= value <= LARGEST:
             raise SampleError(
                 "a signal's initial value is a number",
                 path=f"signals.{name}",
                 got=value,
-                expected="a finite number",
+                expected=SIGNAL,
             )
     return {name: float(value) for name, value in signals.items()}
 
@@ -156,5 +163,5 @@ def _check_name(name: str, path: str) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
         raise MapError(
             f"{name!r} cannot be a name", path=path, got=name,
-            expected=f"up to {MAX_NAME} letters, digits and _; no word of the formula language, no x, y, theta",
+            expected=f"up to {MAX_NAME} letters, digits and _; no keyword of formulas, no x, y, theta",
         )  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from specshield.errors import MapError
 from specshield.policy.funnel import Funnels, make_funnels, reward
 from specshield.policy.observation import Sight, make_sight, observation_size, observe, outcome
 from specshield.policy.progress import (
@@ -51,7 +52,7 @@ class Environment:
         self.step(np.zeros(robots, dtype=np.int64))
 
     def step(self, motions: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Each robot takes a motion (N,). Rewards, and which episodes ended, (N,); those robots begin anew."""
+        """Each robot takes a motion (N,). Rewards and which episodes ended, (N,); those begin anew."""
         n, k = self.status.shape
         fresh = free_poses(self.task, self.body, n, self.random)
         times = np.where(self.random.random(n) < 0.5, 0, self.random.integers(0, self.task.horizon, n))
@@ -73,7 +74,10 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> N
         kept = np.concatenate([kept, poses[~_colliding(body, poses)]])
         if len(kept) >= n:
             return kept[:n]
-    raise ValueError("the map has next to no free space for this robot")
+    raise MapError(
+        "the map has next to no free space for this robot", path="map",
+        got=f"a radius of {task.robot.radius:g} m", expected="a larger map or a smaller footprint",
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)

@@ -19,7 +19,7 @@ from safetensors.numpy import save as save_tensors
 from specshield.errors import PolicyError
 from specshield.policy.network import Network, make_network
 from specshield.policy.observation import Sight, make_sight, observation_size
-from specshield.policy.progress import Rules, hold_signals, make_rules, replay
+from specshield.policy.progress import Rules, make_rules, replay, signal_rows
 from specshield.policy.rollout import rollout, rollout_all
 from specshield.robot import Robot, robot_to_json
 from specshield.robot.unicycle import Body, make_body
@@ -82,10 +82,10 @@ class Policy:
         self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
     ) -> Proposal:
         body, rules, sight = self._prepared
-        rules = hold_signals(rules, self.task, signals)._replace(margin=margin)
+        rules = rules._replace(signals=rules.signals.copy(), margin=margin)
         t, wait = len(history) - 1, wait_motion(self.task.robot)
         status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
-        replay(rules, history, status, run)
+        replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
         motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
         poses = np.empty((*motions.shape, 3))
         args = (body, rules, sight, self.network, history[-1], t, status, run)

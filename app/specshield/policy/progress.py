@@ -81,12 +81,10 @@ def last_step(part: Obligation) -> int:
     return part.c1 + part.b if part.kind == "eventually_always" else part.b
 
 
-def hold_signals(rules: Rules, task: Task, signals: Mapping[str, NDArray[np.float64]]) -> Rules:
-    """The same rules with each signal at its latest value. signals {name: [n]}."""
-    if not task.signals:
-        return rules
-    latest = [signals[n][-1] if n in signals and len(signals[n]) else task.signals[n] for n in task.signals]
-    return rules._replace(signals=np.array(latest, dtype=np.float64))
+def signal_rows(task: Task, signals: Mapping[str, NDArray[np.float64]], n: int) -> NDArray[np.float64]:
+    """The signals' first n samples in the order of `Rules.signals`, shape (n, S). signals {name: [..n]}."""
+    rows = [task.signal(name, signals, n) for name in task.signals]
+    return np.array(rows, dtype=np.float64).reshape(-1, n).T.copy()
 
 
 @njit(cache=True, nogil=True)
@@ -157,13 +155,30 @@ def advance(
 
 @njit(cache=True, nogil=True)
 def replay(
-    rules: Rules, poses: NDArray[np.float64], status: NDArray[np.int8], run: NDArray[np.int64]
+    rules: Rules,
+    poses: NDArray[np.float64],
+    signals: NDArray[np.float64],
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
 ) -> None:
-    """The progress after the states x_0..x_t. poses (t + 1, 3); status, run (K,) are overwritten."""
+    """The progress after the states x_0..x_t. poses (t + 1, 3), signals (t + 1, S).
+
+    Overwritten: status, run (K,), and rules.signals, which is left at the last row: the values that are held.
+    """
     values, stack = np.empty(value_count(rules)), np.empty(STACK)
     predicates = np.empty(rules.kind.shape[0])
     status[:] = PENDING
     run[:] = 0
     for t in range(poses.shape[0]):
+        rules.signals[:] = signals[t]
         read_predicates(rules, poses[t, 0], poses[t, 1], poses[t, 2], values, stack, predicates)
         advance(rules, t, predicates, status, run)
+
+
+@njit(cache=True, nogil=True)
+def forgive(rules: Rules, t: int, status: NDArray[np.int8]) -> None:
+    """What is broken at step t and what a policy goes on with: an `always` holds again from t + 1, the rest is dropped."""
+    for k in range(rules.kind.shape[0]):
+        if status[k] == BROKEN:
+            again = rules.kind[k] == ALWAYS and rules.b[k] > t
+            status[k] = PENDING if again else SETTLED

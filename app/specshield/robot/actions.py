@@ -125,7 +125,7 @@ def robot_from_json(spec: Any) -> Robot:
     _keys(spec, "", {"footprint", "actions"}, {"on_contact"})
     footprint = spec["footprint"]
     _keys(footprint, "footprint", {"radius"}, {"offset"})
-    radius = _number(footprint["radius"], "footprint.radius", low=0.0, high=5.0)
+    radius = _number(footprint["radius"], "footprint.radius", low=1e-3, high=5.0)
     offset = footprint.get("offset", [0.0, 0.0])
     if not isinstance(offset, (list, tuple)) or len(offset) != 2:
         raise RobotError(

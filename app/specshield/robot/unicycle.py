@@ -24,6 +24,7 @@ TOUCH = 1e-6  # [m] a footprint that overlaps by less than this is not in collis
 SKIN = 1e-7  # [m] how far before the first contact a stopped move ends
 ROUNDING = 1e-9  # [m] slack against rounding: sliding along a wall is not a contact
 CHORD = math.radians(6.0)
+DEEP = 32  # [cells] deeper inside obstacles than this is all one: what lies beyond is not searched
 
 
 class Body(NamedTuple):
@@ -92,21 +93,44 @@ def _is_occupied(body: Body, row: int, col: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _rows(body: Body, low: float, high: float) -> tuple[int, int]:
+    """The range of rows between two heights (grid metres), with the ring that stands for the outside."""
+    h = body.resolution
+    return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[0]) + 1
+
+
+@njit(cache=True, nogil=True)
+def _columns(body: Body, low: float, high: float) -> tuple[int, int]:
+    h = body.resolution
+    return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[1]) + 1
+
+
+@njit(cache=True, nogil=True)
+def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
+    """Whether the clearance field alone shows no obstacle within `distance` [m] of a point (grid metres)."""
+    h = body.resolution
+    col, row = int(math.floor(u / h)), int(math.floor(v / h))
+    if row < 0 or col < 0 or row >= body.occupied.shape[0] or col >= body.occupied.shape[1]:
+        return False
+    return body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h) >= distance
+
+
+@njit(cache=True, nogil=True)
 def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     """Exact distance [m] from a point (grid metres) to the nearest occupied square, at most `limit`."""
     h = body.resolution
     col, row = math.floor(u / h), math.floor(v / h)
     if _is_occupied(body, row, col):
         return 0.0
-    bound = body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h)
-    if bound >= limit:
+    if _is_clear(body, u, v, limit):
         return limit
     best = limit * limit
-    for j in range(math.floor((v - limit) / h), math.floor((v + limit) / h) + 1):
+    first, last = _columns(body, u - limit, u + limit)
+    for j in range(*_rows(body, v - limit, v + limit)):
         dy = max(j * h - v, 0.0, v - (j + 1) * h)
         if dy * dy >= best:
             continue
-        for i in range(math.floor((u - limit) / h), math.floor((u + limit) / h) + 1):
+        for i in range(first, last):
             dx = max(i * h - u, 0.0, u - (i + 1) * h)
             if dx * dx + dy * dy < best and _is_occupied(body, j, i):
                 best = dx * dx + dy * dy
@@ -115,20 +139,19 @@ def free_distance(body: Body, u: float, v: float, limit: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _depth(body: Body, u: float, v: float) -> float:
-    """How far inside occupied space a point lies [m]: the distance to the nearest free square."""
+    """How far inside occupied space a point lies [m]: to the nearest free square, DEEP cells at most."""
     h = body.resolution
     height, width = body.occupied.shape
     row, col = math.floor(v / h), math.floor(u / h)
     half = 4
     while True:  # a window that grows until nothing outside it can be nearer
-        best = np.inf
+        best = half * h
         for j in range(max(row - half, 0), min(row + half + 1, height)):
             dy = max(j * h - v, 0.0, v - (j + 1) * h)
             for i in range(max(col - half, 0), min(col + half + 1, width)):
                 if body.occupied[j, i] == 0:
                     best = min(best, math.hypot(max(i * h - u, 0.0, u - (i + 1) * h), dy))
-        whole = row - half <= 0 and col - half <= 0 and row + half >= height - 1 and col + half >= width - 1
-        if best <= half * h or whole:
+        if best < half * h or half >= DEEP:
             return best
         half *= 2
 
@@ -182,9 +205,10 @@ def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length:
         if bound >= r + 0.5 * length:
             return np.inf
     eu, ev = u + length * du, v + length * dv
+    left, right = _columns(body, min(u, eu) - r, max(u, eu) + r)
     first = np.inf
-    for j in range(math.floor((min(v, ev) - r) / h), math.floor((max(v, ev) + r) / h) + 1):
-        for i in range(math.floor((min(u, eu) - r) / h), math.floor((max(u, eu) + r) / h) + 1):
+    for j in range(*_rows(body, min(v, ev) - r, max(v, ev) + r)):
+        for i in range(left, right):
             if not _is_occupied(body, j, i):
                 continue
             u0, u1, v0, v1 = i * h, (i + 1) * h, j * h, (j + 1) * h
@@ -204,6 +228,8 @@ def _move(body: Body, x: float, y: float, theta: float, distance: float) -> floa
     length = abs(distance)
     cx, cy = sign * math.cos(theta), sign * math.sin(theta)
     du, dv = body.cos_yaw * cx + body.sin_yaw * cy, body.cos_yaw * cy - body.sin_yaw * cx
+    if _is_clear(body, u, v, body.radius + length):
+        return distance
     gap = free_distance(body, u, v, body.radius)
     if gap == 0.0:
         return sign * _escape(body, u, v, du, dv, length)
@@ -235,6 +261,8 @@ def _can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> boo
     if body.offset_x == 0.0 and body.offset_y == 0.0:
         return True
     u, v = centre(body, x, y, theta)
+    if _is_clear(body, u, v, body.radius + 2.0 * math.hypot(body.offset_x, body.offset_y)):
+        return True
     gap = free_distance(body, u, v, body.radius)
     inside = _depth(body, u, v) if gap == 0.0 else 0.0
     r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
@@ -245,7 +273,10 @@ def _can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> boo
         if gap == 0.0:
             if _depth(body, eu, ev) > inside + ROUNDING:
                 return False
-        elif _first_contact(body, u, v, (eu - u) / length, (ev - v) / length, length, r) < np.inf:
+        elif (
+            length > 0.0
+            and _first_contact(body, u, v, (eu - u) / length, (ev - v) / length, length, r) < np.inf
+        ):
             return False
         u, v = eu, ev
     return True
