@@ -30,8 +30,9 @@ def rollout(
     """pi_phi from (x_t, t) to the horizon, after the motion `first` (-1: pi_phi chooses that one too).
 
     status, run (K,): the progress after x_t, left as they are. wait: a motion that leaves the pose alone, -1
-    if there is none; once the formula is settled or broken the robot waits. Writes motions (T - t,) and the
-    poses after each (T - t, 3). Returns the progress reached: PENDING, SETTLED or BROKEN.
+    if there is none; once no obligation is pending the robot waits. One that is broken does not end the rest.
+    Writes motions (T - t,) and the poses after each (T - t, 3). Returns the progress reached: PENDING,
+    SETTLED or BROKEN.
     """
     status, run = status.copy(), run.copy()
     here = pose.copy()
@@ -45,7 +46,7 @@ def rollout(
         if k == 0 and first >= 0:
             motion = first
             successors(body, here, nexts)
-        elif wait >= 0 and outcome(status) != PENDING:
+        elif wait >= 0 and not np.any(status == PENDING):
             motions[k:] = wait
             for j in range(k, motions.shape[0]):
                 poses[j] = here

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
-from specshield.robot.unicycle import in_collision, successors
+from specshield.robot.unicycle import in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
-from specshield.shield.feasibility import Best, Futures, best_of, futures
+from specshield.shield.feasibility import Best, Futures, best_of, futures, rho
 from specshield.shield.residual import residuals
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
@@ -35,28 +35,29 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
     Raises PoseError for a pose that is not finite, outside the map or in collision, else InfeasibleStart.
     """
     grid = shield.task.grid
-    if not all(math.isfinite(v) for v in pose):
+    try:
+        history = _history([pose])
+    except (PoseError, ValueError):
         raise PoseError(
-            "a pose is finite", path="initial_pose", got=str(list(pose)), expected="[x, y, theta]"
-        )
+            "not a pose", path="initial_pose", got=str(list(pose)), expected="finite [x, y, theta]"
+        ) from None
     u, v = grid.to_grid(pose[:2])
     if not (0.0 <= u < grid.width * grid.resolution and 0.0 <= v < grid.height * grid.resolution):
         raise PoseError(
             "the pose is outside the map", path="initial_pose", got=list(pose),
             expected=f"within {list(grid.bounds)} (xmin, ymin, xmax, ymax)",
         )  # fmt: skip
-    history = _history([pose])
     if in_collision(shield.body, *history[0]):
         raise PoseError(
             "the footprint touches an obstacle", path="initial_pose", got=list(pose),
             expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
         )  # fmt: skip
     tried = futures(shield.task, shield.body, shield.policies, history, {}, None, shield.config.margin)
-    best = best_of(shield.task, shield.task.formula, tried, {}, len(shield.task.robot.motions))
-    if not np.any(best.robustness > SATISFIED_ABOVE):
+    values = rho(shield.task, shield.task.formula, tried, {})
+    if not np.any(values > SATISFIED_ABOVE):
         raise InfeasibleStart(
             f"no action from here has a future that satisfies the formula: the best robustness is "
-            f"{best.robustness.max():.3f}", path="initial_pose", got=list(pose),
+            f"{values.max():.3f}", path="initial_pose", got=list(pose),
             expected="a pose from which some action, followed by a policy, satisfies it; or allow_infeasible",
         )  # fmt: skip
 
@@ -138,15 +139,16 @@ def decide(
 
 @dataclass(frozen=True)
 class _Judged:
-    """The actions' futures at one step. feasible [A] is S_t; margin_unattainable: the margin was lowered."""
+    """The actions' futures at one step."""
 
     tried: Futures
     best: Best
     feasible_motion: Bools  # [M]
-    feasible: Bools  # [A], false for a terminal action
-    robustness: Floats  # [A], -inf for a terminal action
+    feasible: Bools  # [A], S_t; false for a terminal action
+    values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf for a terminal action
+    robustness: Floats  # [A], rho of the whole formula along the same trajectories
     completion: int
-    margin_unattainable: bool
+    margin_unattainable: bool  # the margin asked for was lowered
 
 
 @dataclass(frozen=True)
@@ -165,11 +167,13 @@ def _judge(
     violated: bool,
 ) -> _Judged:
     task, robot, asked = shield.task, shield.task.robot, shield.config.margin
+    motions = len(robot.motions)
     tried = futures(task, shield.body, shield.policies, poses, signals, tail, asked)
-    whole = best_of(task, task.formula, tried, signals, len(robot.motions))
-    best, feasible, lowered = whole, np.zeros(len(robot.motions), bool), False
-    for formula in residuals(task.formula, prefix) if violated else (task.formula,):
-        best = best_of(task, formula, tried, signals, len(robot.motions)) if violated else whole
+    whole = rho(task, task.formula, tried, signals)
+    best, feasible, lowered = best_of(tried, whole, motions), np.zeros(motions, bool), False
+    for formula in residuals(task.formula, prefix, len(poses) - 1) if violated else (task.formula,):
+        values = rho(task, formula, tried, signals) if violated else whole
+        best = best_of(tried, values, motions)
         feasible = best.robustness > SATISFIED_ABOVE + asked
         highest = best.robustness.max()
         lowered = not feasible.any() and highest > SATISFIED_ABOVE
@@ -188,7 +192,8 @@ def _judge(
         best=best,
         feasible_motion=feasible,
         feasible=feasible[of] & ~robot.terminal,
-        robustness=np.where(robot.terminal, -np.inf, whole.robustness[of]),
+        values=np.where(robot.terminal, -np.inf, best.robustness[of]),
+        robustness=whole[best.row][of],
         completion=int(robot.representative[first]),
         margin_unattainable=lowered,
     )
@@ -213,16 +218,17 @@ def _answer(shield: Shield, log_prior: Floats | None, judged: _Judged, main_task
             prior, "shaped" if any_feasible else "fallback", None if any_feasible else "infeasible"
         )
     conditional = shaping.log_softmax(going_on)
-    config = shield.config
+    config, attainable = shield.config, any_feasible
     if config.evaluation == "robustness":
-        shaped = shaping.tilt(conditional, judged.robustness, config.threshold)
+        shaped = shaping.tilt(conditional, judged.values, config.threshold)
+        attainable = bool(judged.values.max() >= config.threshold)
     elif config.threshold == 1.0:
         shaped = shaping.restrict(conditional, judged.feasible)
     else:
         shaped = shaping.soften(conditional, judged.feasible, config.threshold)
     reason: Reason | None = said
     if shaped is None:
-        reason = "zero_prior_mass" if any_feasible and config.evaluation == "feasibility" else "infeasible"
+        reason = "zero_prior_mass" if attainable else "infeasible"
     mode: Mode = "fallback" if shaped is None else "shaped"
     body = certified if shaped is None else shaped
     return _Answer(np.where(terminal, prior, (1.0 - ending) * body), mode, reason)
@@ -242,11 +248,11 @@ def _verdict(low: float, high: float) -> Verdict:
 
 
 def _history(poses: ArrayLike) -> Floats:
-    """Poses [t + 1, 3] with theta in (-pi, pi], as f has it."""
+    """Poses [t + 1, 3] with theta in (-pi, pi], as f has it. Raises PoseError where they are not finite."""
     array = np.array(poses, dtype=np.float64)
-    theta = array[:, 2]
-    outside = ~((theta > -math.pi) & (theta <= math.pi))
-    theta[outside] -= 2.0 * math.pi * np.ceil((theta[outside] - math.pi) / (2.0 * math.pi))
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not np.isfinite(array).all():
+        raise PoseError("not poses", path="poses", got=str(poses)[:80], expected="a list of finite [x, y, theta]")
+    array[:, 2] = [wrap(theta) for theta in array[:, 2]]
     return array
 
 
@@ -318,7 +324,7 @@ def _j_values(shield: Shield, judged: _Judged | None) -> tuple[float | None, ...
     if judged is None:
         return (None,) * len(terminal)
     binary = shield.config.evaluation == "feasibility"
-    values = judged.feasible.astype(np.float64) if binary else judged.robustness
+    values = judged.feasible.astype(np.float64) if binary else judged.values
     return tuple(np.where(terminal, values[~terminal].max(), values).tolist())
 
 

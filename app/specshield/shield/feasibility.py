@@ -59,7 +59,8 @@ def futures(
     from the pose there is.
     """
     steps = task.horizon + 1 - len(history)
-    proposals = [policy.propose(history, signals, margin) for policy in policies]
+    margins = (margin, 0.0) if margin > 0.0 else (0.0,)  # what cannot be had with the margin may be without
+    proposals = [policy.propose(history, signals, each) for each in margins for policy in policies]
     motions, poses = [p.motions for p in proposals], [p.poses for p in proposals]
     if tail is not None and len(tail) == steps:
         kept, after = np.frombuffer(tail, np.uint8).astype(np.int64)[None], np.empty((1, steps, 3))
@@ -71,11 +72,15 @@ def futures(
     return Futures(np.concatenate(motions), np.concatenate([prefix, joined], axis=1), proposals[0].preferred)
 
 
-def best_of(task: Task, formula: Formula, tried: Futures, signals: Signals, motions: int) -> Best:
-    """rho of the most robust future of each motion, the lowest row on ties. Every motion has at least one."""
+def rho(task: Task, formula: Formula, tried: Futures, signals: Signals) -> Floats:
+    """The robustness of each future, shape (N,), on the whole formula or on a part of it."""
     samples = task.samples(tried.trajectories, signals)
     values = robustness(formula, {name: samples[name] for name in formula.names})
-    values = np.broadcast_to(values, len(tried.motions))
+    return np.broadcast_to(values, len(tried.motions))
+
+
+def best_of(tried: Futures, values: Floats, motions: int) -> Best:
+    """The future of each motion with the highest of `values` (N,), the lowest row on ties; each has one."""
     rows = np.empty(motions, np.int64)
     for m in range(motions):
         candidates = np.flatnonzero(tried.motions[:, 0] == m)

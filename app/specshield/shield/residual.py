@@ -19,14 +19,13 @@ from specshield.stl import (
 )
 
 
-def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]]) -> Iterator[Formula]:
-    """What is left to keep after a violating prefix, the most demanding first.
+def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int) -> Iterator[Formula]:
+    """What is left to keep after a prefix that violates, the most demanding first.
 
     prefix {name: [t + 1]}. The broken conjuncts are dropped, a broken G is enforced again from t + 1; and
     where even that cannot be (the robot is still inside), without those. Nothing is yielded where no conjunct
     is left.
     """
-    t = next(iter(prefix.values())).shape[-1] - 1
     kept: list[Formula] = []
     again: list[Formula] = []
     for conjunct in conjuncts(formula):
