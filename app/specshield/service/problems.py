@@ -88,31 +88,34 @@ def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -
 
 def from_validation(found: Sequence[Mapping[str, Any]], body: Any) -> InputError:
     """One error for everything a schema refused: the first in its own words, all of them in `errors`."""
+    if found[0]["type"] == "json_invalid":
+        reason = found[0].get("ctx", {}).get("error", "")
+        return InputError(f"the body is not JSON: {reason}", expected="a JSON object")
     listed = [
-        {"path": _path(item["loc"], body), "got": plain(item.get("input")), "expected": _expected(item)}
+        {"path": _path(item, body), "got": plain(item.get("input")), "expected": _expected(item)}
         for item in found[:20]
     ]
     first = listed[0]
-    if found[0]["type"] == "json_invalid":
-        reason = found[0].get("ctx", {}).get("error", "")
-        return InputError(
-            f"the body is not JSON: {reason}", position=found[0]["loc"][-1], expected="a JSON object"
-        )
-    kind = next(
-        (FIELD_ERRORS[part] for part in re.split(r"[.\[]", first["path"]) if part in FIELD_ERRORS), InputError
-    )
+    parts = re.split(r"[.\[]", first["path"])
+    kind = next((FIELD_ERRORS[part] for part in parts if part in FIELD_ERRORS), InputError)
     message = f"{first['path'] or 'the body'}: {first['expected']}"
     return kind(message, path=first["path"], got=first["got"], expected=first["expected"], errors=listed)
 
 
 def _expected(item: Mapping[str, Any]) -> str:
-    text = str(item["msg"]).removeprefix("Value error, ")
-    return {"extra_forbidden": "no such field", "missing": "this field is required"}.get(item["type"], text)
+    said, context = str(item["msg"]).removeprefix("Value error, "), item.get("ctx", {})
+    if item["type"].startswith("union_tag"):
+        return (
+            f"one of {context['expected_tags']}" if "expected_tags" in context else "this field is required"
+        )
+    return {"extra_forbidden": "no such field", "missing": "this field is required"}.get(item["type"], said)
 
 
-def _path(location: Sequence[str | int], body: Any) -> str:
+def _path(item: Mapping[str, Any], body: Any) -> str:
     """'poses[0][2]'. Left out: the names that pydantic puts in for the branch of a union."""
-    source, *rest = location
+    source, *rest = item["loc"]
+    if item["type"].startswith("union_tag"):
+        rest.append(item["ctx"]["discriminator"].strip("'"))
     parts: list[str] = []
     here = body
     for i, part in enumerate(rest):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, JsonValue, Tag, model_validator
 
 from specshield.service import examples
 
@@ -213,11 +213,17 @@ class RobotSpec(Strict):
     actions: list[ActionSpec] = Field(min_length=1, max_length=256)
 
 
+RobotChoice = Annotated[
+    Annotated[Name, Tag("name")] | Annotated[RobotSpec, Tag("robot")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "robot"),
+]
+
+
 class PolicyRequest(Strict):
     model_config = ConfigDict(json_schema_extra={"examples": [examples.POLICY]})
 
     map_id: Id = Field(description="Id or name of the map.")
-    robot: Name | RobotSpec = Field("stretch", description="A preset (`stretch`) or a robot of your own.")
+    robot: RobotChoice = Field("stretch", description="A preset (`stretch`) or a robot of your own.")
     spec: Spec
     method: Literal["dqn", "reachability"] = Field("dqn", description="How the policy is made.")
     seed: int = Field(0, ge=0, lt=2**63)
@@ -234,7 +240,7 @@ class Card(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
 
     map_id: Id
-    robot: Name | RobotSpec
+    robot: RobotChoice
     spec: Spec
     method: Literal["dqn"]
     seed: int = Field(ge=0, lt=2**63)

@@ -1,0 +1,358 @@
+"""Everything a caller can get wrong: a problem document that names field, value and what is valid, and no change."""
+
+import io
+import json
+import math
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+from tests.service.world import LOGITS, ROBOT, SPEC, START, ahead, grid_json, policy_files
+
+YAML = b"image: x.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
+PGM = b"P5\n4 3\n255\n" + bytes([254] * 12)
+
+
+def problem(response, status, type, path=...):
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    body = response.json()
+    assert (body["status"], body["type"]) == (status, type), body
+    assert body["detail"]
+    assert "Traceback" not in response.text
+    if path is not ...:
+        assert body["path"] == path, body
+        assert body["expected"]
+        assert "got" in body
+    return body
+
+
+@pytest.fixture
+def unchanged(client, policy):
+    """Whatever the test sends, the server keeps what it had."""
+
+    def kept():
+        return [
+            client.get(f"/v1/{what}", params={"limit": 1000}).json()
+            for what in ("maps", "policies", "sessions")
+        ]
+
+    before = kept()
+    yield
+    assert kept() == before
+
+
+@pytest.mark.parametrize(
+    ("body", "type", "position"),
+    [
+        ({"formula": "F[0,5] (a"}, "invalid-formula", 9),
+        ({"formula": "F[5,0] a"}, "invalid-formula", ...),
+        ({"formula": "1 < x < 2"}, "invalid-formula", ...),
+        ({"formula": "F a"}, "invalid-formula", 2),
+        ({"formula": "G[0,9] Sofa", "regions": {}}, "invalid-formula", 7),
+        ({"formula": "G[0,9] Sofa", "map_id": "case1"}, "invalid-formula", 7),
+        ({"formula": "G[0,2000] x > 1"}, "horizon-too-long", ...),
+        ({"formula": "(" * 4000}, "invalid-formula", ...),
+    ],
+)
+def test_formulas(client, unchanged, body, type, position):
+    answer = problem(client.post("/v1/specs/validate", json=body), 422, type, "formula")
+    assert position is ... or answer["position"] == position
+
+
+@pytest.mark.parametrize(
+    ("body", "path"),
+    [
+        ({}, "formula"),
+        ({"formula": 7}, "formula"),
+        ({"formula": "x > 1", "colour": "red"}, "colour"),
+        (
+            {"formula": "A", "regions": {"A": {"type": "circle", "center": [0, 0], "radius": -1}}},
+            "regions.A.radius",
+        ),
+        ({"formula": "A", "regions": {"A": {"type": "disc"}}}, "regions.A.type"),
+        (
+            {"formula": "A", "regions": {"A": {"type": "circle", "center": [0], "radius": 1}}},
+            "regions.A.center",
+        ),
+        ({"formula": "A", "regions": {"G": {"type": "circle", "center": [0, 0], "radius": 1}}}, "regions.G"),
+    ],
+)
+def test_fields_of_a_specification(client, unchanged, body, path):
+    response = client.post("/v1/specs/validate", json=body)
+    answer = problem(response, 422, response.json()["type"], path)
+    assert answer["type"].startswith("invalid-")
+
+
+@pytest.mark.parametrize(
+    "content", [b"{", b"[1, 2]", b'"text"', b"", b"\xff\xfe", b"[" * 100_000, b'{"formula": 1e999}']
+)
+def test_bodies_that_are_no_json_object(client, unchanged, content):
+    response = client.post(
+        "/v1/specs/validate", content=content, headers={"Content-Type": "application/json"}
+    )
+    assert response.status_code == 422, response.text
+    problem(response, 422, response.json()["type"])
+
+
+def png(width, height):
+    buffer = io.BytesIO()
+    Image.new("1", (width, height)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("metadata", "image", "path"),
+    [
+        (YAML, b"P9\n4 3\n255\n" + bytes(12), "image"),
+        (YAML, PGM[:-3], "image"),
+        (YAML, png(4001, 1), ...),
+        (YAML, b"", "image"),
+        (YAML.replace(b"0.05", b"-1"), PGM, "resolution"),
+        (YAML.replace(b"0.05", b".nan"), PGM, "resolution"),
+        (YAML.replace(b"origin", b"corner"), PGM, "origin"),
+        (b"{", PGM, ...),
+        (b"\xff\xfe\x00", PGM, "metadata"),
+        (b"!!python/object/apply:os.system ['true']", PGM, ...),
+    ],
+)
+def test_maps_as_files(client, unchanged, metadata, image, path):
+    files = {"metadata": ("map.yaml", metadata), "image": ("map.pgm", image)}
+    problem(client.post("/v1/maps", files=files), 422, "invalid-map", path)
+
+
+def test_a_map_over_the_limit_in_cells(client, unchanged):
+    files = {"metadata": ("map.yaml", YAML), "image": ("map.png", png(4001, 4001))}
+    answer = problem(client.post("/v1/maps", files=files), 422, "invalid-map")
+    assert "4000" in answer["expected"]
+
+
+def test_parts_that_are_missing_or_too_many(client, unchanged):
+    files = {"metadata": ("map.yaml", YAML)}
+    assert problem(client.post("/v1/maps", files=files), 422, "invalid-input", "body")["got"] == ["metadata"]
+    problem(
+        client.post("/v1/maps", files={**files, "image": ("i", PGM), "more": ("m", b"x")}),
+        422,
+        "invalid-input",
+    )
+    broken = client.post("/v1/maps", content=b"--x\r\n\r\n", headers={"Content-Type": "multipart/form-data"})
+    problem(broken, 422, "invalid-input")
+
+
+def changed(body, **fields):
+    return {**body, **fields}
+
+
+@pytest.mark.parametrize(
+    ("body", "path"),
+    [
+        ({"format": "picture"}, "format"),
+        ({"house": {}}, "format"),
+        (changed(grid_json(), data=[0, 0, 101]), ...),
+        (changed(grid_json(), data="0"), "data"),
+        (changed(grid_json(), info={**grid_json()["info"], "width": 5000}), "info.width"),
+        (changed(grid_json(), info={**grid_json()["info"], "resolution": 0}), "info.resolution"),
+        ({"format": "procthor", "house": {}, "asset_sizes": {}}, ...),
+    ],
+)
+def test_maps_as_json(client, unchanged, body, path):
+    response = client.post("/v1/maps", json=body)
+    answer = problem(response, 422, response.json()["type"], path)
+    assert answer["type"] in ("invalid-map", "invalid-input")
+
+
+HOUSE = {
+    "rooms": [
+        {
+            "id": "room|1",
+            "roomType": "Bedroom",
+            "floorPolygon": [{"x": x, "y": 0, "z": z} for x, z in ((0, 0), (0, 3), (3, 3), (3, 0))],
+            "children": [],
+        }
+    ],
+    "walls": [],
+    "doors": [],
+    "windows": [],
+    "objects": [
+        {
+            "id": "Sofa|1",
+            "assetId": "Sofa_1",
+            "position": {"x": 1, "y": 0.4, "z": 1},
+            "rotation": {"x": 0, "y": 0, "z": 0},
+            "kinematic": True,
+        }
+    ],
+    "proceduralParameters": {},
+    "metadata": {},
+}
+
+
+def test_a_house_with_an_unknown_asset(client, unchanged):
+    body = {"format": "procthor", "house": HOUSE, "asset_sizes": {}}
+    assert "Sofa_1" in json.dumps(problem(client.post("/v1/maps", json=body), 422, "invalid-map"))
+
+
+def test_maps_and_policies_that_are_not_there(client, unchanged):
+    for path in ("/v1/maps/none", "/v1/maps/none/image.png", "/v1/policies/none", "/v1/sessions/none", "/v2"):
+        problem(client.get(path), 404, "not-found")
+    problem(client.get("/v1/maps/..%2f..%2fetc%2fpasswd"), 404, "not-found")
+    problem(client.get("/v1/maps/" + "a" * 65), 422, "invalid-input", "map_id")
+    problem(client.get("/v1/maps", params={"limit": 0}), 422, "invalid-input", "limit")
+    problem(client.put("/v1/maps"), 405, "method-not-allowed")
+    problem(client.post("/v1/specs/validate", json={"formula": "x > 1", "map_id": "none"}), 404, "not-found")
+
+
+def ask(**fields):
+    return {"map_id": "case1", "spec": {"formula": "F[0,9] Office"}, **fields}
+
+
+@pytest.mark.parametrize(
+    ("body", "type", "path"),
+    [
+        (ask(map_id="none"), "not-found", "map_id"),
+        (ask(robot="spot"), "invalid-robot", "robot"),
+        (ask(robot={**ROBOT, "actions": []}), "invalid-robot", "robot.actions"),
+        (ask(robot={**ROBOT, "footprint": {"radius": -1}}), "invalid-robot", "robot.footprint.radius"),
+        (
+            ask(robot={**ROBOT, "actions": [{"name": "a"}, {"name": "a"}]}),
+            "invalid-robot",
+            "robot.actions[1].name",
+        ),
+        (ask(spec={"formula": "F[0,9] Sofa"}), "invalid-formula", "spec.formula"),
+        (ask(spec={"formula": "F[0,1001] Office"}), "horizon-too-long", "spec.formula"),
+        (ask(spec={"formula": "(F[0,9] Office) or (F[0,9] Hall)"}), "outside-fragment", ...),
+        (ask(method="ppo"), "invalid-input", "method"),
+        (ask(method="reachability"), "unsupported", "method"),
+        (ask(options={"units": 1024}), "invalid-policy", "options.units"),
+        (ask(options={"depth": 3}), "invalid-policy", "options.depth"),
+        (ask(seed=-1), "invalid-input", "seed"),
+        (ask(), "training-unavailable", ...),
+    ],
+)
+def test_policies_that_are_asked_for(client, unchanged, body, type, path):
+    status = {"not-found": 404, "training-unavailable": 503}.get(type, 422)
+    problem(client.post("/v1/policies", json=body), status, type, path)
+
+
+def sent(weights=None, **card):
+    files = policy_files(seed=99)
+    files["card"] = json.dumps({**json.loads(files["card"]), **card}).encode()
+    return {"weights": ("w", files["weights"] if weights is None else weights), "card": ("c", files["card"])}
+
+
+@pytest.mark.parametrize(
+    ("files", "path"),
+    [
+        (sent(task_hash="0" * 64), "card.task_hash"),
+        (sent(map_id="0" * 64), ...),
+        (sent(spec={**SPEC, "formula": "F[0,7] Goal"}), "card.task_hash"),
+        (sent(seed="zero"), "card.seed"),
+        (sent(robot="spot"), "card.robot"),
+        (sent(weights=b"\x80\x04\x95pickle"), "weights"),
+        (sent(weights=policy_files()["weights"][:-8]), "weights"),
+        (sent(weights=b"\xff" * 8 + b"{}"), "weights"),
+    ],
+)
+def test_policies_trained_elsewhere(client, unchanged, files, path):
+    response = client.post("/v1/policies", files=files)
+    answer = problem(response, 422, response.json()["type"], path)
+    assert answer["type"].startswith("invalid-")
+
+
+@pytest.mark.parametrize(
+    ("fields", "type", "path"),
+    [
+        ({"initial_pose": [40.0, 1.5, 0.0]}, "invalid-pose", "initial_pose"),
+        ({"initial_pose": [0.05, 1.5, 0.0]}, "invalid-pose", "initial_pose"),
+        ({"initial_pose": [1.0, 1.5]}, "invalid-pose", "initial_pose"),
+        ({"initial_pose": [1.0, "1.5", 0.0]}, "invalid-pose", "initial_pose[1]"),
+        ({"initial_pose": [3.5, 0.5, 0.0]}, "infeasible-start", "initial_pose"),
+        ({"policy_id": None}, "invalid-input", ...),
+        ({"policy_ids": ["case1"]}, "invalid-input", ...),
+        ({"threshold": 0.0}, "invalid-input", "threshold"),
+        ({"threshold": 1.5}, "invalid-input", "threshold"),
+        ({"margin": -1.0}, "invalid-input", "margin"),
+        ({"evaluation": "guess"}, "invalid-input", "evaluation"),
+        ({"shaping": "lookahead"}, "unsupported", "shaping"),
+        ({"max_steps": 10**9}, "invalid-input", "max_steps"),
+        ({"id": "../x"}, "invalid-input", "id"),
+        ({"id": "{x}"}, "invalid-input", "id"),
+        ({"seed": 1.5}, "invalid-input", "seed"),
+    ],
+)
+def test_sessions(client, policy, unchanged, fields, type, path):
+    body = {"policy_id": policy["id"], "initial_pose": START, **fields}
+    problem(client.post("/v1/sessions", json=body), 422, type, path)
+
+
+def test_policies_for_different_tasks_do_not_share_a_session(client, policy, unchanged):
+    body = {"policy_ids": [policy["id"], "case1"], "initial_pose": START}
+    problem(client.post("/v1/sessions", json=body), 422, "invalid-policy", "policy_ids[1]")
+    body = {"policy_id": "none", "initial_pose": START}
+    problem(client.post("/v1/sessions", json=body), 404, "not-found", "policy_id")
+
+
+def test_an_infeasible_start_can_be_insisted_on(begin):
+    session = begin(initial_pose=[3.5, 0.5, 0.0], allow_infeasible=True)
+    assert not session["feasible"]
+
+
+RAW = {
+    "NaN": b'{"t": 0, "poses": [[1, 1.5, 0]], "logits": [NaN, 0, 0, 0, 0]}',
+    "Infinity": b'{"t": 0, "poses": [[1, 1.5, 0]], "logits": [Infinity, 0, 0, 0, 0]}',
+    "1e999": b'{"t": 0, "poses": [[1, 1.5, 0]], "logits": [1e999, 0, 0, 0, 0]}',
+}
+
+
+@pytest.mark.parametrize("content", RAW.values(), ids=RAW)
+def test_numbers_that_are_none(client, begin, content):
+    path = f"/v1/sessions/{begin()['id']}/steps"
+    response = client.post(path, content=content, headers={"Content-Type": "application/json"})
+    problem(response, 422, "invalid-logits", "logits[0]")
+
+
+@pytest.mark.parametrize(
+    ("fields", "type", "path"),
+    [
+        ({"logits": [0.0] * 4}, "invalid-logits", "logits"),
+        ({"logits": [0.0] * 300}, "invalid-logits", "logits"),
+        ({"logits": [None] * 5}, "invalid-logits", "logits"),
+        ({"logits": None}, "invalid-logits", "logits"),
+        ({"logits": [0.0, True, 0.0, 0.0, 0.0]}, "invalid-logits", "logits[1]"),
+        ({"t": -1}, "invalid-input", "t"),
+        ({"t": 0.5}, "invalid-input", "t"),
+        ({"poses": []}, "invalid-pose", "poses"),
+        ({"poses": [[1.0, 1.5, math.pi, 0.0]]}, "invalid-pose", "poses[0]"),
+        ({"poses": ahead(1)}, "invalid-pose", "poses"),
+        ({"signals": {"fuel": 1.0}}, "invalid-samples", "signals.fuel"),
+        ({"main_task_done": 1}, "invalid-input", "main_task_done"),
+        ({"speed": 1}, "invalid-input", "speed"),
+    ],
+)
+def test_steps(client, begin, step, fields, type, path):
+    session = begin()
+    problem(step(session, **{"t": 0, "poses": [START], "logits": LOGITS, **fields}), 422, type, path)
+    assert client.get(f"/v1/sessions/{session['id']}").json() == session
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_bodies_over_the_limit(client, unchanged, chunked):
+    size = 2 << 20
+    content = (b" " * 65536 for _ in range(size // 65536)) if chunked else b" " * size
+    try:
+        response = client.post(
+            "/v1/specs/validate", content=content, headers={"Content-Type": "application/json"}
+        )
+    except httpx.WriteError:
+        pytest.fail("the server hung up before it said why")
+    assert problem(response, 413, "body-too-large")["limit"] == 1 << 20
+
+
+def test_a_map_of_the_largest_size_is_taken(client):
+    size = 4000
+    image = b"P5\n%d %d\n255\n" % (size, size) + np.full(size * size, 254, np.uint8).tobytes()
+    files = {"metadata": ("map.yaml", YAML), "image": ("map.pgm", image)}
+    response = client.post("/v1/maps", files=files)
+    assert response.status_code == 201, response.text
+    assert (response.json()["width"], response.json()["height"]) == (size, size)
