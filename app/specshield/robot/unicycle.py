@@ -93,6 +93,13 @@ def _is_occupied(body: Body, row: int, col: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _cell(body: Body, u: float, v: float) -> tuple[int, int]:
+    """Row and column of a point (grid metres), held to the ring: one far off fits no integer."""
+    h, (height, width) = body.resolution, body.occupied.shape
+    return math.floor(min(max(v / h, -1.0), height)), math.floor(min(max(u / h, -1.0), width))
+
+
+@njit(cache=True, nogil=True)
 def _rows(body: Body, low: float, high: float) -> tuple[int, int]:
     """The range of rows between two heights (grid metres), with the ring that stands for the outside."""
     h = body.resolution
@@ -119,7 +126,7 @@ def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
 def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     """Exact distance [m] from a point (grid metres) to the nearest occupied square, at most `limit`."""
     h = body.resolution
-    col, row = math.floor(u / h), math.floor(v / h)
+    row, col = _cell(body, u, v)
     if _is_occupied(body, row, col):
         return 0.0
     if _is_clear(body, u, v, limit):
@@ -142,7 +149,7 @@ def _depth(body: Body, u: float, v: float) -> float:
     """How far inside occupied space a point lies [m]: to the nearest free square, DEEP cells at most."""
     h = body.resolution
     height, width = body.occupied.shape
-    row, col = math.floor(v / h), math.floor(u / h)
+    row, col = _cell(body, u, v)
     half = 4
     while True:  # a window that grows until nothing outside it can be nearer
         best = half * h
