@@ -1,4 +1,4 @@
-"""Everything a caller can get wrong: a problem document that names field, value and what is valid, and no change."""
+"""What a caller can get wrong: a problem that names field, value and what is valid, and no change."""
 
 import io
 import json
@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from tests.service.world import LOGITS, ROBOT, SPEC, START, ahead, grid_json, policy_files
 
-YAML = b"image: x.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
+YAML = b"resolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
 PGM = b"P5\n4 3\n255\n" + bytes([254] * 12)
 
 

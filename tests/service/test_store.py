@@ -1,0 +1,192 @@
+"""The embedded store: durable, shared, never left behind; a store that is away; one of the operator's own."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+import redis
+from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
+from tests.serving import serving, wait_for
+
+from specshield.errors import StoreError
+from specshield.service.embedded import EmbeddedStore
+
+
+def begin(client, **options):
+    client.post("/v1/maps", json=grid_json())
+    body = {"policy_id": send_policy(client)["id"], "initial_pose": START, **options}
+    response = client.post("/v1/sessions", json=body)
+    assert response.status_code == 201, response.text
+    return response.json()
+
+
+def step(client, session, t, **fields):
+    body = {"t": t, "poses": ahead(t)[-1:], "logits": LOGITS, **fields}
+    return client.post(f"/v1/sessions/{session['id']}/steps", json=body)
+
+
+def store_pid(data_dir):
+    with redis.Redis(unix_socket_path=str(data_dir / "store" / "socket")) as connection:
+        return connection.info("server")["process_id"]
+
+
+def keeper_pid(data_dir):
+    return int(Path(f"/proc/{store_pid(data_dir)}/stat").read_text().split()[3])
+
+
+def runs(pid):
+    """Whether a process is there, and is no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_what_was_acknowledged_survives_the_kill_of_store_and_server(tmp_path):
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=10.0) as client:
+        session = begin(client)
+        answers = [step(client, session, t).content for t in range(3)]
+        os.kill(store_pid(tmp_path), signal.SIGKILL)
+        wait_for(lambda: step(client, session, 3).status_code == 200, 10.0)  # started again by the server
+        answers.append(step(client, session, 3).content)
+        pids = store_pid(tmp_path), keeper_pid(tmp_path)
+        server.kill()
+        wait_for(lambda: not any(map(runs, pids)), 5.0)  # nothing is left behind
+
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=10.0) as client:
+        assert [step(client, session, t).content for t in range(4)] == answers
+        assert client.get(f"/v1/sessions/{session['id']}").json()["next_t"] == 4
+        assert step(client, session, 4).status_code == 200
+
+
+def test_the_store_ends_with_its_keeper(tmp_path):
+    embedded = EmbeddedStore(tmp_path)
+    embedded.join()
+    pid = store_pid(tmp_path)
+    os.kill(keeper_pid(tmp_path), signal.SIGKILL)
+    wait_for(lambda: not runs(pid), 5.0)
+    assert not embedded.joined()
+    embedded.join()
+    assert store_pid(tmp_path) != pid
+    embedded.leave()
+
+
+def test_a_store_stays_until_its_last_user_is_gone(tmp_path):
+    first, second = EmbeddedStore(tmp_path), EmbeddedStore(tmp_path)
+    first.join()
+    second.join()
+    pid = store_pid(tmp_path)
+    first.leave()
+    time.sleep(0.3)
+    assert runs(pid)
+    assert second.joined()
+    second.leave()
+    wait_for(lambda: not runs(pid), 5.0)
+
+
+def test_a_path_too_long_for_a_socket_is_said_to_be(tmp_path):
+    with pytest.raises(StoreError, match="too long"):
+        EmbeddedStore(tmp_path / ("x" * 100))
+
+
+def test_two_servers_share_one_store_and_one_step_has_one_answer(tmp_path):
+    with (
+        serving(tmp_path) as one,
+        serving(tmp_path) as other,
+        httpx.Client(base_url=one.url, timeout=10.0) as a,
+        httpx.Client(base_url=other.url, timeout=10.0) as b,
+    ):
+        session = begin(a)
+        assert step(b, session, 0).content == step(a, session, 0).content
+        assert b.get("/v1/sessions").json() == a.get("/v1/sessions").json()
+        one.kill()  # it started the store; the other still uses it
+        assert step(b, session, 1).status_code == 200
+
+
+def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_supervisor(tmp_path):
+    with serving(tmp_path, "--workers", "2") as server:
+        with httpx.Client(base_url=server.url, timeout=10.0) as client:
+            session = begin(client)
+        answers = [
+            httpx.post(f"{server.url}/v1/sessions/{session['id']}/steps", json=body).content
+            for body in [STEP] * 8
+        ]
+        assert len(set(answers)) == 1
+        assert 'specshield_decisions_total{mode="shaped"} 1.0' in httpx.get(f"{server.url}/metrics").text
+        pids = [store_pid(tmp_path), *children(server.process.pid)]
+        assert len(pids) >= 3
+        server.kill()
+        wait_for(lambda: not any(map(runs, pids)), 10.0)
+
+
+STEP = {"t": 0, "poses": [START], "logits": LOGITS}
+
+
+def children(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def test_a_store_that_is_away_is_said_to_be_and_nothing_hangs(tmp_path):
+    dead = f"unix://{tmp_path / 'nothing'}"
+    with (
+        serving(tmp_path, ready=False, REDIS_URL=dead) as server,
+        httpx.Client(base_url=server.url) as client,
+    ):
+        wait_for(lambda: alive(client), 20.0)
+        start = time.monotonic()
+        for response in (client.get("/readyz"), client.get("/v1/sessions"), client.get("/v1/sessions/x")):
+            assert (response.status_code, response.json()["type"]) == (503, "store-unavailable")
+            assert response.headers["retry-after"] == "1"
+        assert time.monotonic() - start < 5.0
+        assert client.get("/livez").status_code == 200
+
+
+def alive(client):
+    try:
+        return client.get("/livez").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def test_a_store_of_ones_own_and_sessions_that_expire(tmp_path):
+    own = EmbeddedStore(tmp_path / "own")
+    own.join()
+    try:
+        with serving(
+            tmp_path / "data", REDIS_URL=own.url, SPECSHIELD_SESSION_TTL="2", SPECSHIELD_MAX_SESSIONS="1"
+        ) as server:
+            assert not (tmp_path / "data" / "store").exists()
+            with httpx.Client(base_url=server.url, timeout=10.0) as client:
+                session = begin(client)
+                full = client.post("/v1/sessions", json={"policy_id": "case1", "initial_pose": START})
+                assert (full.status_code, full.json()["type"]) == (429, "limit-reached")
+                time.sleep(1.2)
+                assert step(client, session, 0).status_code == 200  # moves the end on
+                time.sleep(1.2)
+                assert client.get(f"/v1/sessions/{session['id']}").status_code == 200
+                path = f"/v1/sessions/{session['id']}"
+                wait_for(lambda: client.get(path).status_code == 404, 5.0)
+                assert client.get("/v1/sessions").json() == {"items": [], "next": None}
+                with redis.Redis(unix_socket_path=str(own.socket)) as connection:
+                    assert connection.keys("specshield:*") == []
+                assert begin(client)["next_t"] == 0  # there is room again
+    finally:
+        own.leave()
+
+
+def test_the_key_opens_what_it_should(tmp_path):
+    with (
+        serving(tmp_path, SPECSHIELD_API_KEY="s3cret") as server,
+        httpx.Client(base_url=server.url) as client,
+    ):
+        for path in ("/livez", "/readyz", "/docs", "/openapi.json"):
+            assert client.get(path).status_code == 200
+        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "s3cret"}):
+            for path in ("/v1/sessions", "/metrics", "/v1/nothing"):
+                response = client.get(path, headers=headers)
+                assert (response.status_code, response.json()["type"]) == (401, "unauthorized")
+                assert response.headers["www-authenticate"] == "Bearer"
+        assert client.get("/v1/sessions", headers={"Authorization": "Bearer s3cret"}).status_code == 200
