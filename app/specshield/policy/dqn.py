@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,59 +23,12 @@ from safetensors.numpy import load_file, save_file
 from scipy.stats import beta
 from torch import nn
 
-from specshield.errors import PolicyError
 from specshield.policy.environment import Environment, free_poses
 from specshield.policy.network import NAMES, Network, make_network
 from specshield.policy.policy import Policy, make_card, wait_motion
 from specshield.policy.rollout import satisfies
+from specshield.policy.settings import Settings, options_of
 from specshield.task import Task
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a training run may be told. `reward` is `progress` or `paper` (policy/funnel.py)."""
-
-    reward: str = "progress"
-    units: int = 64
-    updates: int = 12_000
-    robots: int = 512
-    batch: int = 1024
-    learning_rate: float = 1e-3
-    discount: float = 0.985
-    returns: int = 5  # steps of an n-step return
-    polyak: float = 0.005
-    replay: int = 1_000_000  # transitions
-    exploration: tuple[float, float] = (0.5, 0.008)  # each robot's own constant chance of a random motion
-    evaluate_every: int = 1000  # updates
-    evaluation_starts: int = 1000
-
-
-LIMITS: dict[str, tuple[float, float]] = {
-    "units": (4, 128), "updates": (1, 1_000_000), "robots": (1, 4096), "batch": (1, 65536),
-    "learning_rate": (1e-7, 1.0), "discount": (0.0, 1.0), "returns": (1, 64), "polyak": (1e-6, 1.0),
-    "replay": (1000, 4_000_000), "evaluate_every": (1, 1_000_000), "evaluation_starts": (1, 100_000),
-}  # fmt: skip
-
-
-def read_settings(options: dict[str, Any]) -> Settings:
-    """Settings from JSON. Raises PolicyError with the path of the option at fault."""
-    known = {f.name: f.default for f in fields(Settings)}
-    for name, value in options.items():
-        if name not in known or name == "exploration":
-            valid = sorted(known.keys() - {"exploration"})
-            raise PolicyError(f"unknown option {name!r}", path=f"options.{name}", got=name, expected=f"one of {valid}")
-        if name == "reward":
-            if value not in ("progress", "paper"):
-                raise PolicyError("unknown reward", path="options.reward", got=value, expected="'progress' or 'paper'")
-            continue
-        low, high = LIMITS[name]
-        whole = isinstance(known[name], int)
-        if isinstance(value, bool) or not isinstance(value, (int,) if whole else (int, float)) or not low <= value <= high:
-            raise PolicyError(
-                "not in range", path=f"options.{name}", got=value,
-                expected=f"{'a whole number' if whole else 'a number'} from {low:g} to {high:g}",
-            )  # fmt: skip
-    return Settings(**options)
 
 
 @dataclass(frozen=True)
@@ -126,7 +79,7 @@ def train(
                 on_progress(Progress(run.update, settings.updates, run.latest, left))
     metrics = measure(task, run.best, settings.evaluation_starts, seed)
     metrics["wall_time_s"] = round(run.elapsed + time.monotonic() - began, 1)
-    card = make_card(task, "dqn", asdict(settings) | {"exploration": list(settings.exploration)}, seed, metrics, spec)
+    card = make_card(task, "dqn", options_of(settings), seed, metrics, spec)
     return Policy(task, card, make_network(run.best, run.inputs, run.outputs))
 
 
@@ -253,6 +206,10 @@ class _Run:
         with torch.no_grad():
             choice = self.q_network(then).argmax(1, keepdim=True)
             goal = returns + factor * self.target_network(then).gather(1, choice).squeeze(1)
+            # One step's delay is worth little beside a whole episode, less than the network's error: without a wider
+            # gap between actions (Bellemare et al., 2016) the greedy policy dithers.
+            now = self.target_network(observation)
+            goal -= s.gap * (now.max(1).values - now.gather(1, motion.unsqueeze(1)).squeeze(1))
         value = self.q_network(observation).gather(1, motion.unsqueeze(1)).squeeze(1)
         loss = nn.functional.smooth_l1_loss(value, goal)
         self.optimizer.zero_grad(set_to_none=True)

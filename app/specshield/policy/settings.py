@@ -15,16 +15,16 @@ class Settings:
 
     reward: str = "progress"
     units: int = 64
-    updates: int = 12_000
+    updates: int = 16_000
     robots: int = 512
     batch: int = 1024
     learning_rate: float = 1e-3
-    discount: float = 0.985
+    discount: float = 0.98
     returns: int = 5  # steps of an n-step return
-    polyak: float = 0.005
+    polyak: float = 0.02
     replay: int = 1_000_000  # transitions
     exploration: tuple[float, float] = (0.5, 0.008)  # each robot's own constant chance of a random motion
-    gap: float = 0.5  # widens the gap between actions (Bellemare et al., 2016)
+    gap: float = 0.6  # share of an action's loss against the best added to its target (Bellemare et al., 2016)
     evaluate_every: int = 1000  # updates
     evaluation_starts: int = 1000
 

@@ -116,10 +116,11 @@ def _columns(body: Body, low: float, high: float) -> tuple[int, int]:
 def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
     """Whether the clearance field alone shows no obstacle within `distance` [m] of a point (grid metres)."""
     h = body.resolution
-    col, row = int(math.floor(u / h)), int(math.floor(v / h))
-    if row < 0 or col < 0 or row >= body.occupied.shape[0] or col >= body.occupied.shape[1]:
+    row, col = _cell(body, u, v)
+    if _is_occupied(body, row, col):
         return False
-    return body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h) >= distance
+    off_centre = math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h)
+    return bool(body.clearance[row, col] - off_centre >= distance)
 
 
 @njit(cache=True, nogil=True)

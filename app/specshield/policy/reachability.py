@@ -1,0 +1,221 @@
+"""pi_phi by backward dynamic programming over pose and progress: made in a second, without learning."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from specshield.errors import FragmentError, PolicyError
+from specshield.policy.lattice import MAX_POSES, heading_count, holds_at, make_lattice
+from specshield.policy.latest import latest_times, masks_of
+from specshield.policy.policy import Card, Proposal, make_card, wait_motion
+from specshield.policy.progress import (
+    ALWAYS,
+    MAX_OBLIGATIONS,
+    Rules,
+    forgive,
+    make_rules,
+    replay,
+    signal_rows,
+)
+from specshield.policy.search import INVALID, SCALE, Tables, propose_all
+from specshield.robot.unicycle import Body, make_body
+from specshield.task import Task
+
+BAND = -4.0  # [steps] of slack: how far the tables are trusted not to err
+
+
+@dataclass(frozen=True)
+class Settings:
+    """pitch: of the lattice [m]. beam: how many poses the search near a deadline keeps."""
+
+    pitch: float = 0.1
+    beam: int = 12
+
+
+def read_settings(options: Mapping[str, Any]) -> Settings:
+    """Settings from JSON. Raises PolicyError with the path of the option at fault."""
+    limits = {"pitch": (0.02, 1.0), "beam": (1, 256)}
+    for name, value in options.items():
+        if name not in limits:
+            raise PolicyError(
+                f"unknown option {name!r}", path=f"options.{name}", got=name, expected=f"one of {sorted(limits)}"
+            )
+        low, high = limits[name]
+        whole = name == "beam"
+        if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not low <= value <= high:
+            raise PolicyError("not in range", path=f"options.{name}", got=value, expected=f"from {low:g} to {high:g}")
+    return Settings(**options)
+
+
+@dataclass(frozen=True, eq=False)
+class ReachabilityPolicy:
+    """Follows the tables of latest feasible times (policy/latest.py, policy/search.py)."""
+
+    task: Task
+    card: Card
+    settings: Settings
+    tables: Tables
+
+    @property
+    def id(self) -> str:
+        return str(self.card["id"])
+
+    @cached_property
+    def _prepared(self) -> tuple[Body, Rules]:
+        return make_body(self.task.robot, self.task.grid), make_rules(self.task)
+
+    def propose(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> Proposal:
+        """A continuation after each first motion: greedy, or by a beam near a deadline."""
+        body, rules = self._prepared
+        rules = rules._replace(signals=rules.signals.copy(), margin=margin)
+        t = len(history) - 1
+        status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
+        replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
+        forgive(rules, t, status)
+        motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
+        poses = np.empty((*motions.shape, 3))
+        wait = wait_motion(self.task.robot)
+        preferred = propose_all(
+            body, rules, self.tables, history[-1], t, status, run, wait, self.settings.beam, BAND, motions, poses
+        )
+        return Proposal(motions, poses, int(preferred))
+
+    def weights(self) -> bytes:
+        """The safetensors file."""
+        return save_tensors({"cell": self.tables.cell, "code": self.tables.code, "index": self.tables.index})
+
+
+def synthesise(task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None) -> ReachabilityPolicy:
+    """Makes the tables. Raises FragmentError for a formula or robot they do not cover, PolicyError for a map too large."""
+    began = time.perf_counter()
+    settings = settings or Settings()
+    body, rules = make_body(task.robot, task.grid), make_rules(task)
+    goals = _check(task, rules)
+    _check_size(task, settings)
+    lattice = make_lattice(body, rules, settings.pitch, task.horizon)
+    masks = masks_of(rules, goals)
+    latest = latest_times(lattice, rules, holds_at(body, rules, lattice), goals, masks, task.horizon)
+    tables = _pack(lattice.valid, latest, masks, goals, len(rules.kind), settings.pitch)
+    start = latest[masks.index(0)][lattice.valid == 1]
+    metrics = {
+        "feasible_start": round(float((start >= 0.0).mean()), 4) if len(start) else 0.0,
+        "size_bytes": int(tables.code.nbytes + tables.cell.nbytes),
+        "wall_time_s": round(time.perf_counter() - began, 3),
+    }
+    card = make_card(task, "reachability", asdict(settings), 0, metrics, spec)
+    return ReachabilityPolicy(task, card, settings, tables)
+
+
+def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPolicy:
+    """A policy from its two files. Raises PolicyError where they do not fit the task."""
+    settings = read_settings(card.get("options", {}))
+    rules = make_rules(task)
+    goals = _check(task, rules)
+    _check_size(task, settings)
+    try:
+        tensors = load_tensors(weights)
+    except Exception as error:  # the parser raises its own types for hostile bytes
+        raise PolicyError(f"not a safetensors file: {error}", path="weights", expected="safetensors") from error
+    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "index": (np.int32, 1)}
+    for name, (dtype, rank) in wanted.items():
+        array = tensors.get(name)
+        if array is None or array.dtype != dtype or array.ndim != rank:
+            raise PolicyError(
+                f"the table {name!r} is missing or of another kind", path=f"weights.{name}",
+                got=None if array is None else f"{array.dtype} {list(array.shape)}", expected=f"{dtype.__name__}, rank {rank}",
+            )  # fmt: skip
+    cell, code, index = tensors["cell"], tensors["code"], tensors["index"]
+    shape, headings = _shape(task, settings)
+    fits = (
+        cell.shape == shape and code.shape[2] == headings and index.shape == (1 << len(goals),)
+        and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
+        and index.min() >= -1 and index.max() < code.shape[0]
+    )  # fmt: skip
+    if not fits:
+        raise PolicyError(
+            "the tables do not fit the task", path="weights", got=[list(cell.shape), list(code.shape), list(index.shape)],
+            expected=f"cell {list(shape)}, code [tables, cells, {headings}], index [{1 << len(goals)}]",
+        )  # fmt: skip
+    tables = Tables(
+        np.ascontiguousarray(cell), np.ascontiguousarray(code), np.ascontiguousarray(index),
+        _bits(goals, len(rules.kind)), settings.pitch,
+    )  # fmt: skip
+    return ReachabilityPolicy(task, card, settings, tables)
+
+
+def _check(task: Task, rules: Rules) -> NDArray[np.int64]:
+    """The goals (obligations that are not `always`), where the tables cover the formula."""
+    if len(rules.kind) > MAX_OBLIGATIONS:
+        raise FragmentError(
+            "too many obligations", path="formula", got=len(rules.kind), expected=f"at most {MAX_OBLIGATIONS}"
+        )
+    if wait_motion(task.robot) < 0:
+        raise FragmentError(
+            "reachability needs a robot that can wait", path="robot", got=list(task.robot.action_names),
+            expected="an action with translate 0 and rotate 0; or method 'dqn'",
+        )  # fmt: skip
+    goals = np.flatnonzero(rules.kind != ALWAYS)
+    end = int(rules.last[goals].max()) if len(goals) else 0
+    for k in np.flatnonzero(rules.kind == ALWAYS):
+        if rules.a[k] > 0 or rules.b[k] < end:
+            raise FragmentError(
+                "reachability does not cover a G that begins late or ends before another window", path="formula",
+                got=f"G[{rules.a[k]},{rules.b[k]}]", expected=f"G[0,b] with b >= {end}; or method 'dqn'",
+            )  # fmt: skip
+    return goals
+
+
+def _shape(task: Task, settings: Settings) -> tuple[tuple[int, int], int]:
+    ny, nx = (
+        max(int(np.ceil(n * task.grid.resolution / settings.pitch - 1e-9)), 1)
+        for n in (task.grid.height, task.grid.width)
+    )
+    return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
+
+
+def _check_size(task: Task, settings: Settings) -> None:
+    (ny, nx), headings = _shape(task, settings)
+    if ny * nx * headings > MAX_POSES:
+        raise PolicyError(
+            "the lattice is too large", path="options.pitch", got=f"{ny} x {nx} x {headings} poses",
+            expected=f"at most {MAX_POSES}: a larger pitch",
+        )  # fmt: skip
+
+
+def _bits(goals: NDArray[np.int64], obligations: int) -> NDArray[np.int64]:
+    bit = np.zeros(obligations, np.int64)
+    bit[goals] = 1 << np.arange(len(goals))
+    return bit
+
+
+def _pack(
+    valid: NDArray[np.uint8],
+    latest: NDArray[np.float32],
+    masks: list[int],
+    goals: NDArray[np.int64],
+    obligations: int,
+    pitch: float,
+) -> Tables:
+    used = valid.any(axis=2)
+    cell = np.full(used.shape, -1, np.int32)
+    cell[used] = np.arange(int(used.sum()))
+    kept = [n for n, mask in enumerate(masks) if mask != (1 << len(goals)) - 1]  # with every goal settled: no table
+    code = np.zeros((len(kept), int(used.sum()), valid.shape[2]), np.uint16)
+    index = np.full(1 << len(goals), -1, np.int32)
+    for row, n in enumerate(kept):
+        values = latest[n][used]
+        code[row] = np.where(values >= 0.0, 1.0 + np.floor(SCALE * values), 0.0).astype(np.uint16)
+        code[row][valid[used] == 0] = INVALID
+        index[masks[n]] = row
+    return Tables(cell, code, index, _bits(goals, obligations), pitch)
