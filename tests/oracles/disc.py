@@ -1,4 +1,4 @@
-"""A disc on a grid by brute force: every occupied square, every millimetre. Shares no code with the package."""
+"""A disc on a grid by brute force: every occupied square, every millimetre."""
 
 from __future__ import annotations
 

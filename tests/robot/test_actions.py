@@ -37,28 +37,7 @@ def changed(path, value):
 
 
 def test_the_stretch_tokens():
-    names = [
-        "m",
-        "r",
-        "l",
-        "b",
-        "end",
-        "sub_done",
-        "ls",
-        "rs",
-        "p",
-        "zm",
-        "zp",
-        "yp",
-        "ym",
-        "wp",
-        "wm",
-        "yms",
-        "zms",
-        "zps",
-        "yps",
-        "d",
-    ]
+    names = "m r l b end sub_done ls rs p zm zp yp ym wp wm yms zms zps yps d".split()  # noqa: SIM905
     assert list(STRETCH.action_names) == names
     assert [a.name for a in STRETCH.actions if a.terminal] == ["end"]
     assert (STRETCH.radius, STRETCH.offset, STRETCH.on_contact) == (0.1855, (-0.109, 0.0), "stop")

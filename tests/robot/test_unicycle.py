@@ -75,7 +75,7 @@ def test_stretch_stops_at_the_wall_its_off_centre_disc_touches():
 
 
 def test_the_corner_of_a_square():
-    # The corner (1, 1) is 0.24 m beside the way: a disc of 0.3 m touches it sqrt(0.09 - 0.0576) = 0.18 m before.
+    # The corner (1, 1) is 0.24 m beside the way: a disc of 0.3 m touches sqrt(0.09 - 0.0576) = 0.18 m before.
     grid = grid_of(40, 40, taken=[(20, 20)])
     for on_contact, x in (("stop", 1 - 0.18), ("stay", 0.4)):
         robot = robot_of((1.0, 0.0), on_contact=on_contact)
@@ -110,13 +110,9 @@ def test_turning_sweeps_an_off_centre_footprint():
         (0.0, math.pi / 2), (0.0, math.pi / 6), radius=0.2, offset=(-0.3, 0.0), on_contact="stay"
     )
     grid = grid_of(40, 40)  # 2 x 2 m, walls all round
-    near_the_top = (
-        1.0,
-        1.7,
-        math.pi / 2,
-    )  # the disc trails below; turning by 90 degrees brings it to the right
+    near_the_top = (1.0, 1.7, math.pi / 2)  # the disc trails below; a quarter turn brings it to the right
     assert follow(robot, grid, near_the_top, "a0") == pytest.approx((1.0, 1.7, math.pi))
-    # From heading pi the disc is at (1.3, 1.7); the next turn swings it up to (1.3 - .., 1.7 + 0.15 ..) > 1.8.
+    # Heading pi the disc is at (1.3, 1.7); a turn further would put it 0.15 m higher, past 2 - 0.2.
     assert follow(robot, grid, near_the_top, "a0", "a1") == pytest.approx((1.0, 1.7, math.pi))
     assert (
         follow(robot_of((0.0, 1.0), radius=0.29), grid, (1.0, 1.7, 0.0), "a0")[2] == 1.0
