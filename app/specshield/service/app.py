@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import logging
 import multiprocessing
-import signal
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -22,6 +19,7 @@ from specshield.service import problems
 from specshield.service.children import TrainingWorker, tend, wants_worker
 from specshield.service.embedded import EmbeddedStore
 from specshield.service.jobs import Jobs
+from specshield.service.keeper import follow_parent
 from specshield.service.maps import Maps
 from specshield.service.middleware import Guard, Observe
 from specshield.service.policies import Policies
@@ -78,7 +76,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 @asynccontextmanager
 async def _life(app: FastAPI, settings: Settings) -> AsyncIterator[None]:
-    _follow_supervisor()
+    if multiprocessing.parent_process() is not None:  # one of uvicorn's workers
+        follow_parent()
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
     if embedded is not None:
         await asyncio.to_thread(embedded.join)
@@ -112,12 +111,6 @@ async def _warm(server: Server) -> None:
     except Exception as error:
         log.exception("warming up")
         server.failure = f"the kernels cannot be compiled: {type(error).__name__}"
-
-
-def _follow_supervisor() -> None:
-    """Linux: a worker process of uvicorn is told to stop when its supervisor was killed."""
-    if sys.platform == "linux" and multiprocessing.parent_process() is not None:
-        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:

@@ -90,7 +90,7 @@ class Jobs:
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 
     def cancel(self, id: str) -> None:
-        """The run, if it has begun, stops at its next report; if not, when its turn comes."""
+        """The run, if it has begun, stops within a second or so; if not, when its turn comes."""
         fields = {"attempt": "", "status": "failed", "error": "cancelled", "eta_s": ""}
         self._try(lambda: self.redis.hset(_key(id), mapping=fields))
 
@@ -100,13 +100,18 @@ class Jobs:
     # --- for the run itself
 
     def report(self, id: str, attempt: str, **fields: Any) -> bool:
-        """False where another attempt, or nobody, is to go on."""
+        """Of no effect, and False, where another attempt, or nobody, is to go on."""
         pairs = [part for pair in fields.items() for part in pair]
         return bool(self._try(lambda: self._write(keys=[_key(id)], args=[attempt, *pairs])))
 
-    def sign_of_life(self, id: str | None) -> None:
-        """Of a run, or of a worker (None)."""
-        self._try(lambda: self.redis.set(WORKER if id is None else _alive(id), 1, ex=SIGN_OF_LIFE))
+    def sign_of_life(self, id: str, attempt: str) -> bool:
+        """Of a run. False where another attempt, or nobody, is to go on."""
+        self._try(lambda: self.redis.set(_alive(id), 1, ex=SIGN_OF_LIFE))
+        return bool(self._try(lambda: self.redis.hget(_key(id), "attempt")) == attempt.encode())
+
+    def worker_lives(self) -> None:
+        """A worker's sign of life."""
+        self._try(lambda: self.redis.set(WORKER, 1, ex=SIGN_OF_LIFE))
 
     def _try(self, action: Any) -> Any:
         try:

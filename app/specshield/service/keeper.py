@@ -19,10 +19,9 @@ GRACE = 10.0  # seconds for the store to write its file out and leave
 
 
 def follow_parent() -> None:
-    """Linux: the store is told to stop if the keeper itself is killed."""
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "prctl"):
-        libc.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+    """Linux: this process is told to stop when the one that started it is gone, however it went."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def main(folder: Path, command: list[str]) -> int:

@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,6 +18,7 @@ from rq.serializers import JSONSerializer
 from specshield.errors import SpecshieldError, StoreError
 from specshield.service.embedded import EmbeddedStore
 from specshield.service.jobs import QUEUE, SIGN_OF_LIFE, Jobs
+from specshield.service.keeper import follow_parent
 from specshield.service.settings import Settings
 
 log = logging.getLogger("specshield")
@@ -32,7 +33,7 @@ def serve(settings: Settings, until_eof: bool) -> None:
     jobs = Jobs(os.environ.get("REDIS_URL") or str(settings.redis_url), settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
-    with _signs_of_life(jobs, None):
+    with _regularly(jobs.worker_lives):
         _Worker(jobs).work(logging_level="WARNING")
 
 
@@ -82,22 +83,31 @@ class _Worker(Worker):
 
 def train(id: str, attempt: str) -> None:
     """One run, in a process of its own. Whatever ends it is said in the policy's `error`."""
+    follow_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     settings = Settings()
     jobs = Jobs(str(settings.redis_url), settings)
+    cancelled = threading.Event()
+
+    def live() -> None:
+        if not jobs.sign_of_life(id, attempt):
+            cancelled.set()
+
     if not jobs.report(id, attempt, status="training"):
         return  # cancelled, or asked for again
-    with _signs_of_life(jobs, id):
+    with _regularly(live):
         try:
-            if _train(settings, jobs, id, attempt):
-                jobs.report(id, attempt, status="ready", progress=1, eta_s=0)
+            _train(settings, jobs, id, attempt, cancelled)
+            done: dict[str, Any] = {"status": "ready", "progress": 1, "eta_s": 0}
         except SpecshieldError as error:
-            jobs.report(id, attempt, status="failed", error=error.message, eta_s="")
+            done = {"status": "failed", "error": error.message, "eta_s": ""}
         except Exception as error:
             log.exception("training of %s", id)
-            jobs.report(id, attempt, status="failed", error=f"{type(error).__name__}: {error}", eta_s="")
+            done = {"status": "failed", "error": f"{type(error).__name__}: {error}", "eta_s": ""}
+        jobs.report(id, attempt, **done)  # of no effect once cancelled
 
 
-def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> bool:
+def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
     # torch, numba and the rest are for the process of the run alone: the worker stays small.
     from specshield.policy import dqn
     from specshield.policy.settings import read_settings
@@ -105,44 +115,38 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> bool:
     from specshield.service.policies import Policies
 
     policies = Policies(settings, Maps(settings))
-    record = policies.record(id)
-    about = record.about
-    wanted = True
+    about = policies.record(id).about
 
     def on_progress(progress: dqn.Progress) -> None:
-        nonlocal wanted
         done = progress.update / progress.updates
-        wanted = jobs.report(id, attempt, progress=round(done, 4), eta_s=round(progress.eta_s, 1))
+        jobs.report(id, attempt, progress=round(done, 4), eta_s=round(progress.eta_s, 1))
 
-    try:
-        policy = dqn.train(
-            policies.task(about),
-            read_settings(about.options),
-            about.seed,
-            on_progress,
-            policies.checkpoints(id),
-            lambda: not wanted,
-            about.spec,
-        )
-    except dqn.Stopped:
-        return False
+    policy = dqn.train(
+        policies.task(about),
+        read_settings(about.options),
+        about.seed,
+        on_progress,
+        policies.checkpoints(id),
+        cancelled.is_set,
+        about.spec,
+    )
     policies.finish(id, policy.weights(), {**policy.card, "map_id": about.map_id})
-    return True
 
 
 @contextmanager
-def _signs_of_life(jobs: Jobs, id: str | None) -> Iterator[None]:
+def _regularly(action: Callable[[], object]) -> Iterator[None]:
+    """Several times within SIGN_OF_LIFE, in a thread, as long as the block lasts."""
     over = threading.Event()
 
-    def beat() -> None:
+    def repeat() -> None:
         while not over.is_set():
             try:
-                jobs.sign_of_life(id)
+                action()
             except StoreError as error:
                 log.warning("%s", error)
-            over.wait(SIGN_OF_LIFE / 4)
+            over.wait(SIGN_OF_LIFE / 5)
 
-    thread = threading.Thread(target=beat, daemon=True)
+    thread = threading.Thread(target=repeat, daemon=True)
     thread.start()
     try:
         yield

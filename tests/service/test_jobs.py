@@ -1,0 +1,133 @@
+"""Training as a job, for real: seen to go on, finished, failed, cancelled, killed."""
+
+import os
+import signal
+from pathlib import Path
+
+import httpx
+import pytest
+from tests.service.world import ROBOT, START, grid_json
+from tests.serving import serving, wait_for
+
+pytest.importorskip("torch")
+
+TINY = {
+    "updates": 20,
+    "robots": 16,
+    "batch": 32,
+    "units": 8,
+    "evaluate_every": 10,
+    "evaluation_starts": 20,
+    "replay": 1000,
+}
+LONG = {**TINY, "updates": 1_000_000, "evaluate_every": 1_000_000}
+SPEC = {
+    "formula": "F[0,6] Goal",
+    "regions": {"Goal": {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}},
+}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("training"), SPECSHIELD_WORKER="true") as server:
+        yield server
+
+
+@pytest.fixture
+def client(server):
+    with httpx.Client(base_url=server.url, timeout=20.0) as client:
+        yield client
+
+
+def ask(client, **fields):
+    map_id = client.post("/v1/maps", json=grid_json()).json()["id"]
+    body = {"map_id": map_id, "robot": ROBOT, "spec": SPEC, "options": TINY, **fields}
+    response = client.post("/v1/policies", json=body)
+    assert response.status_code == 202, response.text
+    return response.json()
+
+
+def read(client, policy):
+    return client.get(f"/v1/policies/{policy['id']}").json()
+
+
+def reach(client, policy, status, seconds=60.0):
+    wait_for(lambda: read(client, policy)["status"] in (status, "failed"), seconds)
+    found = read(client, policy)
+    assert found["status"] == status, found
+    return found
+
+
+def children(pid):
+    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [(int(child), Path(f"/proc/{child}/cmdline").read_bytes()) for child in listed]
+
+
+def worker_of(server):
+    (pid,) = (pid for pid, command in children(server.process.pid) if b"--until-eof" in command)
+    return pid
+
+
+def test_a_policy_is_trained_and_serves(client):
+    policy = ask(client)
+    assert policy["status"] in ("queued", "training")
+    assert ask(client)["id"] == policy["id"]  # the same request, the same policy
+    ready = reach(client, policy, "ready")
+    assert ready["progress"] == 1.0
+    assert 0.0 <= ready["metrics"]["satisfied"] <= 1.0
+    assert ready["options"]["units"] == 8
+    session = client.post(
+        "/v1/sessions", json={"policy_id": policy["id"], "initial_pose": START, "allow_infeasible": True}
+    )
+    assert session.status_code == 201
+    assert client.get("/v1/policies").json()["items"][-1]["id"]
+
+
+def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
+    policy = ask(client, options=LONG)
+    reach(client, policy, "training")
+    wait_for(lambda: read(client, policy)["eta_s"], 60.0)
+    assert 0.0 < read(client, policy)["progress"] < 1.0
+    assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
+    found = read(client, policy)
+    assert (found["status"], found["error"]) == ("failed", "cancelled")
+    ((run, _),) = children(worker_of(server))
+    wait_for(lambda: not Path(f"/proc/{run}").exists(), 10.0)
+    assert read(client, policy)["error"] == "cancelled"
+    assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
+    assert client.get(f"/v1/policies/{policy['id']}").status_code == 404
+
+
+def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, client):
+    policy = ask(client, options=LONG, seed=2)
+    reach(client, policy, "training")
+    ((run, _),) = children(worker_of(server))
+    os.kill(run, signal.SIGKILL)
+    wait_for(lambda: read(client, policy)["status"] == "failed", 3.0)
+    assert "signal 9" in read(client, policy)["error"]
+    assert ask(client, options=LONG, seed=2)["status"] == "queued"
+    client.delete(f"/v1/policies/{policy['id']}")
+
+
+def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, client):
+    policy = ask(client, options=LONG, seed=3)
+    reach(client, policy, "training")
+    os.kill(worker_of(server), signal.SIGKILL)
+    wait_for(lambda: read(client, policy)["status"] == "failed", 10.0)
+    assert "worker is gone" in read(client, policy)["error"]
+    reach(client, ask(client, seed=4), "ready")
+
+
+def test_nothing_trains_on_without_its_server(tmp_path):
+    with serving(tmp_path, SPECSHIELD_WORKER="true") as server:
+        with httpx.Client(base_url=server.url, timeout=20.0) as client:
+            policy = ask(client, options=LONG)
+            reach(client, policy, "training")
+        worker = worker_of(server)
+        ((run, _),) = children(worker)
+        server.kill()
+        wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (worker, run)), 10.0)
+    with serving(tmp_path) as server:  # no worker this time
+        found = httpx.get(f"{server.url}/v1/policies/{policy['id']}").json()
+        assert found["status"] == "failed"
+        assert "ask for it again" in found["error"]
