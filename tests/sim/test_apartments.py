@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from specshield.sim.apartments import APARTMENTS, draw, files
 from specshield.world.geodesic import geodesic_distance
 from specshield.world.map_server import load_map

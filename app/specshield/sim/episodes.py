@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class Episode:
     poses: list[Pose] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self)
+        return {**vars(self), "modes": dict(self.modes)}
 
     def judged(self, verdict: Verdict) -> Episode:
         self.spec_status, self.robustness = verdict.spec_status, verdict.robustness_bounds

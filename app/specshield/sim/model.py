@@ -53,7 +53,7 @@ class GoalSeeker:
     HABIT = 0.5
     IDLE = -4.0  # for tokens that leave the base where it is
     END_WITHIN = 0.7  # [m]
-    END_NEAR, END_FAR, END_SLOPE = 1.5, -9.0, 30.0  # logits, and logits a metre between them
+    END_NEAR, END_FAR, END_SLOPE = 2.5, -9.0, 30.0  # logits, and logits a metre between them
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot

@@ -13,7 +13,7 @@ from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode
 from specshield.sim.robot import Pose
 from specshield.stl import Formula, Not, obligations, robustness
-from specshield.world.regions import signed_distance
+from specshield.world.regions import Region, signed_distance
 
 FINE = 3  # drawn this much larger, then reduced
 PIXELS = 110  # a metre
@@ -31,8 +31,7 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
     canvas = _Canvas(case)
     canvas.floor()
     for name, region in case.task.regions.items():
-        inside = signed_distance(region, canvas.points()) > 0.0
-        canvas.region(name, inside, BAD if name in _avoided(case.task.formula) else GOOD)
+        canvas.region(name, region, BAD if name in _avoided(case.task.formula) else GOOD)
     canvas.way(unshielded.poses, UNSHIELDED, 2.2)
     canvas.way(shielded.poses, SHIELDED, 3.0)
     for t, (x, y, _) in _kept_at(case, shielded.poses):
@@ -88,37 +87,39 @@ class _Canvas:
         self._image = Image.new("RGB", (size[0] * FINE, size[1] * FINE), PAPER)
         self._pen = ImageDraw.Draw(self._image)
 
-    def points(self) -> NDArray[np.float64]:
-        """The map-frame point of every fine pixel of the map. Shape [rows, columns, 2]."""
-        scale = FINE * PIXELS
-        columns, rows = np.meshgrid(
-            np.arange(self.width * FINE) + 0.5, np.arange(self.map_height * FINE) + 0.5
-        )
-        return np.stack([self._corner[0] + columns / scale, self._corner[1] - rows / scale], axis=-1)
+    def _points(self) -> NDArray[np.float64]:
+        """The map-frame point of every pixel of the map. Shape [rows, columns, 2]."""
+        columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.map_height) + 0.5)
+        return np.stack([self._corner[0] + columns / PIXELS, self._corner[1] - rows / PIXELS], axis=-1)
+
+    def _refined(self, values: NDArray[np.float32], how: Image.Resampling) -> NDArray[np.float32]:
+        """Values a pixel, as values a fine pixel."""
+        size = (self.width * FINE, self.map_height * FINE)
+        return np.asarray(Image.fromarray(values).resize(size, how))
 
     def floor(self) -> None:
         case, grid = self._case, self._case.task.grid
-        cells = np.floor(grid.to_grid(self.points()) / grid.resolution).astype(int)
+        cells = np.floor(grid.to_grid(self._points()) / grid.resolution).astype(int)
         columns, rows = cells[..., 0].clip(0, grid.width - 1), cells[..., 1].clip(0, grid.height - 1)
-        self._paint(grid.occupied[rows, columns], WALL, 1.0)
+        occupied = grid.occupied[rows, columns].astype(np.float32)
+        self._paint(self._refined(occupied, Image.Resampling.NEAREST) > 0.5, WALL, 1.0)
+        taken = [signed_distance(region, grid.centres) > -0.4 for region in case.task.regions.values()]
+        taken.append(np.hypot(*np.moveaxis(grid.centres - case.target, -1, 0)) < 0.8)
         for name, room in case.rooms.items():
-            inside = signed_distance(room, grid.centres)
-            free = np.where(grid.clearance > 0.4, np.minimum(inside, grid.clearance), -1.0)
-            row, column = np.unravel_index(np.argmax(free), free.shape)
-            self.text(tuple(grid.centres[row, column]), name, 13, FAINT)
+            roomy = np.minimum(signed_distance(room, grid.centres), grid.clearance)
+            row, column = np.unravel_index(
+                np.argmax(np.where(np.any(taken, axis=0), -1.0, roomy)), roomy.shape
+            )
+            self.text(grid.centres[row, column].tolist(), name, 13, FAINT)
 
-    def region(self, name: str, inside: NDArray[np.bool_], color: Color) -> None:
-        edge = np.zeros_like(inside)
-        thick = 2 * FINE
-        edge[thick:-thick, thick:-thick] = inside[thick:-thick, thick:-thick] & ~(
-            inside[: -2 * thick, thick:-thick] & inside[2 * thick :, thick:-thick]
-            & inside[thick:-thick, : -2 * thick] & inside[thick:-thick, 2 * thick :]
-        )  # fmt: skip
-        self._paint(inside, color, 0.16)
-        self._paint(edge, color, 1.0)
-        rows, columns = np.nonzero(inside)
-        x, y = self.points()[rows.max(), int(columns.mean())]
-        self.text((x, y), name, 13, color, shift=(0, 4), anchor="mt")
+    def region(self, name: str, region: Region, color: Color) -> None:
+        coarse = signed_distance(region, self._points()).astype(np.float32)
+        depth = self._refined(coarse, Image.Resampling.BILINEAR)
+        self._paint(depth > 0.0, color, 0.16)
+        self._paint((depth > 0.0) & (depth < 2.0 / PIXELS), color, 1.0)
+        rows, columns = np.nonzero(coarse > 0.0)
+        lowest = self._points()[rows.max(), int(columns.mean())]
+        self.text(lowest.tolist(), name, 13, color, shift=(0, 4), anchor="mt")
 
     def way(self, poses: Sequence[Pose], color: Color, thickness: float) -> None:
         line = [self._at(pose) for pose in poses]
@@ -163,7 +164,8 @@ class _Canvas:
             self._write((left + 44 * FINE, v), f"{said}: {_outcome(episode)}", 14, INK, "lm")
         right = left + 560 * FINE
         v = top + 32 * FINE
-        for color, said in ((GOOD, "to visit"), (BAD, "to avoid")):
+        avoided = _avoided(case.task.formula)
+        for color, said in ((GOOD, "to visit"), (BAD, "to avoid")) if avoided else ((GOOD, "to visit"),):
             box = (right, v - 7 * FINE, right + 20 * FINE, v + 7 * FINE)
             tint = tuple(round(0.84 * p + 0.16 * c) for p, c in zip(PAPER, color, strict=True))
             self._pen.rectangle(box, fill=tint, outline=color, width=2 * FINE)

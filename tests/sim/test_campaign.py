@@ -1,0 +1,91 @@
+"""Campaigns through the SDK against a real server, and what is made of them."""
+
+import dataclasses
+import json
+
+import pytest
+from PIL import Image
+from tests.oracles.judge import margin
+
+from specshield.client import ShieldClient
+from specshield.sim import picture, report
+from specshield.sim.campaign import run
+
+RUNS = 3
+
+
+@pytest.fixture(scope="module")
+def campaign(server, case):
+    with ShieldClient(server.url, timeout=10.0) as client:
+        yield run(client, case, RUNS, seed=1)
+
+
+def test_with_the_shield_the_rule_is_kept_and_without_it_broken(campaign, case):
+    """The service's verdicts, and the oracle's."""
+    assert campaign.kept
+    for episode in campaign.shielded:
+        assert margin(case.spec, padded(episode, case)) > 0.0
+        assert episode.main_done
+        assert set(episode.modes) <= {"shaped", "prior", "completion"}
+        assert episode.spread >= 0.8 * episode.asked > 0
+        assert len(episode.server_ms) == len(episode.round_trip_ms) == sum(episode.modes.values())
+    for episode in campaign.unshielded:
+        low, high = episode.robustness
+        assert (episode.spec_status, low) == ("violated", high)
+        assert margin(case.spec, episode.poses) == pytest.approx(low, abs=1e-9)
+        assert episode.main_done
+
+
+def padded(episode, case):
+    """An episode that ended early, the robot standing still to the horizon."""
+    return episode.poses + [episode.poses[-1]] * (case.task.horizon + 1 - len(episode.poses))
+
+
+def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
+    with ShieldClient(server.url, timeout=10.0) as client:
+        again = run(client, case, 1, seed=1)
+    for name in ("shielded", "unshielded"):
+        first, second = getattr(campaign, name)[0], getattr(again, name)[0]
+        assert second.poses == first.poses
+        assert second.kl == first.kl
+    assert again.shielded[0].start == again.unshielded[0].start
+    assert campaign.shielded[1].start != campaign.shielded[0].start
+
+
+def test_the_table_and_the_json_say_what_happened(campaign):
+    figures = json.loads(json.dumps(report.summary(campaign)))
+    kept = figures["with_shield"]
+    assert (kept["satisfied"], kept["main_done"]) == (RUNS, RUNS)
+    assert figures["without_shield"] == {"satisfied": 0, "main_done": RUNS}
+    every = [value for episode in campaign.shielded for value in episode.kl]
+    assert kept["kl_per_episode"] == pytest.approx(sum(every) / RUNS, abs=1e-3)
+    assert kept["kl_per_decision"] == pytest.approx(sum(every) / len(every), abs=1e-3)
+    later = sorted(
+        s.ended_at - u.ended_at for s, u in zip(campaign.shielded, campaign.unshielded, strict=True)
+    )
+    assert kept["extra_steps"] == later[RUNS // 2]
+    lines = report.table([figures, figures]).splitlines()
+    assert lines[2].split() == ["rule", "satisfied", *f"0 of {RUNS} {RUNS} of {RUNS}".split() * 2]
+    assert len({len(line) for line in lines[2:]}) <= 2
+    json.dumps([episode.to_json() for episode in campaign.shielded])
+
+
+def test_a_broken_rule_is_noticed(campaign):
+    broken = dataclasses.replace(campaign.shielded[0], spec_status="violated")
+    assert not dataclasses.replace(campaign, shielded=[broken]).kept
+
+
+def test_the_picture_shows_both_ways(campaign, case, tmp_path):
+    path = tmp_path / "out" / "case.png"
+    picture.draw(case, campaign.shielded[0], campaign.unshielded[0], path)
+    with Image.open(path) as image:
+        xmin, _, xmax, ymax = case.task.grid.bounds
+        assert image.width == round((xmax - xmin) * picture.PIXELS) + 2 * picture.BORDER
+        colors = {color for _, color in image.getcolors(1 << 20)}
+        assert {picture.SHIELDED, picture.UNSHIELDED, picture.TARGET, picture.WALL, picture.GOOD} <= colors
+        assert (picture.BAD in colors) == (case.name == "case2")
+        u, v = (
+            picture.BORDER + (case.target[0] - xmin) * picture.PIXELS,
+            picture.BORDER + (ymax - case.target[1]) * picture.PIXELS,
+        )
+        assert image.getpixel((round(u), round(v))) == picture.TARGET

@@ -1,0 +1,33 @@
+import json
+
+import numpy as np
+import pytest
+
+from specshield import errors
+from specshield.sim.cases import MAPS, MODELS, load_case
+from specshield.stl import parse
+
+
+def test_a_case_is_what_its_files_say(case):
+    beside = json.loads((MAPS / f"{case.name}.regions.json").read_text())
+    assert case.task.formula == parse(beside["formula"])
+    assert case.target in [tuple(point) for point in beside["targets"].values()]
+    assert case.task.robot.name == "stretch"
+    assert case.distance[case.cell(case.target)] == 0.0
+    row, column = case.cell((case.target[0] - 0.5, case.target[1]))
+    assert case.distance[row, column] == pytest.approx(0.5, abs=0.051)
+    assert np.all(np.isinf(case.distance) == case.task.grid.occupied)
+
+
+def test_the_policy_shipped_for_a_case_is_for_its_task_and_opens_95_percent_of_the_starts(case):
+    card = json.loads((MODELS / case.name / "card.json").read_text())
+    assert card["task_hash"] == case.task.content_hash
+    assert card["map_id"] == case.task.grid.content_hash
+    assert card["spec"] == case.spec
+    assert card["metrics"]["feasible_start"] >= 0.95
+
+
+def test_an_unknown_case_is_told_with_those_there_are():
+    with pytest.raises(errors.NotFound) as caught:
+        load_case("case9")
+    assert caught.value.expected == "one of case1, case2"
