@@ -1,8 +1,8 @@
-"""pi_phi by deep Q-learning on funnel-shaped rewards (paper, section IV-A): the one module that imports torch.
+"""pi_phi by deep Q-learning on funnel-shaped rewards (paper, section IV-A); alone in importing torch.
 
-Double DQN, n-step returns, Huber loss, Polyak-averaged target network, one update a step of all robots. The robots
-step in a thread of their own while the network learns. Every figure in a card comes from the compiled rollout that
-serves, not from torch.
+Double DQN, n-step returns, Huber loss, Polyak-averaged target network, one update a step of all robots. The
+robots step in a thread of their own while the network learns. Every figure in a card comes from the compiled
+rollout that serves, not from torch.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from specshield.task import Task
 
 @dataclass(frozen=True)
 class Progress:
-    """A report from a running training. satisfied: the latest measured rate, None before the first evaluation."""
+    """A report from a running training. satisfied: the latest measured rate, None before the first."""
 
     update: int
     updates: int
@@ -56,9 +56,11 @@ def train(
 ) -> Policy:
     """Trains pi_phi and returns it with its card.
 
-    checkpoint: a folder to save to at every evaluation and to resume from after a kill (the replay buffer is filled
-    anew). Raises FragmentError for a formula outside the fragment, Stopped when `should_stop` says so.
+    checkpoint: a folder to save to at every evaluation and to resume from after a kill (the replay buffer is
+    filled anew). Raises FragmentError for a formula outside the fragment, Stopped when `should_stop` says so.
     """
+    # One core is the robots'; threads that wait for a core spin, at worst forty times slower than one thread.
+    torch.set_num_threads(max((os.cpu_count() or 1) - 1, 1))
     run = _Run(task, settings, seed)
     if checkpoint is not None:
         run.resume(checkpoint)
@@ -86,15 +88,16 @@ def train(
 def measure(task: Task, weights: dict[str, NDArray[np.float32]], starts: int, seed: int) -> dict[str, Any]:
     """How often pi_phi satisfies the formula from starts uniform over free space, t = 0.
 
-    `satisfied`: pi_phi alone. `feasible_start`: some first action, then pi_phi (a session opens there). Each with
-    its 95 % Clopper-Pearson interval.
+    `satisfied`: pi_phi alone. `feasible_start`: some first action, then pi_phi (a session opens there). Each
+    with its 95 % Clopper-Pearson interval.
     """
     env = Environment(task, 1, 0)
     poses = free_poses(task, env.body, starts, np.random.default_rng([seed, 1]))
     net = make_network(weights, env.observations.shape[1], len(env.body.translate))
     result: dict[str, Any] = {"starts": starts}
     for name, first in (("satisfied", False), ("feasible_start", True)):
-        count = int(satisfies(env.body, env.rules, env.sight, net, poses, first, wait_motion(task.robot)).sum())
+        kept = satisfies(env.body, env.rules, env.sight, net, poses, first, wait_motion(task.robot))
+        count = int(kept.sum())
         low = float(beta.ppf(0.025, count, starts - count + 1)) if count else 0.0
         high = float(beta.ppf(0.975, count + 1, starts - count)) if count < starts else 1.0
         result[name] = count / starts
@@ -116,7 +119,8 @@ class _QNetwork(nn.Module):
     def weights(self) -> dict[str, NDArray[np.float32]]:
         """In the serving layout: w [inputs, outputs]."""
         tensors = [p.detach().cpu().numpy() for p in self.parameters()]
-        return {n: np.ascontiguousarray(t.T if t.ndim == 2 else t).copy() for n, t in zip(NAMES, tensors, strict=True)}
+        serving = [np.ascontiguousarray(t.T if t.ndim == 2 else t).copy() for t in tensors]
+        return dict(zip(NAMES, serving, strict=True))
 
     def set_weights(self, weights: dict[str, NDArray[np.float32]]) -> None:
         with torch.no_grad():
@@ -136,12 +140,17 @@ class _Replay:
         self.ended = np.zeros((steps, robots), np.bool_)
         self.added = 0
 
-    def add(self, observation: NDArray[np.float32], motion: NDArray[np.int64], reward: Any, ended: Any) -> None:
+    def add(
+        self, observation: NDArray[np.float32], motion: NDArray[np.int64], reward: Any, ended: Any
+    ) -> None:
         at = self.added % self.steps
-        self.observation[at], self.motion[at], self.reward[at], self.ended[at] = observation, motion, reward, ended
+        self.observation[at], self.motion[at] = observation, motion
+        self.reward[at], self.ended[at] = reward, ended
         self.added += 1
 
-    def sample(self, random: np.random.Generator, batch: int, n: int, discount: float) -> tuple[NDArray[Any], ...]:
+    def sample(
+        self, random: np.random.Generator, batch: int, n: int, discount: float
+    ) -> tuple[NDArray[Any], ...]:
         """observation, motion, n-step return, bootstrap factor (0 after an end), observation n steps on."""
         held = min(self.added, self.steps)
         start = self.added - held + random.integers(0, held - n, batch)
@@ -151,8 +160,8 @@ class _Replay:
             at = (start + j) % self.steps
             returns += factor * self.reward[at, robot]
             factor *= np.float32(discount) * ~self.ended[at, robot]
-        at, then = start % self.steps, (start + n) % self.steps
-        return self.observation[at, robot], self.motion[at, robot], returns, factor, self.observation[then, robot]
+        first, then = (start % self.steps, robot), ((start + n) % self.steps, robot)
+        return self.observation[first], self.motion[first], returns, factor, self.observation[then]
 
 
 class _Run:
@@ -182,7 +191,7 @@ class _Run:
     latest: float | None
 
     def advance(self, stepper: ThreadPoolExecutor) -> bool:
-        """All robots take a step while the network learns from what came before; whether there was enough to learn."""
+        """All robots step while the network learns from what was before; whether that was enough to learn."""
         observation = self.env.observations.copy()
         with torch.no_grad():
             motion = self.q_network(torch.from_numpy(observation).to(self.device)).argmax(1).cpu().numpy()
@@ -200,14 +209,14 @@ class _Run:
     def _learn(self) -> None:
         s = self.settings
         batch = self.replay.sample(self.random, s.batch, s.returns, s.discount)
-        observation, motion, returns, factor, then = (torch.from_numpy(array).to(self.device) for array in batch)
+        observation, motion, returns, factor, then = (torch.from_numpy(a).to(self.device) for a in batch)
         for group in self.optimizer.param_groups:
             group["lr"] = s.learning_rate * max(1.0 - self.update / s.updates, 0.02)
         with torch.no_grad():
             choice = self.q_network(then).argmax(1, keepdim=True)
             goal = returns + factor * self.target_network(then).gather(1, choice).squeeze(1)
-            # One step's delay is worth little beside a whole episode, less than the network's error: without a wider
-            # gap between actions (Bellemare et al., 2016) the greedy policy dithers.
+            # One step's delay is worth little beside a whole episode, less than the network's error: without
+            # a wider gap between actions (Bellemare et al., 2016) the greedy policy dithers.
             now = self.target_network(observation)
             goal -= s.gap * (now.max(1).values - now.gather(1, motion.unsqueeze(1)).squeeze(1))
         value = self.q_network(observation).gather(1, motion.unsqueeze(1)).squeeze(1)
@@ -223,9 +232,9 @@ class _Run:
         """Keeps the weights that satisfy most often, measured on starts of their own."""
         weights = self.q_network.weights()
         net: Network = make_network(weights, self.inputs, self.outputs)
-        poses = free_poses(self.task, self.env.body, self.settings.evaluation_starts, np.random.default_rng(0))
-        wait = wait_motion(self.task.robot)
-        rate = float(satisfies(self.env.body, self.env.rules, self.env.sight, net, poses, False, wait).mean())
+        env, wait = self.env, wait_motion(self.task.robot)
+        poses = free_poses(self.task, env.body, self.settings.evaluation_starts, np.random.default_rng(0))
+        rate = float(satisfies(env.body, env.rules, env.sight, net, poses, False, wait).mean())
         self.latest = rate
         if rate >= self.best_rate:
             self.best_rate, self.best = rate, weights
@@ -238,10 +247,10 @@ class _Run:
         arrays |= {f"best.{n}": a for n, a in self.best.items()}
         for i, parameter in enumerate(self.q_network.parameters()):
             state = self.optimizer.state[parameter]
-            arrays |= {f"adam.{i}.{n}": state[n].detach().cpu().numpy().reshape(-1) for n in ("exp_avg", "exp_avg_sq")}
-            arrays[f"adam.{i}.step"] = state["step"].detach().cpu().numpy().reshape(1)
+            for name in ("exp_avg", "exp_avg_sq", "step"):
+                arrays[f"adam.{i}.{name}"] = state[name].detach().cpu().numpy().reshape(-1)
         meta = {
-            "task": self.task.content_hash, "settings": asdict(self.settings), "update": self.update,
+            "task": self.task.content_hash, "settings": options_of(self.settings), "update": self.update,
             "elapsed": self.elapsed + time.monotonic() - self.began, "latest": self.latest,
             "best_rate": self.best_rate, "random": self.random.bit_generator.state,
         }  # fmt: skip
@@ -257,7 +266,7 @@ class _Run:
             return
         with safe_open(path, framework="numpy") as opened:
             meta = json.loads(opened.metadata()["meta"])
-        if meta["task"] != self.task.content_hash or meta["settings"] != json.loads(json.dumps(asdict(self.settings))):
+        if (meta["task"], meta["settings"]) != (self.task.content_hash, options_of(self.settings)):
             return
         arrays = load_file(path)
         self.q_network.set_weights({n: arrays[f"q.{n}"] for n in NAMES})
