@@ -35,10 +35,10 @@ CUSTOM = robot_from_json(
 )
 
 
-def flat(formula=FORMULA, robot=STRETCH, origin=(-1.0, 0.5, 0.3), **more):
+def flat(formula=FORMULA, robot=STRETCH, origin=(-1.0, 0.5, 0.3), regions=REGIONS):
+    """regions are given in the grid's frame, which the origin turns and moves."""
     grid = OccupancyGrid(OCCUPIED, 0.1, origin)
-    regions = {name: moved(grid, region) for name, region in REGIONS.items()}
-    return make_task(grid, robot, formula, regions, **more)
+    return make_task(grid, robot, formula, {name: moved(grid, region) for name, region in regions.items()})
 
 
 def moved(grid, region):
