@@ -46,7 +46,12 @@ def _latest(rules: Rules, k: int) -> int:
 
 
 def latest_times(
-    lattice: Lattice, rules: Rules, holds: NDArray[np.uint8], goals: NDArray[np.int64], masks: list[int], horizon: int
+    lattice: Lattice,
+    rules: Rules,
+    holds: NDArray[np.uint8],
+    goals: NDArray[np.int64],
+    masks: list[int],
+    horizon: int,
 ) -> NDArray[np.float32]:
     """L for each mask of `masks`, [masks, ny, nx, H]; NEVER where the formula cannot be satisfied."""
     index = {mask: n for n, mask in enumerate(masks)}
@@ -57,7 +62,9 @@ def latest_times(
         table = tables[index[mask]]
         for after in masks:
             if after & mask == mask and after != mask:
-                added = np.array([goals[g] for g in range(len(goals)) if after >> g & 1 and not mask >> g & 1])
+                added = np.array(
+                    [goals[g] for g in range(len(goals)) if after >> g & 1 and not mask >> g & 1]
+                )
                 _settle(rules, holds, added, tables[index[after]], table)
         _sweep(lattice, table)
     return tables
@@ -86,7 +93,9 @@ def _settle(
                         if left < rules.a[k] + rules.b[k]:
                             latest = np.float32(NEVER)
                             break
-                        latest = min(latest, np.float32(rules.c1[k] + rules.c2[k]), np.float32(left - dwell + 1))
+                        latest = min(
+                            latest, np.float32(rules.c1[k] + rules.c2[k]), np.float32(left - dwell + 1)
+                        )
                     else:
                         if left < rules.a[k]:
                             latest = np.float32(NEVER)
@@ -146,7 +155,12 @@ def _sweep(lattice: Lattice, table: NDArray[np.float32]) -> None:
                     for d in range(lattice.far_u.shape[3]):
                         u = lattice.far_u[j, i, h, d]
                         if u != np.float32(-1.0):
-                            found = bilinear(valid, table, lattice.far_v[j, i, h, d], u, lattice.far_h[j, i, h, d]) - 1.0
+                            found = (
+                                bilinear(
+                                    valid, table, lattice.far_v[j, i, h, d], u, lattice.far_h[j, i, h, d]
+                                )
+                                - 1.0
+                            )
                             best = max(best, np.float32(found))
                     if best > table[j, i, h] + SETTLED_CHANGE and best >= 0.0:
                         table[j, i, h] = best

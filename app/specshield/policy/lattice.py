@@ -73,7 +73,9 @@ def make_lattice(body: Body, rules: Rules, pitch: float, horizon: int) -> Lattic
 
 
 @njit(cache=True, nogil=True)
-def pose_of(body: Body, pitch: float, headings: int, j: float, i: float, h: float) -> tuple[float, float, float]:
+def pose_of(
+    body: Body, pitch: float, headings: int, j: float, i: float, h: float
+) -> tuple[float, float, float]:
     """The map-frame pose at lattice coordinates; whole numbers are crossings."""
     u, v = (i + 0.5) * pitch, (j + 0.5) * pitch
     x = body.origin_x + u * body.cos_yaw - v * body.sin_yaw
@@ -83,7 +85,9 @@ def pose_of(body: Body, pitch: float, headings: int, j: float, i: float, h: floa
 
 
 @njit(cache=True, nogil=True)
-def coordinates(body: Body, pitch: float, headings: int, x: float, y: float, theta: float) -> tuple[float, float, float]:
+def coordinates(
+    body: Body, pitch: float, headings: int, x: float, y: float, theta: float
+) -> tuple[float, float, float]:
     """Lattice coordinates (v, u, heading in [0, H)) of a pose of the map frame."""
     dx, dy = x - body.origin_x, y - body.origin_y
     u = (body.cos_yaw * dx + body.sin_yaw * dy) / pitch - 0.5

@@ -14,8 +14,8 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from specshield.errors import FragmentError, PolicyError
-from specshield.policy.lattice import MAX_POSES, heading_count, holds_at, make_lattice
 from specshield.policy.latest import latest_times, masks_of
+from specshield.policy.lattice import MAX_POSES, heading_count, holds_at, make_lattice
 from specshield.policy.policy import Card, Proposal, make_card, wait_motion
 from specshield.policy.progress import (
     ALWAYS,
@@ -30,7 +30,7 @@ from specshield.policy.search import INVALID, SCALE, Tables, propose_all
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
 
-BAND = -4.0  # [steps] of slack: how far the tables are trusted not to err
+BAND = -3.0  # [steps] of slack: how far the tables are trusted not to err
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,21 @@ def read_settings(options: Mapping[str, Any]) -> Settings:
     for name, value in options.items():
         if name not in limits:
             raise PolicyError(
-                f"unknown option {name!r}", path=f"options.{name}", got=name, expected=f"one of {sorted(limits)}"
+                f"unknown option {name!r}",
+                path=f"options.{name}",
+                got=name,
+                expected=f"one of {sorted(limits)}",
             )
         low, high = limits[name]
         whole = name == "beam"
-        if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)) or not low <= value <= high:
-            raise PolicyError("not in range", path=f"options.{name}", got=value, expected=f"from {low:g} to {high:g}")
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int if whole else (int, float))
+            or not low <= value <= high
+        ):
+            raise PolicyError(
+                "not in range", path=f"options.{name}", got=value, expected=f"from {low:g} to {high:g}"
+            )
     return Settings(**options)
 
 
@@ -87,7 +96,18 @@ class ReachabilityPolicy:
         poses = np.empty((*motions.shape, 3))
         wait = wait_motion(self.task.robot)
         preferred = propose_all(
-            body, rules, self.tables, history[-1], t, status, run, wait, self.settings.beam, BAND, motions, poses
+            body,
+            rules,
+            self.tables,
+            history[-1],
+            t,
+            status,
+            run,
+            wait,
+            self.settings.beam,
+            BAND,
+            motions,
+            poses,
         )
         return Proposal(motions, poses, int(preferred))
 
@@ -96,7 +116,9 @@ class ReachabilityPolicy:
         return save_tensors({"cell": self.tables.cell, "code": self.tables.code, "index": self.tables.index})
 
 
-def synthesise(task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None) -> ReachabilityPolicy:
+def synthesise(
+    task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
+) -> ReachabilityPolicy:
     """Makes the tables. Raises FragmentError for a formula or robot they do not cover, PolicyError for a map too large."""
     began = time.perf_counter()
     settings = settings or Settings()
@@ -126,7 +148,9 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
     try:
         tensors = load_tensors(weights)
     except Exception as error:  # the parser raises its own types for hostile bytes
-        raise PolicyError(f"not a safetensors file: {error}", path="weights", expected="safetensors") from error
+        raise PolicyError(
+            f"not a safetensors file: {error}", path="weights", expected="safetensors"
+        ) from error
     wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "index": (np.int32, 1)}
     for name, (dtype, rank) in wanted.items():
         array = tensors.get(name)
@@ -210,7 +234,9 @@ def _pack(
     used = valid.any(axis=2)
     cell = np.full(used.shape, -1, np.int32)
     cell[used] = np.arange(int(used.sum()))
-    kept = [n for n, mask in enumerate(masks) if mask != (1 << len(goals)) - 1]  # with every goal settled: no table
+    kept = [
+        n for n, mask in enumerate(masks) if mask != (1 << len(goals)) - 1
+    ]  # with every goal settled: no table
     code = np.zeros((len(kept), int(used.sum()), valid.shape[2]), np.uint16)
     index = np.full(1 << len(goals), -1, np.int32)
     for row, n in enumerate(kept):

@@ -5,6 +5,7 @@ The tables propose, exact simulation decides: every pose here comes from f, ever
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ SCALE = 64.0  # table codes a step
 INVALID = 65535  # code of a pose that is in collision or breaks a lasting `always`
 HOPELESS = -1e9
 SAFE = 1e6
+NUDGE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
 
 
 class Tables(NamedTuple):
@@ -121,6 +123,43 @@ def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _score(
+    body: Body,
+    rules: Rules,
+    tables: Tables,
+    x: float,
+    y: float,
+    theta: float,
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+    wait: int,
+    scores: NDArray[np.float64],
+) -> None:
+    """L after each motion (M,), contact and the step's own progress left out: a cheap order to try motions in."""
+    mask = 0
+    for k in range(status.shape[0]):
+        if status[k] == SETTLED:
+            mask |= tables.bit[k]
+    table = tables.index[mask]
+    headings = tables.code.shape[2]
+    v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
+    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
+    cos, sin = math.cos(grid_theta) / tables.pitch, math.sin(grid_theta) / tables.pitch
+    for m in range(scores.shape[0]):
+        d = body.translate[m]
+        w = h + body.rotate[m] * headings / (2.0 * math.pi)
+        if w < 0.0:
+            w += headings
+        scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w) if table >= 0 else HOPELESS
+    for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
+        if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
+            ahead = tables.index[mask | tables.bit[k]]
+            if ahead >= 0:
+                left = rules.b[k] - rules.c2[k] + 1 - run[k]
+                scores[wait] = max(scores[wait], latest_at(tables, ahead, v, u, h) - left + 1.0)
+
+
+@njit(cache=True, nogil=True)
 def greedy(
     body: Body,
     rules: Rules,
@@ -134,53 +173,89 @@ def greedy(
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> tuple[bool, float]:
-    """Follows the slack uphill from (x_t, t) to the horizon after the motion `first` (-1: its own choice).
+    """Follows the latest feasible time uphill from (x_t, t) to the horizon, after the motion `first`.
 
     status, run (K,): progress after x_t, left as they are. Writes motions (T - t,), poses (T - t, 3). Returns whether
     every goal was settled and nothing broken, and the slack after the first motion.
     """
-    k_count, m_count = status.shape[0], body.translate.shape[0]
+    k_count, steps = status.shape[0], motions.shape[0]
     status, run = status.copy(), run.copy()
-    trial_status, trial_run = np.empty_like(status), np.empty_like(run)
-    best_status, best_run = np.empty_like(status), np.empty_like(run)
+    kept_status, kept_run = np.empty_like(status), np.empty_like(run)
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(k_count)
-    x, y, theta = pose[0], pose[1], pose[2]
-    after_first = HOPELESS
-    for n in range(motions.shape[0]):
-        if (n > 0 or first < 0) and goals_settled(rules, status):
-            for rest in range(n, motions.shape[0]):  # waiting keeps what is left
-                motions[rest] = wait
-                poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
-            return True, SAFE if n == 0 else after_first
-        best, best_slack = wait, -np.inf
-        bx, by, bth = x, y, theta
-        for trial in range(m_count):
-            m = wait if trial == 0 else (trial - 1 if trial <= wait else trial)  # waiting first: it wins ties
-            if n == 0 and first >= 0 and m != first:
-                continue
-            nx, ny, nth = step(body, x, y, theta, m)
-            if m != wait and nx == x and ny == y and nth == theta and (n > 0 or first < 0):
-                continue
-            read_predicates(rules, nx, ny, nth, values, stack, predicates)
-            trial_status[:], trial_run[:] = status, run
-            advance(rules, t + n + 1, predicates, trial_status, trial_run)
-            found = slack(body, rules, tables, nx, ny, nth, t + n + 1, trial_status, trial_run)
-            if found > best_slack:
-                best, best_slack = m, found
-                bx, by, bth = nx, ny, nth
-                best_status[:], best_run[:] = trial_status, trial_run
-        if n == 0:
-            after_first = best_slack
-        x, y, theta = bx, by, bth
-        status[:], run[:] = best_status, best_run
-        motions[n] = best
-        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-        if best_slack <= 0.5 * HOPELESS:  # nothing left to follow
-            for rest in range(n + 1, motions.shape[0]):
-                motions[rest] = wait
-                poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
-            return False, after_first
-    return goals_settled(rules, status), after_first
+    scores = np.empty(body.translate.shape[0])
+    x, y, theta = step(body, pose[0], pose[1], pose[2], first)
+    read_predicates(rules, x, y, theta, values, stack, predicates)
+    advance(rules, t + 1, predicates, status, run)
+    ahead = slack(body, rules, tables, x, y, theta, t + 1, status, run)
+    motions[0] = first
+    poses[0, 0], poses[0, 1], poses[0, 2] = x, y, theta
+    n = 1
+    while n < steps and not goals_settled(rules, status):
+        _score(body, rules, tables, x, y, theta, status, run, wait, scores)
+        if not _pays_to_wait(rules, t + n, predicates, status):
+            scores[wait] = HOPELESS
+        last = motions[n - 1]
+        for m in range(scores.shape[0]):  # tables err by a little: never straight back
+            if body.translate[m] * body.translate[last] < 0.0 or body.rotate[m] * body.rotate[last] < 0.0:
+                scores[m] = HOPELESS
+        chosen = -1
+        while True:
+            best = wait  # waiting wins ties
+            for m in range(scores.shape[0]):
+                if scores[m] > scores[best]:
+                    best = m
+            if best == wait or scores[best] <= HOPELESS:
+                break
+            nx, ny, nth = step(body, x, y, theta, best)
+            if abs(nx - x) + abs(ny - y) > NUDGE or nth != theta:
+                kept_status[:], kept_run[:] = status, run
+                read_predicates(rules, nx, ny, nth, values, stack, predicates)
+                advance(rules, t + n + 1, predicates, status, run)
+                if not _is_broken(status):
+                    chosen = best
+                    x, y, theta = nx, ny, nth
+                    break
+                status[:], run[:] = kept_status, kept_run
+            scores[best] = HOPELESS
+        if chosen >= 0:
+            motions[n] = chosen
+            poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+            n += 1
+            continue
+        # Waiting is best until something it brings about changes the progress.
+        kept_status[:] = status
+        read_predicates(rules, x, y, theta, values, stack, predicates)
+        while n < steps:
+            advance(rules, t + n + 1, predicates, status, run)
+            motions[n] = wait
+            poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+            n += 1
+            if np.any(status != kept_status):
+                break
+        if _is_broken(status):
+            break
+    for rest in range(n, steps):
+        motions[rest] = wait
+        poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
+    return goals_settled(rules, status), ahead
+
+
+@njit(cache=True, nogil=True)
+def _pays_to_wait(rules: Rules, t: int, predicates: NDArray[np.float64], status: NDArray[np.int8]) -> bool:
+    """Whether a goal that holds here is still to open, or a dwell to go on."""
+    for k in range(status.shape[0]):
+        if rules.kind[k] != ALWAYS and status[k] == PENDING and predicates[k] > rules.margin:
+            if rules.kind[k] == EVENTUALLY_ALWAYS or rules.a[k] > t:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _is_broken(status: NDArray[np.int8]) -> bool:
+    for k in range(status.shape[0]):
+        if status[k] == BROKEN:
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -195,12 +270,13 @@ def beam(
     first: int,
     wait: int,
     width: int,
+    band: float,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> bool:
     """Keeps the `width` poses with the most slack at every step; True once one has settled every goal.
 
-    Arguments as `greedy`; motions and poses are written only on success.
+    band: poses with less slack than this are given up. Other arguments as `greedy`; motions and poses are written only on success.
     """
     k_count, m_count, steps = status.shape[0], body.translate.shape[0], motions.shape[0]
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(k_count)
@@ -212,20 +288,34 @@ def beam(
     new = np.empty((room, 3))
     new_status, new_run = np.empty((room, k_count), np.int8), np.empty((room, k_count), np.int64)
     new_slack, new_from, new_motion = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
+    scores = np.empty(m_count)
     parent = np.empty((steps, width), np.int32)
     taken = np.empty((steps, width), np.int16)
     for n in range(steps):
         found = 0
         for w in range(count):
+            if n > 0:
+                _score(
+                    body,
+                    rules,
+                    tables,
+                    here[w, 0],
+                    here[w, 1],
+                    here[w, 2],
+                    here_status[w],
+                    here_run[w],
+                    wait,
+                    scores,
+                )
             for m in range(m_count):
-                if n == 0 and m != first:
+                if m != first if n == 0 else scores[m] - (t + n + 1) < band:
                     continue
                 x, y, theta = step(body, here[w, 0], here[w, 1], here[w, 2], m)
                 read_predicates(rules, x, y, theta, values, stack, predicates)
                 new_status[found], new_run[found] = here_status[w], here_run[w]
                 advance(rules, t + n + 1, predicates, new_status[found], new_run[found])
                 ahead = slack(body, rules, tables, x, y, theta, t + n + 1, new_status[found], new_run[found])
-                if ahead <= 0.5 * HOPELESS:
+                if ahead < band:
                     continue
                 new[found, 0], new[found, 1], new[found, 2] = x, y, theta
                 new_slack[found], new_from[found], new_motion[found] = ahead, w, m
@@ -318,7 +408,9 @@ def propose_all(
     for m in range(motions.shape[0]):
         settled, ahead = greedy(body, rules, tables, pose, t, status, run, m, wait, motions[m], poses[m])
         if not settled and ahead >= band:
-            settled = beam(body, rules, tables, pose, t, status, run, m, wait, width, motions[m], poses[m])
+            settled = beam(
+                body, rules, tables, pose, t, status, run, m, wait, width, band, motions[m], poses[m]
+            )
         if ahead > best_slack or (ahead == best_slack and m == wait):
             best, best_slack = m, ahead
     return best
