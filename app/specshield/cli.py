@@ -46,7 +46,9 @@ def main() -> None:
 
 def _commands() -> Any:
     app = typer.Typer(
-        help="Keeps robot foundation models inside their operating rules.", no_args_is_help=True
+        help="Keeps robot foundation models inside their operating rules.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
     )
     for command in (serve, demo, train, evaluate, worker, openapi):
         app.command()(command)

@@ -49,13 +49,13 @@ POLICY: dict[str, Any] = {
     "seed": 0,
 }
 
-SESSION: dict[str, Any] = {"id": "example", "policy_id": "case1", "initial_pose": [2.0, 2.0, 0.0], "seed": 7}
+SESSION: dict[str, Any] = {"id": "example", "policy_id": "case1", "initial_pose": [5.0, 5.0, 0.0], "seed": 7}
 
 STEP: dict[str, Any] = {
     "t": 0,
-    "poses": [[2.0, 2.0, 0.0]],
+    "poses": [[5.0, 5.0, 0.0]],
     "logits": [2.0, 0.5, 0.5, -1.0, -4.0, None, 0.0, 0.0, *[None] * 12],
     "main_task_done": False,
 }
 
-CLOSE: dict[str, Any] = {"t": 1, "poses": [[2.2, 2.0, 0.0]]}
+CLOSE: dict[str, Any] = {"t": 1, "poses": [[5.2, 5.0, 0.0]]}

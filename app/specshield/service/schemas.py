@@ -81,7 +81,7 @@ class Polygon(Strict):
     """Simple: the edges touch only at their ends. The last vertex joins the first."""
 
     type: Literal["polygon"]
-    vertices: list[Point] = Field(min_length=3, max_length=10_000)
+    vertices: list[Point] = Field(min_length=3, max_length=10_000, description="In order, [x, y] in metres.")
 
 
 Shape = Annotated[Circle | Rectangle | Polygon, Field(discriminator="type")]
@@ -91,7 +91,7 @@ class Union(Strict):
     """Everything inside any member."""
 
     type: Literal["union"]
-    members: list[Shape] = Field(min_length=1, max_length=256)
+    members: list[Shape] = Field(min_length=1, max_length=256, description="Regions that are no unions.")
 
 
 Region = Annotated[Circle | Rectangle | Polygon | Union, Field(discriminator="type")]
@@ -123,8 +123,8 @@ class SpecRequest(Strict):
     model_config = ConfigDict(json_schema_extra={"examples": [examples.SPEC_REQUEST]})
 
     formula: Formula
-    regions: Regions | None = None
-    signals: Signals | None = None
+    regions: Regions | None = Field(None, description="Regions by name.")
+    signals: Signals | None = Field(None, description="Initial values of other signals, by name.")
     map_id: Id | None = Field(None, description="A map, whose rooms are then names too.")
 
 
@@ -199,7 +199,7 @@ class Footprint(Strict):
 
 
 class ActionSpec(Strict):
-    name: Name
+    name: Name = Field(description="Unlike the others'.")
     translate: float = Field(0.0, description="Along the heading [m].")
     rotate: float = Field(0.0, description="Counter-clockwise, after the translation [rad].")
     terminal: bool = Field(False, description="Ends the main task: moves nothing, consumes no step.")
@@ -226,7 +226,7 @@ class PolicyRequest(Strict):
     robot: RobotChoice = Field("stretch", description="A preset (`stretch`) or a robot of your own.")
     spec: Spec
     method: Literal["dqn", "reachability"] = Field("dqn", description="How the policy is made.")
-    seed: int = Field(0, ge=0, lt=2**63)
+    seed: int = Field(0, ge=0, lt=2**63, description="Of everything random in the training.")
     options: dict[str, bool | int | float | str | list[float]] = Field(
         default_factory=dict,
         max_length=64,
@@ -252,18 +252,18 @@ class Card(BaseModel):
 class PolicyResponse(Answer):
     id: str = Field(description="Hash of task, method, options and seed.")
     name: str | None = Field(description="Its name, if it came with the server; accepted wherever an id is.")
-    status: Literal["queued", "training", "ready", "failed"]
+    status: Literal["queued", "training", "ready", "failed"] = Field(description="Sessions need `ready`.")
     progress: float = Field(description="0 to 1.")
     eta_s: float | None = Field(description="Estimate of the time left [s]; null where there is none.")
     error: str | None = Field(description="Why it failed.")
     metrics: dict[str, JsonValue] = Field(description="What was measured, such as the rate of satisfaction.")
-    map_id: str
-    robot: str | dict[str, JsonValue]
+    map_id: str = Field(description="Id of the map.")
+    robot: str | dict[str, JsonValue] = Field(description="A preset's name, or the robot as it was sent.")
     spec: dict[str, JsonValue] = Field(description="`formula`, `regions`, `signals`.")
     horizon: int = Field(description="The horizon T in steps.")
-    method: str
-    seed: int
-    options: dict[str, JsonValue]
+    method: str = Field(description="How it is made.")
+    seed: int = Field(description="As asked for.")
+    options: dict[str, JsonValue] = Field(description="Every setting of the method.")
     created_at: str | None = Field(description="RFC 3339; null for one that came with the server.")
 
 
@@ -317,24 +317,24 @@ class SessionRequest(Strict):
 
 
 class SessionResponse(Answer):
-    id: str
-    policy_ids: list[str]
-    map_id: str
+    id: str = Field(description="For the paths below /v1/sessions.")
+    policy_ids: list[str] = Field(description="Ids of its policies.")
+    map_id: str = Field(description="Id of its map.")
     spec: dict[str, JsonValue] = Field(description="`formula`, `regions`, `signals`.")
     horizon: int = Field(description="The horizon T in steps; the last shaped decision is at T - 1.")
     actions: list[str] = Field(description="Names, in the order of the logits.")
     terminal_actions: list[int] = Field(description="Indices of the actions that end the main task.")
-    seed: int
-    threshold: float
-    margin: float
-    evaluation: str
-    shaping: str
-    max_steps: int
+    seed: int = Field(description="Of the draws of `action`.")
+    threshold: float = Field(description="delta.")
+    margin: float = Field(description="Robustness kept in hand [the unit of the formula, m].")
+    evaluation: str = Field(description="`feasibility` or `robustness`.")
+    shaping: str = Field(description="`projection`.")
+    max_steps: int = Field(description="The last step there can be.")
     next_t: int = Field(description="The step expected next.")
     feasible: bool = Field(description="Whether some action from x_0 had a satisfying future.")
-    spec_status: SpecStatus
-    main_task_done: bool
-    finished: bool
+    spec_status: SpecStatus = Field(description="Of the history so far, whatever may follow.")
+    main_task_done: bool = Field(description="As the last step said.")
+    finished: bool = Field(description="No further step will be taken.")
     created_at: str = Field(description="RFC 3339.")
     expires_at: str = Field(description="RFC 3339; every change moves it on.")
 
@@ -377,7 +377,7 @@ class Residual(Answer):
 
 
 class StepResponse(Answer):
-    t: int
+    t: int = Field(description="The step that was decided.")
     mode: Literal["prior", "shaped", "completion", "fallback", "violated"] = Field(
         description="How `distribution` came about."
     )
@@ -387,11 +387,11 @@ class StepResponse(Answer):
         description="rho of the joint trajectory that certifies (or fails) each action."
     )
     action: int = Field(description="Drawn from `distribution` by the session's seed and t.")
-    action_name: str
+    action_name: str = Field(description="Its name.")
     completion_action: int | None = Field(
         description="The certified continuation; null once the specification is settled."
     )
-    spec_status: SpecStatus
+    spec_status: SpecStatus = Field(description="Of x_0 .. x_t, whatever may follow.")
     feasible_mass: float | None = Field(description="pi_FM(S_t), of the non-terminal actions.")
     kl: float | None = Field(
         description="KL(pi* || pi_FM) in nats; null where pi* leaves the prior's support."
@@ -410,6 +410,8 @@ class StepResponse(Answer):
 
 
 class CloseRequest(Strict):
+    model_config = ConfigDict(json_schema_extra={"examples": [examples.CLOSE]})
+
     t: int | None = Field(
         None, ge=0, le=1_000_000, description="The last step reached. Default: the last one stored."
     )
@@ -431,7 +433,7 @@ class CloseResponse(SessionResponse):
 
 
 class TrajectoryItem(Answer):
-    t: int
+    t: int = Field(description="The step.")
     pose: Pose
     signals: dict[str, float] = Field(description="The samples held at t.")
     decision: StepResponse | None = Field(
@@ -441,4 +443,4 @@ class TrajectoryItem(Answer):
 
 class Trajectory(Answer):
     items: list[TrajectoryItem]
-    next: None = None
+    next: None = Field(None, description="Always null: a trajectory is one page.")

@@ -20,7 +20,9 @@ from specshield.world.procthor import load_house
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
 MODELS = (HouseMap, GridMap)  # documented by hand
 UPLOAD: TypeAdapter[HouseMap | GridMap] = TypeAdapter(MapUpload)
-MapId = Annotated[Id, Path(description="Id or name of a map.", examples=["case1"])]
+MapId = Annotated[
+    Id, Path(description="Id or name of a map.", openapi_examples={"case1": {"value": "case1"}})
+]
 
 
 @router.post(
@@ -66,7 +68,7 @@ def _from_json(server: Server, content: bytes) -> Map:
 
 
 @router.get("", response_model=MapList, summary="List the maps", responses=problems())
-async def list_maps(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
+async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
     """In order of name and id."""
     found, following = await asyncio.to_thread(server.maps.page, cursor, limit)
     return {"items": [item.to_json() for item in found], "next": following}

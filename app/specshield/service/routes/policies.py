@@ -22,7 +22,9 @@ router = APIRouter(prefix="/v1/policies", tags=["policies"])
 MODELS = (PolicyRequest,)  # documented by hand
 REQUEST = TypeAdapter(PolicyRequest)
 CARD = TypeAdapter(Card)
-PolicyId = Annotated[Id, Path(description="Id or name of a policy.", examples=["case1"])]
+PolicyId = Annotated[
+    Id, Path(description="Id or name of a policy.", openapi_examples={"case1": {"value": "case1"}})
+]
 
 
 @router.post(
@@ -115,7 +117,7 @@ def _show(server: Server, record: Record) -> dict[str, Any]:
 @router.get(
     "", response_model=PolicyList, summary="List the policies", responses=problems(_503="The store is away.")
 )
-async def list_policies(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
+async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
     """In order of name and id."""
 
     def show() -> dict[str, Any]:

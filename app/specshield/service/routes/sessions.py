@@ -23,7 +23,9 @@ from specshield.service.schemas import (
 from specshield.service.state import Cursor, Limit, ServerState, problems
 
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
-SessionId = Annotated[Id, Path(description="Id of a session.", examples=[examples.SESSION["id"]])]
+SessionId = Annotated[
+    Id, Path(description="Id of a session.", openapi_examples={"example": {"value": examples.SESSION["id"]}})
+]
 NDJSON = "application/x-ndjson"
 GONE = {"_404": "No such session; it may have expired.", "_503": "The store is away: try again."}
 
@@ -53,7 +55,7 @@ async def create(request: SessionRequest, server: ServerState) -> Any:
 @router.get(
     "", response_model=SessionList, summary="List the sessions", responses=problems(_503="The store is away.")
 )
-async def list_sessions(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
+async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
     """In order of id; ids that the server makes up are in order of time."""
     found, following = await server.sessions.page(cursor, limit)
     return {"items": found, "next": following}

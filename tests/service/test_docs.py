@@ -1,0 +1,144 @@
+"""The API's description: committed, complete, its examples true, its page there without the internet."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from specshield.service.app import create_app
+from specshield.service.settings import Settings
+
+COMMITTED = Path(__file__).parents[2] / "openapi.json"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def description():
+    return create_app(Settings()).openapi()
+
+
+def operations(description):
+    for path, methods in description["paths"].items():
+        for method, operation in methods.items():
+            yield path, method, operation
+
+
+def test_the_committed_description_is_this_one(description):
+    assert json.loads(COMMITTED.read_text()) == description, "run `make openapi`"
+
+
+def test_every_operation_and_every_field_is_described(description):
+    for path, method, operation in operations(description):
+        assert operation["summary"], (path, method)
+        assert operation["description"], (path, method)
+        for parameter in operation.get("parameters", []):
+            assert parameter["description"], (path, method, parameter["name"])
+        for response in operation["responses"].values():
+            assert response["description"], (path, method)
+    for name, schema in description["components"]["schemas"].items():
+        for field, told in schema.get("properties", {}).items():
+            told_by_type = "const" in told or "$ref" in told or "$ref" in told.get("items", {})
+            assert told_by_type or told.get("description"), f"{name}.{field} is not described"
+
+
+def test_references_lead_somewhere(description):
+    for name in re.findall(r'"#/components/schemas/(\w+)"', json.dumps(description)):
+        assert name in description["components"]["schemas"]
+
+
+ORDER = [  # the way the description says: each example is sent as it stands
+    ("post", "/v1/specs/validate", 200),
+    ("post", "/v1/maps", 201),
+    ("get", "/v1/maps", 200),
+    ("get", "/v1/maps/{map_id}", 200),
+    ("get", "/v1/maps/{map_id}/image.png", 200),
+    ("post", "/v1/policies", 503),  # no worker here; with one it is 202
+    ("get", "/v1/policies", 200),
+    ("get", "/v1/policies/{policy_id}", 200),
+    ("delete", "/v1/policies/{policy_id}", 409),  # it came with the server
+    ("post", "/v1/sessions", 201),
+    ("get", "/v1/sessions", 200),
+    ("get", "/v1/sessions/{session_id}", 200),
+    ("post", "/v1/sessions/{session_id}/steps", 200),
+    ("post", "/v1/sessions/{session_id}/close", 200),
+    ("get", "/v1/sessions/{session_id}/trajectory", 200),
+    ("delete", "/v1/sessions/{session_id}", 204),
+    ("get", "/livez", 200),
+    ("get", "/readyz", 200),
+    ("get", "/metrics", 200),
+]
+
+
+def test_the_examples_work_as_they_stand(server, description):
+    assert {(method, path) for method, path, _ in ORDER} == {(m, p) for p, m, _ in operations(description)}
+    with httpx.Client(base_url=server.url, timeout=20.0) as client:
+        for method, path, status in ORDER:
+            operation = description["paths"][path][method]
+            filled = path.format(**examples_of(operation))
+            response = client.request(method, filled, json=body_of(operation, description))
+            assert response.status_code == status, (method, path, response.text)
+            if status == 200 and response.headers["content-type"] == "application/json":
+                documented = operation["responses"]["200"]["content"]["application/json"]["schema"]["$ref"]
+                fields = description["components"]["schemas"][documented.rsplit("/", 1)[1]]["properties"]
+                assert set(response.json()) <= set(fields)
+
+
+def examples_of(operation):
+    """Of the parameters in the path."""
+    return {
+        parameter["name"]: next(iter(parameter["examples"].values()))["value"]
+        for parameter in operation.get("parameters", [])
+        if parameter["in"] == "path"
+    }
+
+
+def body_of(operation, description):
+    if "requestBody" not in operation:
+        return None
+    content = operation["requestBody"]["content"]["application/json"]
+    if "example" in content:
+        return content["example"]
+    return description["components"]["schemas"][content["schema"]["$ref"].rsplit("/", 1)[1]]["examples"][0]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
+def test_the_page_is_there_without_the_internet(server, tmp_path):
+    """A browser that can resolve no name but the server's draws the page."""
+    picture = tmp_path / "docs.png"
+    page = subprocess.run(
+        [
+            CHROMIUM,
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+            f"--user-data-dir={tmp_path / 'profile'}",
+            "--window-size=1200,2400",
+            "--virtual-time-budget=10000",
+            f"--screenshot={picture}",
+            "--dump-dom",
+            f"{server.url}/docs",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    for shown in ("/v1/sessions/{session_id}/steps", "Decide one step", "Check a formula"):
+        assert shown in page.stdout.replace("​", ""), page.stderr[-2000:]
+    drawn = np.asarray(Image.open(picture).convert("L"))
+    assert (drawn < 128).mean() > 0.005  # text
+    assert len(np.unique(drawn)) > 50
+
+
+def test_the_page_asks_nobody_else(server):
+    page = httpx.get(f"{server.url}/docs").text
+    for link in re.findall(r'(?:src|href)="([^"]+)"', page):
+        assert link.startswith("/"), link
+        assert httpx.get(server.url + link).status_code == 200
