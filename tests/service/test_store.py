@@ -190,3 +190,16 @@ def test_the_key_opens_what_it_should(tmp_path):
                 assert (response.status_code, response.json()["type"]) == (401, "unauthorized")
                 assert response.headers["www-authenticate"] == "Bearer"
         assert client.get("/v1/sessions", headers={"Authorization": "Bearer s3cret"}).status_code == 200
+
+
+def test_a_server_that_fails_says_no_more_than_that(tmp_path):
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=10.0) as client:
+        session = begin(client)
+        with redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket")) as connection:
+            connection.hset(f"specshield:{{{session['id']}}}:session", "state", "broken")
+        response = client.get(f"/v1/sessions/{session['id']}")
+        assert (response.status_code, response.json()["type"]) == (500, "internal-error")
+        assert response.headers["content-type"] == "application/problem+json"
+        assert "JSONDecodeError" not in response.text
+        wait_for(lambda: "JSONDecodeError" in server.log.read_text(), 5.0)
+        assert client.get("/readyz").status_code == 200

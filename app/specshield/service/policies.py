@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from specshield.errors import FormulaError, NotFound, PolicyError, SpecshieldError
-from specshield.policy.policy import Policy, load_policy, policy_id
+from specshield.policy.load import load_policy
+from specshield.policy.policy import Proposer, policy_id
 from specshield.robot import robot_from_json
 from specshield.service import files
 from specshield.service.maps import Maps
@@ -56,7 +57,7 @@ class Policies:
         self._max_horizon = settings.max_horizon
         self._folder = settings.data_dir / "policies"
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._recent = files.Recent[Policy](KEPT_IN_MEMORY)
+        self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
         self._named = {record.name: record for record in self._shipped()}
 
     def record(self, key: str) -> Record:
@@ -95,11 +96,11 @@ class Policies:
         except SpecshieldError as error:
             raise error.at("spec") from None
 
-    def policy(self, record: Record) -> Policy:
+    def policy(self, record: Record) -> Proposer:
         """The trained policy. Raises PolicyError where it is not ready."""
         return self._recent.get(record.id, lambda: self._load(record))
 
-    def _load(self, record: Record) -> Policy:
+    def _load(self, record: Record) -> Proposer:
         if record.card is None:
             raise PolicyError(
                 f"policy {record.id} is not ready", path="policy_id", got=record.id, expected="status ready"

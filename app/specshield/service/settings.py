@@ -14,7 +14,9 @@ REPOSITORY = Path(__file__).resolve().parents[3]
 class Settings(BaseSettings):
     """Environment variables: the field names in upper case after `SPECSHIELD_`, and `REDIS_URL`."""
 
-    model_config = SettingsConfigDict(env_prefix="SPECSHIELD_", frozen=True, extra="ignore")
+    model_config = SettingsConfigDict(
+        env_prefix="SPECSHIELD_", frozen=True, extra="ignore", env_ignore_empty=True
+    )
 
     data_dir: Path = Field(
         default=Path("data"), description="Uploaded maps, trained policies and the embedded store."

@@ -1,0 +1,1 @@
+"""The HTTP service: routes over sessions, maps, policies and training jobs."""
