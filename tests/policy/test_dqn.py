@@ -9,8 +9,8 @@ from tests.policy.rooms import flat
 
 from specshield.errors import FragmentError, PolicyError
 from specshield.policy.dqn import Progress, Stopped, _Run, measure, train
+from specshield.policy.load import load_policy
 from specshield.policy.network import NAMES
-from specshield.policy.policy import load_policy
 from specshield.policy.settings import Settings, options_of, read_settings
 
 TASK = flat("F[0,30] West and G[0,30] not Hole")

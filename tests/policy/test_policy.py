@@ -10,8 +10,9 @@ from tests.policy.rooms import CUSTOM, flat, random_policy, random_weights, size
 from specshield.errors import PolicyError
 from specshield.policy.dqn import _QNetwork
 from specshield.policy.environment import Environment, free_poses
+from specshield.policy.load import load_policy
 from specshield.policy.network import greedy, make_network
-from specshield.policy.policy import load_policy, policy_id, wait_motion
+from specshield.policy.policy import policy_id, wait_motion
 from specshield.policy.progress import BROKEN, SETTLED, make_rules, replay
 from specshield.policy.rollout import rollout
 from specshield.robot import STRETCH

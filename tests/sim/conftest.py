@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from specshield.policy.policy import load_policy
+from specshield.policy.load import load_policy
 from specshield.shield.episode import make_shield
 from specshield.sim.cases import MODELS, case_names, load_case
 

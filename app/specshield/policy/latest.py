@@ -1,12 +1,15 @@
 """The latest feasible time: one number a pose and progress from which a formula can still be satisfied.
 
-Where the robot can wait and no `always` begins or ends within the horizon, feasibility is monotone in time: what can
+Where the robot can wait and no `always` begins or ends within the horizon, feasibility is monotone in time:
+what can
 be done from time t can be done from any earlier one, by waiting. So with p the set of settled goals
 
     L(s, p) = max( max_a L(f(s, a), p) - 1,   max_J m(s, p, J) )          J: goals to settle by waiting at s
 
-m(s, p, J) is the latest time from which waiting at s settles all of J and leaves L(s, p + J) ahead: for F[a,b] at most
-b, with L >= a; for F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, at most c1 + c2 and L - n + 1, with L >= a + b.
+m(s, p, J) is the latest time from which waiting at s settles all of J and leaves L(s, p + J) ahead: for
+F[a,b] at most
+b, with L >= a; for F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, at most c1 + c2 and L - n + 1, with L
+>= a + b.
 Backward dynamic programming, by in-place semi-Lagrangian sweeps (values off the lattice bilinear).
 """
 

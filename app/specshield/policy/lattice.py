@@ -1,6 +1,8 @@
-"""The lattice that reachability is computed on: poses at the crossings of x, y and heading, and where f leads from each.
+"""The lattice that reachability is computed on: poses at the crossings of x, y and heading, and where f
+leads from each.
 
-f leaves the lattice at once (6 degree headings, 0.2 m moves, contact), so values off it are interpolated, and what the
+f leaves the lattice at once (6 degree headings, 0.2 m moves, contact), so values off it are interpolated,
+and what the
 tables say is a proposal: only exact simulation certifies.
 """
 
@@ -23,9 +25,11 @@ MAX_POSES = 40_000_000
 class Lattice(NamedTuple):
     """Poses [ny, nx, H] in the grid frame, spaced `pitch` [m] and 2 pi / H.
 
-    valid: the footprint is free and every `always` that lasts the whole horizon holds.
-    far_u, far_v [ny, nx, H, D]: where each of the D translating motions leads, in cells of the lattice (-1: nowhere
-    else); far_h: with which heading. turns [ny, nx, H, R]: whether each turn is possible; shift [R]: by how many headings.
+    valid: the footprint is free and every lasting `always` holds.
+    far_u, far_v [ny, nx, H, D]: where each of the D translating motions leads, in cells of the lattice (-1:
+    nowhere
+    else); far_h: with which heading. turns [ny, nx, H, R]: whether each turn is possible; shift [R]: by how
+    many headings.
     """
 
     pitch: float
@@ -48,15 +52,17 @@ def heading_count(rotations: list[float]) -> int:
     return 72
 
 
-def make_lattice(body: Body, rules: Rules, pitch: float, horizon: int) -> Lattice:
-    """Simulates every motion from every pose of the lattice once."""
+def make_lattice(body: Body, rules: Rules, pitch: float, end: int) -> Lattice:
+    """Simulates every motion from every pose of the lattice once. An `always` on [0, b] with b >= end is
+    lasting.
+    """
     height, width = body.occupied.shape
-    ny, nx = (max(int(math.ceil(n * body.resolution / pitch - 1e-9)), 1) for n in (height, width))
+    ny, nx = (max(math.ceil(n * body.resolution / pitch - 1e-9), 1) for n in (height, width))
     headings = heading_count([float(r) for r in body.rotate if r != 0.0])
     moving = np.flatnonzero(body.translate != 0.0)
     turning = np.flatnonzero((body.translate == 0.0) & (body.rotate != 0.0))
     shape = (ny, nx, headings)
-    lasting = (rules.kind == ALWAYS) & (rules.a == 0) & (rules.b >= horizon)
+    lasting = (rules.kind == ALWAYS) & (rules.a == 0) & (rules.b >= end)
     lattice = Lattice(
         pitch=pitch,
         headings=headings,
@@ -66,7 +72,7 @@ def make_lattice(body: Body, rules: Rules, pitch: float, horizon: int) -> Lattic
         far_h=np.zeros((*shape, len(moving)), np.int16),
         turns=np.zeros((*shape, len(turning)), np.uint8),
         shift=np.array([round(body.rotate[m] * headings / (2.0 * math.pi)) for m in turning], np.int64),
-        reach=int(math.ceil(float(np.max(np.abs(body.translate))) / pitch)) + 1,
+        reach=math.ceil(float(np.max(np.abs(body.translate))) / pitch) + 1,
     )
     _simulate_all(body, rules, lattice, moving, turning, lasting)
     return lattice
@@ -125,7 +131,7 @@ def _simulate_all(
                     if nx_ != x or ny_ != y or nth != theta:
                         v, u, w = coordinates(body, lattice.pitch, headings, nx_, ny_, nth)
                         lattice.far_u[j, i, h, d], lattice.far_v[j, i, h, d] = u, v
-                        lattice.far_h[j, i, h, d] = int(round(w)) % headings
+                        lattice.far_h[j, i, h, d] = round(w) % headings
                 for r in range(turning.shape[0]):
                     _, _, nth = step(body, x, y, theta, turning[r])
                     lattice.turns[j, i, h, r] = nth != theta

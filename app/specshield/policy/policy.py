@@ -148,20 +148,17 @@ def task_spec(task: Task) -> dict[str, Any]:
     return spec | ({"signals": dict(task.signals)} if task.signals else {})
 
 
-def load_policy(weights: bytes, card: Card, task: Task) -> Policy:
-    """A policy from its two files, for the task it was made for.
+def load_dqn(weights: bytes, card: Card, task: Task) -> Policy:
+    """A policy from its two files. Raises PolicyError where the weights do not fit the task."""
+    body, rules = make_body(task.robot, task.grid), make_rules(task)
+    inputs, outputs = observation_size(rules, body), len(body.translate)
+    return Policy(task, card, make_network(read_tensors(weights), inputs, outputs))
 
-    Raises PolicyError where the card names another task, or the weights are not a network that fits it.
-    """
-    if card.get("task_hash") != task.content_hash:
-        raise PolicyError(
-            "the policy was made for another task", path="card.task_hash", got=card.get("task_hash"),
-            expected=task.content_hash,
-        )  # fmt: skip
-    if card.get("method") != "dqn":
-        raise PolicyError("unknown method", path="card.method", got=card.get("method"), expected="'dqn'")
+
+def read_tensors(weights: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of a safetensors file. Raises PolicyError for any other bytes."""
     try:
-        tensors = load_tensors(weights)
+        return load_tensors(weights)
     except Exception as error:  # the parser raises its own types for hostile bytes
         raise PolicyError(
             f"not a safetensors file: {error}",
@@ -169,5 +166,3 @@ def load_policy(weights: bytes, card: Card, task: Task) -> Policy:
             got=f"{len(weights)} bytes",
             expected="safetensors",
         ) from error
-    body, rules = make_body(task.robot, task.grid), make_rules(task)
-    return Policy(task, card, make_network(tensors, observation_size(rules, body), len(body.translate)))

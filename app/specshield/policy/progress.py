@@ -177,7 +177,9 @@ def replay(
 
 @njit(cache=True, nogil=True)
 def forgive(rules: Rules, t: int, status: NDArray[np.int8]) -> None:
-    """What is broken at step t and what a policy goes on with: an `always` holds again from t + 1, the rest is dropped."""
+    """What is broken at step t and what a policy goes on with: an `always` holds again from t + 1, the rest
+    is dropped.
+    """
     for k in range(rules.kind.shape[0]):
         if status[k] == BROKEN:
             again = rules.kind[k] == ALWAYS and rules.b[k] > t

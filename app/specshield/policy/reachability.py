@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from specshield.errors import FragmentError, PolicyError
 from specshield.policy.latest import latest_times, masks_of
 from specshield.policy.lattice import MAX_POSES, heading_count, holds_at, make_lattice
-from specshield.policy.policy import Card, Proposal, make_card, wait_motion
+from specshield.policy.policy import Card, Proposal, make_card, read_tensors, wait_motion
 from specshield.policy.progress import (
     ALWAYS,
     MAX_OBLIGATIONS,
@@ -113,19 +112,21 @@ class ReachabilityPolicy:
 
     def weights(self) -> bytes:
         """The safetensors file."""
-        return save_tensors({"cell": self.tables.cell, "code": self.tables.code, "index": self.tables.index})
+        return save_tensors({"cell": self.tables.cell, "code": self.tables.code, "table": self.tables.table})
 
 
 def synthesise(
     task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
 ) -> ReachabilityPolicy:
-    """Makes the tables. Raises FragmentError for a formula or robot they do not cover, PolicyError for a map too large."""
+    """Makes the tables. Raises FragmentError for a formula or robot they do not cover, PolicyError for a
+    map too large.
+    """
     began = time.perf_counter()
     settings = settings or Settings()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     goals = _check(task, rules)
     _check_size(task, settings)
-    lattice = make_lattice(body, rules, settings.pitch, task.horizon)
+    lattice = make_lattice(body, rules, settings.pitch, _end(rules, goals))
     masks = masks_of(rules, goals)
     latest = latest_times(lattice, rules, holds_at(body, rules, lattice), goals, masks, task.horizon)
     tables = _pack(lattice.valid, latest, masks, goals, len(rules.kind), settings.pitch)
@@ -145,34 +146,31 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
     rules = make_rules(task)
     goals = _check(task, rules)
     _check_size(task, settings)
-    try:
-        tensors = load_tensors(weights)
-    except Exception as error:  # the parser raises its own types for hostile bytes
-        raise PolicyError(
-            f"not a safetensors file: {error}", path="weights", expected="safetensors"
-        ) from error
-    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "index": (np.int32, 1)}
+    tensors = read_tensors(weights)
+    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 1)}
     for name, (dtype, rank) in wanted.items():
         array = tensors.get(name)
         if array is None or array.dtype != dtype or array.ndim != rank:
             raise PolicyError(
                 f"the table {name!r} is missing or of another kind", path=f"weights.{name}",
-                got=None if array is None else f"{array.dtype} {list(array.shape)}", expected=f"{dtype.__name__}, rank {rank}",
+                got=None if array is None else f"{array.dtype} {list(array.shape)}",
+                expected=f"{dtype.__name__}, rank {rank}",
             )  # fmt: skip
-    cell, code, index = tensors["cell"], tensors["code"], tensors["index"]
+    cell, code, table = tensors["cell"], tensors["code"], tensors["table"]
     shape, headings = _shape(task, settings)
     fits = (
-        cell.shape == shape and code.shape[2] == headings and index.shape == (1 << len(goals),)
+        cell.shape == shape and code.shape[2] == headings and table.shape == (1 << len(goals),)
         and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
-        and index.min() >= -1 and index.max() < code.shape[0]
+        and table.min() >= -1 and table.max() < code.shape[0]
     )  # fmt: skip
     if not fits:
         raise PolicyError(
-            "the tables do not fit the task", path="weights", got=[list(cell.shape), list(code.shape), list(index.shape)],
-            expected=f"cell {list(shape)}, code [tables, cells, {headings}], index [{1 << len(goals)}]",
+            "the tables do not fit the task", path="weights",
+            got=[list(cell.shape), list(code.shape), list(table.shape)],
+            expected=f"cell {list(shape)}, code [tables, cells, {headings}], table [{1 << len(goals)}]",
         )  # fmt: skip
     tables = Tables(
-        np.ascontiguousarray(cell), np.ascontiguousarray(code), np.ascontiguousarray(index),
+        np.ascontiguousarray(cell), np.ascontiguousarray(code), np.ascontiguousarray(table),
         _bits(goals, len(rules.kind)), settings.pitch,
     )  # fmt: skip
     return ReachabilityPolicy(task, card, settings, tables)
@@ -190,14 +188,20 @@ def _check(task: Task, rules: Rules) -> NDArray[np.int64]:
             expected="an action with translate 0 and rotate 0; or method 'dqn'",
         )  # fmt: skip
     goals = np.flatnonzero(rules.kind != ALWAYS)
-    end = int(rules.last[goals].max()) if len(goals) else 0
+    end = _end(rules, goals)
     for k in np.flatnonzero(rules.kind == ALWAYS):
         if rules.a[k] > 0 or rules.b[k] < end:
             raise FragmentError(
-                "reachability does not cover a G that begins late or ends before another window", path="formula",
-                got=f"G[{rules.a[k]},{rules.b[k]}]", expected=f"G[0,b] with b >= {end}; or method 'dqn'",
+                "reachability does not cover a G that begins late or ends before another window",
+                path="formula", got=f"G[{rules.a[k]},{rules.b[k]}]",
+                expected=f"G[0,b] with b >= {end}; or method 'dqn'",
             )  # fmt: skip
     return goals
+
+
+def _end(rules: Rules, goals: NDArray[np.int64]) -> int:
+    """The step by which every goal is decided."""
+    return int(rules.last[goals].max()) if len(goals) else 0
 
 
 def _shape(task: Task, settings: Settings) -> tuple[tuple[int, int], int]:
@@ -238,10 +242,10 @@ def _pack(
         n for n, mask in enumerate(masks) if mask != (1 << len(goals)) - 1
     ]  # with every goal settled: no table
     code = np.zeros((len(kept), int(used.sum()), valid.shape[2]), np.uint16)
-    index = np.full(1 << len(goals), -1, np.int32)
+    table = np.full(1 << len(goals), -1, np.int32)
     for row, n in enumerate(kept):
         values = latest[n][used]
         code[row] = np.where(values >= 0.0, 1.0 + np.floor(SCALE * values), 0.0).astype(np.uint16)
         code[row][valid[used] == 0] = INVALID
-        index[masks[n]] = row
-    return Tables(cell, code, index, _bits(goals, obligations), pitch)
+        table[masks[n]] = row
+    return Tables(cell, code, table, _bits(goals, obligations), pitch)

@@ -1,6 +1,8 @@
-"""Continuations out of the tables of latest feasible times: greedily, and by a small beam where slack is small.
+"""Continuations out of the tables of latest feasible times: greedily, and by a small beam where slack is
+small.
 
-The tables propose, exact simulation decides: every pose here comes from f, every settled obligation from its predicate.
+The tables propose, exact simulation decides: every pose here comes from f, every settled obligation from
+its predicate.
 """
 
 from __future__ import annotations
@@ -38,20 +40,23 @@ class Tables(NamedTuple):
     """Latest feasible times, stored over the cells that have a valid pose.
 
     cell [ny, nx]: row of `code`, -1 where no pose is valid. code [P, cells, H]: INVALID, 0 for never, else
-    1 + SCALE * L. index [2^G]: which table a set of settled goals has, -1 if it has none. bit [K]: the obligation's bit
+    1 + SCALE * L. table [2^G]: which table a set of settled goals has, -1 if it has none. bit [K]: the
+    obligation's bit
     in that set, 0 for an `always`.
     """
 
     cell: NDArray[np.int32]
     code: NDArray[np.uint16]
-    index: NDArray[np.int32]
+    table: NDArray[np.int32]
     bit: NDArray[np.int64]
     pitch: float
 
 
 @njit(cache=True, nogil=True)
 def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float:
-    """L at lattice coordinates: linear in x, y and heading over the corners that are valid; HOPELESS where none is."""
+    """L at lattice coordinates: linear in x, y and heading over the corners that are valid; HOPELESS where
+    none is.
+    """
     ny, nx = tables.cell.shape
     headings = tables.code.shape[2]
     j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
@@ -91,7 +96,9 @@ def slack(
     status: NDArray[np.int8],
     run: NDArray[np.int64],
 ) -> float:
-    """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something is broken."""
+    """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something
+    is broken.
+    """
     mask, every = 0, 0
     for k in range(status.shape[0]):
         if status[k] == BROKEN:
@@ -103,11 +110,11 @@ def slack(
         return SAFE
     v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
     best = HOPELESS
-    if tables.index[mask] >= 0:
-        best = latest_at(tables, tables.index[mask], v, u, h) - t
+    if tables.table[mask] >= 0:
+        best = latest_at(tables, tables.table[mask], v, u, h) - t
     for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
-            ahead = tables.index[mask | tables.bit[k]]
+            ahead = tables.table[mask | tables.bit[k]]
             if ahead >= 0:
                 left = rules.b[k] - rules.c2[k] + 1 - run[k]
                 best = max(best, latest_at(tables, ahead, v, u, h) - t - left)
@@ -135,12 +142,14 @@ def _score(
     wait: int,
     scores: NDArray[np.float64],
 ) -> None:
-    """L after each motion (M,), contact and the step's own progress left out: a cheap order to try motions in."""
+    """L after each motion (M,), contact and the step's own progress left out: a cheap order to try motions
+    in.
+    """
     mask = 0
     for k in range(status.shape[0]):
         if status[k] == SETTLED:
             mask |= tables.bit[k]
-    table = tables.index[mask]
+    table = tables.table[mask]
     headings = tables.code.shape[2]
     v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
     grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
@@ -153,7 +162,7 @@ def _score(
         scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w) if table >= 0 else HOPELESS
     for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
-            ahead = tables.index[mask | tables.bit[k]]
+            ahead = tables.table[mask | tables.bit[k]]
             if ahead >= 0:
                 left = rules.b[k] - rules.c2[k] + 1 - run[k]
                 scores[wait] = max(scores[wait], latest_at(tables, ahead, v, u, h) - left + 1.0)
@@ -175,7 +184,8 @@ def greedy(
 ) -> tuple[bool, float]:
     """Follows the latest feasible time uphill from (x_t, t) to the horizon, after the motion `first`.
 
-    status, run (K,): progress after x_t, left as they are. Writes motions (T - t,), poses (T - t, 3). Returns whether
+    status, run (K,): progress after x_t, left as they are. Writes motions (T - t,), poses (T - t, 3).
+    Returns whether
     every goal was settled and nothing broken, and the slack after the first motion.
     """
     k_count, steps = status.shape[0], motions.shape[0]
@@ -244,18 +254,15 @@ def greedy(
 def _pays_to_wait(rules: Rules, t: int, predicates: NDArray[np.float64], status: NDArray[np.int8]) -> bool:
     """Whether a goal that holds here is still to open, or a dwell to go on."""
     for k in range(status.shape[0]):
-        if rules.kind[k] != ALWAYS and status[k] == PENDING and predicates[k] > rules.margin:
-            if rules.kind[k] == EVENTUALLY_ALWAYS or rules.a[k] > t:
-                return True
+        useful = rules.kind[k] == EVENTUALLY_ALWAYS or (rules.kind[k] != ALWAYS and rules.a[k] > t)
+        if useful and status[k] == PENDING and predicates[k] > rules.margin:
+            return True
     return False
 
 
 @njit(cache=True, nogil=True)
 def _is_broken(status: NDArray[np.int8]) -> bool:
-    for k in range(status.shape[0]):
-        if status[k] == BROKEN:
-            return True
-    return False
+    return bool(np.any(status == BROKEN))
 
 
 @njit(cache=True, nogil=True)
@@ -276,7 +283,8 @@ def beam(
 ) -> bool:
     """Keeps the `width` poses with the most slack at every step; True once one has settled every goal.
 
-    band: poses with less slack than this are given up. Other arguments as `greedy`; motions and poses are written only on success.
+    band: poses with less slack than this are given up. Other arguments as `greedy`; motions and poses are
+    written only on success.
     """
     k_count, m_count, steps = status.shape[0], body.translate.shape[0], motions.shape[0]
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(k_count)
@@ -400,9 +408,11 @@ def propose_all(
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> int:
-    """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); the motion of most slack.
+    """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); the motion of most
+    slack.
 
-    The beam is tried where the greedy one fails and the table sees at least `band` steps of slack (it errs a little).
+    The beam is tried where the greedy one fails and the table sees at least `band` steps of slack (it errs
+    a little).
     """
     best, best_slack = wait, -np.inf
     for m in range(motions.shape[0]):

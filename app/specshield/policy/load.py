@@ -1,0 +1,32 @@
+"""Reading back a policy of any method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from specshield.errors import PolicyError
+from specshield.policy.policy import Card, Proposer, load_dqn
+from specshield.policy.reachability import load_reachability
+from specshield.task import Task
+
+READERS: dict[str, Callable[[bytes, Card, Task], Proposer]] = {
+    "dqn": load_dqn,
+    "reachability": load_reachability,
+}
+
+
+def load_policy(weights: bytes, card: Card, task: Task) -> Proposer:
+    """A policy from its two files, for the task it was made for. Raises PolicyError where they do not fit."""
+    if card.get("task_hash") != task.content_hash:
+        raise PolicyError(
+            "the policy was made for another task",
+            path="card.task_hash",
+            got=card.get("task_hash"),
+            expected=task.content_hash,
+        )
+    read = READERS.get(str(card.get("method")))
+    if read is None:
+        raise PolicyError(
+            "unknown method", path="card.method", got=card.get("method"), expected=f"one of {sorted(READERS)}"
+        )
+    return read(weights, card, task)
