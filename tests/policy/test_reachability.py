@@ -1,0 +1,107 @@
+"""Reachability: the exact feasible set where every future can be tried, and refusals where it does not reach."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.oracles.cells import MOTIONS, Cells
+
+from specshield.errors import FragmentError, PolicyError
+from specshield.policy.load import load_policy
+from specshield.policy.reachability import Settings, read_settings, synthesise
+from specshield.robot import STRETCH, robot_from_json
+from specshield.shield.episode import decide, make_shield
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+
+WORLDS = {
+    "in turn, with a forbidden cell": Cells(
+        "F[0,4] A and F[4,7] B and G[0,7] not C",
+        lambda s: s["A"][..., :5].any(-1) & s["B"][..., 4:].any(-1) & ~s["C"].any(-1),
+        {"A": (1, 0), "B": (0, 1), "C": (0, 2)},
+    ),
+    "overlapping windows, in either order": Cells(
+        "F[1,5] A and F[2,7] B",
+        lambda s: s["A"][..., 1:6].any(-1) & s["B"][..., 2:].any(-1),
+        {"A": (0, 0), "B": (0, 2)},
+    ),
+    "one visit that serves two": Cells(
+        "F[0,4] (A or B) and F[4,7] A",
+        lambda s: (s["A"] | s["B"])[..., :5].any(-1) & s["A"][..., 4:].any(-1),
+        {"A": (2, 0), "B": (0, 2)},
+    ),
+    "a dwell, then away": Cells(
+        "F[1,3] G[1,3] A and F[6,7] B",
+        lambda s: (
+            np.any([s["A"][..., k + 1 : k + 4].all(-1) for k in range(1, 4)], axis=0)
+            & s["B"][..., 6:].any(-1)
+        ),
+        {"A": (2, 2), "B": (2, 1)},
+    ),
+    "a dwell that serves a visit too": Cells(
+        "F[0,3] G[0,3] (A or B) and F[2,5] A",
+        lambda s: (
+            np.any([(s["A"] | s["B"])[..., k : k + 4].all(-1) for k in range(4)], axis=0)
+            & s["A"][..., 2:6].any(-1)
+        ),
+        {"A": (2, 2), "B": (2, 0)},
+    ),
+}
+
+
+@pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
+def test_s_t_is_the_exact_feasible_set_where_it_can_be_enumerated(cells):
+    """On a lattice that f never leaves, every pose at every step of random ways: none claimed falsely, none missed."""
+    shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
+    random, seen = np.random.default_rng(2), set()
+    for i, j, heading in [(i, j, h) for i, j in ((0, 0), (0, 1), (2, 1), (2, 2), (4, 2)) for h in range(4)]:
+        history, carry = [cells.pose(i, j, heading)], None
+        for _ in range(cells.task.horizon):
+            expected = cells.feasible(history)
+            decision = decide(shield, history, np.zeros(5), carry=carry)
+            if decision.mode in ("shaped", "fallback"):
+                assert decision.j_values[:MOTIONS] == tuple(expected.astype(float))
+                seen.add(tuple(expected))
+            likely = (
+                np.flatnonzero(expected) if expected.any() and random.random() < 0.8 else np.arange(MOTIONS)
+            )
+            motion = int(random.choice(likely))
+            history, carry = [*history, decision.next_poses[motion]], decision.carry
+    assert len(seen) > 3
+
+
+def test_a_policy_comes_back_from_its_files_as_it_was():
+    task = WORLDS["in turn, with a forbidden cell"].task
+    policy = synthesise(task, Settings(pitch=0.2))
+    again = load_policy(policy.weights(), policy.card, task)
+    history = np.array([[0.1, 0.1, 0.0]])
+    ours, theirs = policy.propose(history, {}, 0.0), again.propose(history, {}, 0.0)
+    np.testing.assert_array_equal(ours.motions, theirs.motions)
+    np.testing.assert_array_equal(ours.poses, theirs.poses)
+    assert synthesise(task, Settings(pitch=0.2)).weights() == policy.weights()
+    assert policy.id != synthesise(task, Settings(pitch=0.1)).id
+    for options in ({"pitch": 0.1}, {"pitch": 0.2, "beam": 0}, {"pitch": "fine"}):
+        with pytest.raises(PolicyError):
+            load_policy(policy.weights(), {**policy.card, "options": options}, task)
+    with pytest.raises(PolicyError, match="safetensors"):
+        load_policy(policy.weights()[:-9], policy.card, task)
+
+
+def test_what_the_tables_do_not_cover_is_refused():
+    regions = {"A": {"type": "circle", "center": [0.5, 0.5], "radius": 0.2}}
+    grid = OccupancyGrid(np.zeros((20, 20), bool), 0.1)
+    with pytest.raises(FragmentError, match="begins late"):
+        synthesise(make_task(grid, STRETCH, "F[0,9] A and G[3,9] x > 0.2", regions))
+    with pytest.raises(FragmentError, match="ends before"):
+        synthesise(make_task(grid, STRETCH, "F[0,9] A and G[0,5] x > 0.2", regions))
+    with pytest.raises(FragmentError, match="too many"):
+        synthesise(make_task(grid, STRETCH, " and ".join(f"F[0,{k}] A" for k in range(1, 10)), regions))
+    restless = robot_from_json({"footprint": {"radius": 0.1}, "actions": [{"name": "go", "translate": 0.1}]})
+    with pytest.raises(FragmentError, match="wait"):
+        synthesise(make_task(grid, restless, "F[0,9] A", regions))
+    with pytest.raises(PolicyError, match="options.pitch|not in range") as caught:
+        read_settings({"pitch": 0})
+    assert caught.value.path == "options.pitch"
+    huge = OccupancyGrid(np.zeros((1000, 1000), bool), 0.05)
+    with pytest.raises(PolicyError, match="too large"):
+        synthesise(make_task(huge, STRETCH, "F[0,9] A", regions), Settings(pitch=0.05))
