@@ -92,6 +92,16 @@ def test_a_path_too_long_for_a_socket_is_said_to_be(tmp_path):
         EmbeddedStore(tmp_path / ("x" * 100))
 
 
+def test_a_store_whose_file_is_spoiled_is_reported(tmp_path):
+    embedded = EmbeddedStore(tmp_path)
+    embedded.join()
+    embedded.leave()
+    (base,) = (tmp_path / "store" / "appendonlydir").glob("*.manifest")
+    base.write_text("spoiled")
+    with pytest.raises(StoreError, match=r"store\.log"):
+        EmbeddedStore(tmp_path).join()
+
+
 def test_two_servers_share_one_store_and_one_step_has_one_answer(tmp_path):
     with (
         serving(tmp_path) as one,
@@ -115,7 +125,10 @@ def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_superv
             for body in [STEP] * 8
         ]
         assert len(set(answers)) == 1
-        assert 'specshield_decisions_total{mode="shaped"} 1.0' in httpx.get(f"{server.url}/metrics").text
+        told = httpx.get(f"{server.url}/metrics").text
+        assert 'specshield_decisions_total{mode="shaped"} 1.0' in told
+        route = 'method="POST",route="/v1/sessions/{session_id}/steps",status="200"'
+        assert f"specshield_requests_total{{{route}}} 8.0" in told
         pids = [store_pid(tmp_path), *children(server.process.pid)]
         assert len(pids) >= 3
         server.kill()

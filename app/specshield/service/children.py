@@ -73,6 +73,7 @@ async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None) ->
                 worker.ensure()
         except (SpecshieldError, OSError) as error:
             log.error("%s", error)
+            await asyncio.sleep(2.0)
         await asyncio.sleep(CHECK_EVERY)
 
 

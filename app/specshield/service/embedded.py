@@ -19,6 +19,7 @@ from pathlib import Path
 from specshield.errors import StoreError
 from specshield.service import keeper
 
+TRIES = 5  # a store on its way out may take one or two
 START_TIMEOUT = 60.0  # seconds; an append-only file of a gigabyte loads in a few
 
 
@@ -48,12 +49,13 @@ class EmbeddedStore:
         lock = os.open(self.folder / "start.lock", os.O_RDWR | os.O_CREAT, 0o600)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            deadline = time.monotonic() + START_TIMEOUT
+            deadline, tries = time.monotonic() + START_TIMEOUT, 0
             while not (self.joined() and self._answers()):
                 if not self.joined():
+                    tries += 1
                     self._open()
-                if time.monotonic() > deadline:
-                    raise StoreError(f"the embedded store does not answer; see {self.folder / 'store.log'}")
+                if tries > TRIES or time.monotonic() > deadline:
+                    raise StoreError(f"the embedded store does not start; see {self.folder / 'store.log'}")
                 time.sleep(0.005)
         finally:
             os.close(lock)

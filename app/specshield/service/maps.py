@@ -58,7 +58,7 @@ class Maps:
         self._folder, self._limit = settings.data_dir / "maps", settings.max_maps
         self._folder.mkdir(parents=True, exist_ok=True)
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
-        self._named = {found.name: found for found in _shipped(settings.maps_dir)}
+        self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
 
     def get(self, key: str) -> Map:
         """By id, by the name of one that came with the server, or by the hash of the grid alone, which is
@@ -84,18 +84,26 @@ class Maps:
         except NotFound:
             files.check_room(self._folder, self._limit, "maps")
         text, image = dump_map(grid)
-        meta = files.to_json({"grid": grid.content_hash, "rooms": _rooms_json(rooms)})
+        made = Map(id, grid, rooms)
+        meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
         files.write_folder(self._folder / id, {"map.yaml": text.encode(), "map.pgm": image, "map.json": meta})
-        return self._recent.get(id, lambda: Map(id, grid, rooms))
+        return self._recent.get(id, lambda: made)
 
-    def page(self, after: str | None, limit: int) -> tuple[list[Map], str | None]:
-        keys, following = files.page([*map(str, self._named), *files.ids(self._folder)], after, limit)
-        return [self.get(key) for key in keys], following
+    def page(self, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
+        """As JSON, since that is there without reading the cells."""
+        keys, following = files.page([*self._named, *files.ids(self._folder)], after, limit)
+        return [self._shown(key) for key in keys], following
+
+    def _shown(self, key: str) -> dict[str, Any]:
+        if key in self._named:
+            return self._named[key].to_json()
+        shown: dict[str, Any] = files.read_json(self._folder / key / "map.json")["shown"]
+        return shown
 
     def _read(self, id: str) -> Map:
         folder = self._folder / id
         grid = load_map((folder / "map.yaml").read_text(), (folder / "map.pgm").read_bytes())
-        return Map(id, grid, parse_regions(files.read_json(folder / "map.json")["rooms"]))
+        return Map(id, grid, parse_regions(self._shown(id)["rooms"]))
 
 
 def _shipped(folder: Path) -> Iterator[Map]:

@@ -58,7 +58,7 @@ class Policies:
         self._folder = settings.data_dir / "policies"
         self._folder.mkdir(parents=True, exist_ok=True)
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
-        self._named = {record.name: record for record in self._shipped()}
+        self._named = {str(record.name): record for record in self._shipped()}
 
     def record(self, key: str) -> Record:
         """Raises NotFound."""
@@ -171,7 +171,7 @@ class Policies:
         files.remove_folder(self._folder / record.id)
 
     def page(self, after: str | None, limit: int) -> tuple[list[Record], str | None]:
-        keys, following = files.page([*map(str, self._named), *files.ids(self._folder)], after, limit)
+        keys, following = files.page([*self._named, *files.ids(self._folder)], after, limit)
         return [self.record(key) for key in keys], following
 
     def _shipped(self) -> Iterator[Record]:

@@ -71,7 +71,7 @@ def _from_json(server: Server, content: bytes) -> Map:
 async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
     """In order of name and id."""
     found, following = await asyncio.to_thread(server.maps.page, cursor, limit)
-    return {"items": [item.to_json() for item in found], "next": following}
+    return {"items": found, "next": following}
 
 
 @router.get(
