@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from specshield.policy.settings import read_settings
 from specshield.sim import picture, report
 from specshield.sim.campaign import Campaign, run
 from specshield.sim.cases import MODELS, Case, case_names, load_case
+from specshield.sim.progress import StatusLine, duration
 from specshield.sim.service import own_server
 
 PATIENCE = 10.0  # [s] for one decision: other work may share the machine
@@ -26,15 +27,15 @@ def demo(runs: int, seed: int, out: Path) -> int:
 
     1 if an episode with the shield broke its rule.
     """
-    began = time.monotonic()
-    _say("starting the service ...")
+    began, status = time.monotonic(), StatusLine()
+    status.say("starting the service (its first start compiles: about a minute) ...")
     with own_server() as url, ShieldClient(url, timeout=PATIENCE) as client:
-        campaigns = [_campaign(client, load_case(name), runs, seed) for name in case_names()]
+        campaigns = [_campaign(client, load_case(name), runs, seed, status) for name in case_names()]
     for campaign in campaigns:
         picture.draw(
             campaign.case, campaign.shielded[0], campaign.unshielded[0], out / f"{campaign.case.name}.png"
         )
-    _say("")
+    status.clear()
     print(f"{runs} episodes a case, seed {seed}, over HTTP\n")
     for campaign in campaigns:
         print(
@@ -44,21 +45,22 @@ def demo(runs: int, seed: int, out: Path) -> int:
     for campaign in campaigns:
         print(f"picture: {out / campaign.case.name}.png")
     print(f"{time.monotonic() - began:.0f} s")
-    return _status(campaigns)
+    return _exit_status(campaigns)
 
 
 def evaluate(case: str, runs: int, seed: int, as_json: bool) -> int:
     """One case with any number of runs; the table, or with `as_json` the figures and every episode."""
+    status, loaded = StatusLine(), load_case(case)
     with own_server() as url, ShieldClient(url, timeout=PATIENCE) as client:
-        campaign = _campaign(client, load_case(case), runs, seed)
-    _say("")
+        campaign = _campaign(client, loaded, runs, seed, status)
+    status.clear()
     figures = report.summary(campaign)
     if as_json:
         episodes = [episode.to_json() for episode in (*campaign.shielded, *campaign.unshielded)]
         print(json.dumps({**figures, "episodes": episodes}))
     else:
         print(report.table([figures]))
-    return _status([campaign])
+    return _exit_status([campaign])
 
 
 def train(
@@ -80,7 +82,7 @@ def train(
     from specshield.policy.dqn import Progress, train
 
     settings = read_settings(_options(options) | ({} if updates is None else {"updates": updates}))
-    loaded, out = load_case(case), out or MODELS / case
+    loaded, out, status = load_case(case), out or MODELS / case, StatusLine()
     checkpoint = out / "checkpoint"
     if not resume:
         shutil.rmtree(checkpoint, ignore_errors=True)
@@ -88,17 +90,17 @@ def train(
     def show(progress: Progress) -> None:
         rate = "not measured yet" if progress.satisfied is None else f"satisfied {progress.satisfied:.1%}"
         done = f"{case}: update {progress.update} of {progress.updates}"
-        _say(f"{done}, {rate}, {_duration(progress.eta_s)} left")
+        status.say(f"{done}, {rate}, {duration(progress.eta_s)} left")
 
     policy = train(loaded.task, settings, seed, show, checkpoint, spec=dict(loaded.spec))
     (out / "policy.safetensors").write_bytes(policy.weights())
     (out / "card.json").write_text(json.dumps(policy.card, indent=1) + "\n")
     shutil.rmtree(checkpoint)
-    _say("")
+    status.clear()
     metrics = policy.card["metrics"]
     print(
         f"{out}: satisfies from {metrics['satisfied']:.1%} of {metrics['starts']} starts, "
-        f"{metrics['feasible_start']:.1%} after some first action; {_duration(metrics['wall_time_s'])}"
+        f"{metrics['feasible_start']:.1%} after some first action; {duration(metrics['wall_time_s'])}"
     )
     return 0
 
@@ -115,22 +117,17 @@ def _options(texts: Sequence[str]) -> dict[str, Any]:
     return settings
 
 
-def _campaign(client: ShieldClient, case: Case, runs: int, seed: int) -> Campaign:
-    _say(f"{case.name}: 0 of {runs} episodes")
-    return run(client, case, runs, seed, _counter(case.name, runs))
-
-
-def _counter(name: str, runs: int) -> Callable[[int], None]:
+def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: StatusLine) -> Campaign:
     began = time.monotonic()
 
     def show(done: int) -> None:
         left = (time.monotonic() - began) / done * (runs - done)
-        _say(f"{name}: {done} of {runs} episodes, {_duration(left)} left")
+        status.say(f"{case.name}: {done} of {runs} episodes, {duration(left)} left")
 
-    return show
+    return run(client, case, runs, seed, show)
 
 
-def _status(campaigns: list[Campaign]) -> int:
+def _exit_status(campaigns: list[Campaign]) -> int:
     broken = [
         episode
         for campaign in campaigns
@@ -143,16 +140,3 @@ def _status(campaigns: list[Campaign]) -> int:
             file=sys.stderr,
         )
     return 1 if broken else 0
-
-
-def _say(line: str) -> None:
-    """Progress, on standard error: one line that is written over, or a line each where nobody looks on."""
-    if sys.stderr.isatty():
-        print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-    elif line:
-        print(line, file=sys.stderr, flush=True)
-
-
-def _duration(seconds: float) -> str:
-    whole = round(seconds)
-    return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60:02d} s"

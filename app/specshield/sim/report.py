@@ -51,59 +51,49 @@ def summary(campaign: Campaign) -> dict[str, Any]:
 
 def table(summaries: Sequence[dict[str, Any]]) -> str:
     """One pair of columns a case, without and with the shield."""
-    rows: list[tuple[str, list[str]]] = [("", []), ("", [])]
-    names = (
-        "rule satisfied",
-        "main task done",
-        "KL a decision",
-        "KL an episode",
-        "median extra steps",
-        "decisions",
-    )
-    rows += [(name, []) for name in (*names, *(f"  {mode}" for mode in MODES), "more than one action left")]
-    rows += [(name, []) for name in ("a decision, p50 / p99", "  of it in the server", "starts refused")]
-    columns = [column for one in summaries for column in _columns(one)]
-    for i, (_, cells) in enumerate(rows):
-        cells.extend(column[i] for column in columns)
-    rows = [
-        row for row in rows if row[0].strip() not in MODES or any(cell not in ("", "0") for cell in row[1])
-    ]
-    wide = [max(len(cells[c]) for _, cells in rows) for c in range(len(columns))]
-    first = max(len(name) for name, _ in rows)
-    return "\n".join(
-        "  ".join([name.ljust(first), *(cell.rjust(w) for cell, w in zip(cells, wide, strict=True))]).rstrip()
-        for name, cells in rows
-    )
+    columns = [column for one in summaries for column in (_without(one), _with(one))]
+    names = list(columns[1])
+    cells = [[name, *(column.get(name, "") for column in columns)] for name in names]
+    heads = [["", *(one["case"] if i == 0 else "" for one in summaries for i in range(2))]]
+    heads.append(["", *("without", "with shield") * len(summaries)])
+    rows = heads + [row for row in cells if row[0] != "  violated" or set(row[1:]) > {"", "0"}]
+    wide = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
+    lines = ["  ".join([row[0].ljust(wide[0]), *map(str.rjust, row[1:], wide[1:])]) for row in rows]
+    return "\n".join(line.rstrip() for line in lines)
 
 
-def _columns(one: dict[str, Any]) -> tuple[list[str], list[str]]:
-    runs, bare, kept = one["runs"], one["without_shield"], one["with_shield"]
+def _without(one: dict[str, Any]) -> dict[str, str]:
+    runs, figures = one["runs"], one["without_shield"]
+    return {
+        "rule satisfied": f"{figures['satisfied']} of {runs}",
+        "main task done": f"{figures['main_done']} of {runs}",
+    }
 
-    def outcome(name: str, figures: dict[str, Any]) -> list[str]:
-        return [f"{figures['satisfied']} of {runs}", f"{figures['main_done']} of {runs}"]
 
-    def number(value: float | None, form: str) -> str:
-        return "-" if value is None else form.format(value)
+def _with(one: dict[str, Any]) -> dict[str, str]:
+    runs, refused, figures = one["runs"], one["refused_starts"], one["with_shield"]
+    modes = figures["modes"]
+    return {
+        "rule satisfied": f"{figures['satisfied']} of {runs}",
+        "main task done": f"{figures['main_done']} of {runs}",
+        "KL a decision": _number(figures["kl_per_decision"], ".2f"),
+        "KL an episode": _number(figures["kl_per_episode"], ".0f"),
+        "median extra steps": _number(figures["extra_steps"], "+.0f"),
+        "decisions": str(sum(modes.values())),
+        **{f"  {mode}": str(modes.get(mode, 0)) for mode in MODES},
+        "more than one action left": _number(figures["spread"], ".1%"),
+        "a decision, p50 / p99": _times(figures["round_trip_ms"]),
+        "  of it in the server": _times(figures["server_ms"]),
+        "starts refused": f"{refused} of {runs + refused}",
+    }
 
-    def times(figures: dict[str, float]) -> str:
-        return f"{figures['p50']:.1f} / {figures['p99']:.1f} ms"
 
-    with_shield = [
-        "",
-        "with shield",
-        *outcome(one["case"], kept),
-        number(kept["kl_per_decision"], "{:.2f}"),
-        number(kept["kl_per_episode"], "{:.0f}"),
-        number(kept["extra_steps"], "{:+.0f}"),
-        str(sum(kept["modes"].values())),
-        *(str(kept["modes"].get(mode, 0)) for mode in MODES),
-        number(kept["spread"], "{:.1%}"),
-        times(kept["round_trip_ms"]),
-        times(kept["server_ms"]),
-        f"{one['refused_starts']} of {runs + one['refused_starts']}",
-    ]
-    without = [one["case"], "without", *outcome(one["case"], bare)]
-    return without + [""] * (len(with_shield) - len(without)), with_shield
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _times(figures: dict[str, float]) -> str:
+    return f"{figures['p50']:.1f} / {figures['p99']:.1f} ms"
 
 
 def _outcome(episodes: Sequence[Episode]) -> dict[str, Any]:

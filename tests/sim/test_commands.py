@@ -1,0 +1,108 @@
+"""The commands as a user runs them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from specshield.policy.load import load_policy
+from specshield.sim.cases import load_case
+
+SPECSHIELD = (sys.executable, "-m", "specshield.cli")
+
+
+def specshield(*arguments, code=0):
+    done = subprocess.run([*SPECSHIELD, *arguments], capture_output=True, text=True, timeout=300)
+    assert done.returncode == code, done.stderr
+    return done
+
+
+def children(pid):
+    """Of whichever thread began them."""
+    return [
+        int(n)
+        for task in Path(f"/proc/{pid}/task").iterdir()
+        for n in (task / "children").read_text().split()
+    ]
+
+
+def gone(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def until(condition, seconds=120.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_demo_prints_the_table_and_draws_each_case(tmp_path):
+    done = specshield("demo", "--runs", "1", "--seed", "4", "--out", str(tmp_path))
+    assert "1 episodes a case, seed 4" in done.stdout
+    assert "rule satisfied" in done.stdout
+    assert done.stdout.count("1 of 1") >= 4
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["case1.png", "case2.png"]
+    assert "starting the service" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a_command_that_is_stopped_leaves_nothing_running(how):
+    command = subprocess.Popen(
+        [*SPECSHIELD, "evaluate", "--case", "case1", "--runs", "500", "--json"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        until(lambda: children(command.pid))
+        (server,) = children(command.pid)
+        until(lambda: children(server))  # the store's keeper
+        (keeper,) = children(server)
+        os.kill(command.pid, how)
+        assert command.wait(60) != 0
+        until(lambda: gone(server) and gone(keeper), 30.0)
+    finally:
+        command.kill()
+
+
+def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
+    pytest.importorskip("torch")
+    case, out = load_case("case1"), tmp_path / "model"
+    arguments = ["train", "--case", "case1", "--seed", "3", "--updates", "400", "--out", str(out)]
+    arguments += ["--option", "units=8", "--option", "evaluate_every=100", "--option", "evaluation_starts=50"]
+    command = subprocess.Popen([*SPECSHIELD, *arguments], stderr=subprocess.DEVNULL)
+    until((out / "checkpoint" / "state.safetensors").exists)
+    command.kill()
+    command.wait()
+    assert not (out / "card.json").exists()
+    done = specshield(*arguments, "--resume")
+    assert "of 50 starts" in done.stdout
+    assert sorted(path.name for path in out.iterdir()) == ["card.json", "policy.safetensors"]
+    card = json.loads((out / "card.json").read_text())
+    assert card["options"]["units"] == 8
+    assert card["spec"] == case.spec
+    load_policy((out / "policy.safetensors").read_bytes(), card, case.task)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["evaluate", "--case", "case9"], "one of case1, case2"),
+        (["train", "--case", "case1", "--option", "units=9000"], "from 4 to 128"),
+        (["train", "--case", "case1", "--method", "magic"], "only a DQN"),
+    ],
+)
+def test_a_mistake_is_told_in_a_line(arguments, said):
+    done = specshield(*arguments, code=1)
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
