@@ -1,0 +1,105 @@
+"""Tasks: what they read from a trajectory, their hash, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from specshield.errors import FormulaError, HorizonError, MapError, SampleError
+from specshield.robot import STRETCH, robot_from_json
+from specshield.stl import robustness
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Circle, region_from_json
+
+GRID = OccupancyGrid(np.zeros((20, 20), bool), 0.1)
+DISC = {"type": "circle", "center": [1.0, 1.0], "radius": 0.5}
+BOX = {"type": "rectangle", "min": [0.0, 0.0], "max": [1.0, 2.0]}
+CART = robot_from_json({"footprint": {"radius": 0.2}, "actions": [{"name": "go", "translate": 0.1}]})
+
+
+def task_of(formula="F[0,3] A and G[0,2] theta < 1 and F[0,1] load > 0.5", grid=GRID, robot=STRETCH, **more):
+    return make_task(grid, robot, formula, **({"regions": {"A": DISC}, "signals": {"load": 0.0}} | more))
+
+
+def test_samples_of_a_trajectory():
+    poses = np.array([[1.0, 1.0, 0.5], [1.5, 1.0, -3.0], [2.0, 1.0, math.pi], [1.0, 0.0, 0.0]])
+    samples = task_of().samples(poses, {"load": np.array([0.1, 0.9])})
+    assert sorted(samples) == ["A", "load", "theta"]
+    np.testing.assert_allclose(samples["A"], [0.5, 0.0, -0.5, -0.5])
+    assert samples["theta"].tolist() == [0.5, -3.0, math.pi, 0.0]
+    assert samples["load"].tolist() == [0.1, 0.9, 0.9, 0.9]  # the last value is held
+    assert task_of().samples(poses)["load"].tolist() == [0.0] * 4  # the declared one before any
+    batch = task_of().samples(np.stack([poses, poses + 1.0]), {"load": np.array([0.1, 0.9])})
+    assert {name: array.shape for name, array in batch.items()} == {
+        "A": (2, 4),
+        "theta": (2, 4),
+        "load": (2, 4),
+    }
+    # min(max A, min(1 - theta over 0..2), max load - 0.5 over 0..1) = min(0.5, 1 - pi, 0.4)
+    assert robustness(task_of().formula, samples) == pytest.approx(1 - math.pi)
+
+
+def test_only_what_the_formula_names_is_kept_and_the_specs_own_comes_first():
+    rooms = {"A": Circle((5.0, 5.0), 1.0), "Hall": Circle((6.0, 6.0), 1.0), "load": Circle((7.0, 7.0), 1.0)}
+    task = task_of("F[0,3] (A and Hall) and F[0,2] load > 1", regions={"A": DISC, "B": BOX}, rooms=rooms)
+    assert task.regions == {"A": region_from_json(DISC, "A"), "Hall": rooms["Hall"]}
+    assert task.signals == {"load": 0.0}
+    assert task.samples(np.zeros((4, 3)))["load"].tolist() == [0.0] * 4  # the signal, not the room
+    assert task.horizon == 3
+
+
+def test_the_hash_is_of_all_that_matters_and_nothing_else():
+    same = task_of()
+    assert task_of("(F[0:3] A) & G[0,2] theta<1 & F[0,1] load>0.5").content_hash == same.content_hash
+    assert (
+        task_of(regions={"B": BOX, "A": DISC}, signals={"load": 0, "extra": 1.0}).content_hash
+        == same.content_hash
+    )
+    others = [
+        task_of("F[0,4] A and G[0,2] theta < 1 and F[0,1] load > 0.5"),
+        task_of(regions={"A": {**DISC, "radius": 0.6}}),
+        task_of(signals={"load": 0.1}),
+        task_of(robot=CART),
+        task_of(grid=OccupancyGrid(np.zeros((20, 20), bool), 0.1, (0.0, 0.1, 0.0))),
+    ]
+    assert len({task.content_hash for task in (same, *others)}) == 6
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "path"),
+    [
+        ({"formula": "F[0,3] Nowhere"}, FormulaError, None),
+        ({"formula": "F[0,3] (A"}, FormulaError, None),
+        ({"formula": "A"}, FormulaError, "formula"),
+        ({"formula": "F[0,1001] A"}, HorizonError, None),
+        ({"regions": {"A": {**DISC, "radius": -1}}}, MapError, "regions.A.radius"),
+        ({"regions": {"x": DISC}}, MapError, "regions.x"),
+        ({"regions": {"F": DISC}}, MapError, "regions.F"),
+        ({"regions": {"a b": DISC}}, MapError, "regions.a b"),
+        ({"regions": {"A" * 65: DISC}}, MapError, "regions." + "A" * 65),
+        ({"regions": {f"A{i}": DISC for i in range(257)}}, MapError, "regions"),
+        ({"signals": {"A": 1.0}}, MapError, "signals.A"),
+        ({"signals": {"theta": 1.0}}, MapError, "signals.theta"),
+        ({"signals": {"load": math.nan}}, SampleError, "signals.load"),
+        ({"signals": {"load": "full"}}, SampleError, "signals.load"),
+        ({"signals": {"load": True}}, SampleError, "signals.load"),
+        ({"signals": {"load": 10**400}}, SampleError, "signals.load"),
+    ],
+)
+def test_bad_specs_name_the_field(given, error, path):
+    with pytest.raises(error) as caught:
+        task_of(**{"formula": "F[0,3] A", **given})
+    assert path is None or caught.value.path == path
+    assert caught.value.expected
+
+
+def test_signals_that_are_sent_are_checked():
+    task = task_of()
+    task.check_signals({"load": 3.0})
+    for signals in ({"weight": 1.0}, {"load": math.inf}, {"load": math.nan}):
+        with pytest.raises(SampleError) as caught:
+            task.check_signals(signals)
+        assert caught.value.path == f"signals.{next(iter(signals))}"
