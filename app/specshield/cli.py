@@ -81,14 +81,10 @@ def serve(
 def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
 ) -> None:
-    """Train policies that are asked for, until stopped."""
-    from importlib.util import find_spec
-
+    """Make the policies that are asked for, until stopped; those that are learned need torch."""
     from specshield.service.settings import Settings
     from specshield.service.worker import serve as work
 
-    if find_spec("torch") is None:
-        sys.exit(NEEDS_TORCH)
     work(Settings(), until_eof)
 
 

@@ -24,7 +24,6 @@ main()
         (["typer"], ["serve"], "specshield[server]"),
         (["fastapi"], ["openapi"], "specshield[server]"),
         (["uvicorn"], ["serve"], "specshield[server]"),
-        (["torch"], ["worker"], "specshield[train]"),
     ],
 )
 def test_what_is_not_installed_is_said(parts, arguments, told):

@@ -83,6 +83,22 @@ def test_a_policy_is_trained_and_serves(client):
     assert client.get("/v1/policies").json()["items"][-1]["id"]
 
 
+def test_a_policy_is_computed_and_serves(client):
+    ready = reach(client, ask(client, method="reachability", options={}), "ready")
+    assert 0.0 < ready["metrics"]["feasible_start"] <= 1.0
+    body = {"policy_id": ready["id"], "initial_pose": START}
+    session = client.post("/v1/sessions", json=body)
+    assert session.status_code == 201, session.text
+    assert session.json()["feasible"]
+
+
+def test_a_run_that_cannot_be_says_why(client):
+    restless = {**ROBOT, "actions": [action for action in ROBOT["actions"] if action["name"] != "wait"]}
+    policy = ask(client, method="reachability", options={}, robot=restless)
+    wait_for(lambda: read(client, policy)["status"] == "failed", 30.0)
+    assert "wait" in read(client, policy)["error"]
+
+
 def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
     policy = ask(client, options=LONG)
     reach(client, policy, "training")

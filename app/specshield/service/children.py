@@ -9,7 +9,6 @@ import logging
 import os
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 from specshield.errors import SpecshieldError
@@ -59,7 +58,7 @@ class TrainingWorker:
 def wants_worker(settings: Settings) -> bool:
     if settings.worker is not None:
         return settings.worker
-    return settings.redis_url is None and find_spec("torch") is not None
+    return settings.redis_url is None
 
 
 async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None) -> None:

@@ -7,6 +7,7 @@ that stops giving signs of life is reported as failed, whatever happened to its 
 from __future__ import annotations
 
 import secrets
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +20,6 @@ from rq.serializers import JSONSerializer
 from specshield.errors import StoreError
 from specshield.service.settings import Settings
 
-QUEUE = "specshield"
-WORKER = "specshield:worker"  # there while any worker is
 SIGN_OF_LIFE = 5  # seconds without one after which a run, or the last worker, is taken for dead
 WRITE = """
 if redis.call('HGET', KEYS[1], 'attempt') ~= ARGV[1] then return 0 end
@@ -52,17 +51,17 @@ class Jobs:
         self._timeout = settings.training_timeout
         self._write = self.redis.register_script(WRITE)
 
-    def worker_there(self) -> bool:
-        return bool(self._try(lambda: self.redis.exists(WORKER)))
+    def worker_there(self, method: str) -> bool:
+        return bool(self._try(lambda: self.redis.exists(_worker(method))))
 
-    def start(self, id: str) -> None:
+    def start(self, id: str, method: str) -> None:
         """Queue a run for this policy."""
         attempt = secrets.token_hex(8)
         state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
 
         def enqueue() -> None:
             self.redis.hset(_key(id), mapping=state)
-            queue = Queue(QUEUE, connection=self.redis, serializer=JSONSerializer)
+            queue = Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer)
             queue.enqueue(
                 "specshield.service.worker.train",
                 id,
@@ -109,15 +108,29 @@ class Jobs:
         self._try(lambda: self.redis.set(_alive(id), 1, ex=SIGN_OF_LIFE))
         return bool(self._try(lambda: self.redis.hget(_key(id), "attempt")) == attempt.encode())
 
-    def worker_lives(self) -> None:
-        """A worker's sign of life."""
-        self._try(lambda: self.redis.set(WORKER, 1, ex=SIGN_OF_LIFE))
+    def worker_lives(self, methods: Sequence[str]) -> None:
+        """The sign of life of a worker for these methods."""
+
+        def live() -> None:
+            for method in methods:
+                self.redis.set(_worker(method), 1, ex=SIGN_OF_LIFE)
+
+        self._try(live)
 
     def _try(self, action: Any) -> Any:
         try:
             return action()
         except (redis.RedisError, OSError) as error:
             raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+
+
+def queue_of(method: str) -> str:
+    """Of rq: one a method, since not every worker can do them all."""
+    return f"specshield-{method}"
+
+
+def _worker(method: str) -> str:
+    return f"specshield:worker:{method}"
 
 
 def _key(id: str) -> str:

@@ -225,7 +225,9 @@ class PolicyRequest(Strict):
     map_id: Id = Field(description="Id or name of the map.")
     robot: RobotChoice = Field("stretch", description="A preset (`stretch`) or a robot of your own.")
     spec: Spec
-    method: Literal["dqn", "reachability"] = Field("dqn", description="How the policy is made.")
+    method: Literal["dqn", "reachability"] = Field(
+        "dqn", description="How the policy is made: learned or computed."
+    )
     seed: int = Field(0, ge=0, lt=2**63, description="Of everything random in the training.")
     options: dict[str, bool | int | float | str | list[float]] = Field(
         default_factory=dict,
@@ -242,7 +244,7 @@ class Card(BaseModel):
     map_id: Id
     robot: RobotChoice
     spec: Spec
-    method: Literal["dqn"]
+    method: Literal["dqn", "reachability"]
     seed: int = Field(ge=0, lt=2**63)
     options: dict[str, bool | int | float | str | list[float]] = Field(max_length=64)
     task_hash: Name

@@ -55,7 +55,7 @@ class Settings(BaseSettings):
 
     worker: bool | None = Field(
         default=None,
-        description="Start a training worker too. Unset: where the store is embedded and torch installed.",
+        description="Start a training worker too. Unset: where the store is embedded.",
     )
     training_timeout: int = Field(default=6 * 3600, ge=1, description="Longest training run [s].")
 

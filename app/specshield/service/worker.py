@@ -16,8 +16,9 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from specshield.errors import SpecshieldError, StoreError
+from specshield.service import methods
 from specshield.service.embedded import EmbeddedStore
-from specshield.service.jobs import QUEUE, SIGN_OF_LIFE, Jobs
+from specshield.service.jobs import SIGN_OF_LIFE, Jobs, queue_of
 from specshield.service.keeper import follow_parent
 from specshield.service.settings import Settings
 
@@ -33,7 +34,7 @@ def serve(settings: Settings, until_eof: bool) -> None:
     jobs = Jobs(os.environ.get("REDIS_URL") or str(settings.redis_url), settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
-    with _regularly(jobs.worker_lives):
+    with _regularly(lambda: jobs.worker_lives(methods.available())):
         _Worker(jobs).work(logging_level="WARNING")
 
 
@@ -42,7 +43,7 @@ class _Worker(Worker):
 
     def __init__(self, jobs: Jobs) -> None:
         super().__init__(
-            [QUEUE],
+            [queue_of(method) for method in methods.available()],
             connection=jobs.redis,
             serializer=JSONSerializer,
             work_horse_killed_handler=self._killed,
@@ -93,6 +94,7 @@ def train(id: str, attempt: str) -> None:
         if not jobs.sign_of_life(id, attempt):
             cancelled.set()
 
+    live()  # first: a run that is said to train without a sign of life is taken for dead
     if not jobs.report(id, attempt, status="training"):
         return  # cancelled, or asked for again
     with _regularly(live):
@@ -102,35 +104,35 @@ def train(id: str, attempt: str) -> None:
         except SpecshieldError as error:
             done = {"status": "failed", "error": error.message, "eta_s": ""}
         except Exception as error:
+            if cancelled.is_set():
+                return
             log.exception("training of %s", id)
             done = {"status": "failed", "error": f"{type(error).__name__}: {error}", "eta_s": ""}
         jobs.report(id, attempt, **done)  # of no effect once cancelled
 
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
-    # torch, numba and the rest are for the process of the run alone: the worker stays small.
-    from specshield.policy import dqn
-    from specshield.policy.settings import read_settings
+    # numba, torch and the rest are for the process of the run alone: the worker stays small.
     from specshield.service.maps import Maps
     from specshield.service.policies import Policies
 
     policies = Policies(settings, Maps(settings))
     about = policies.record(id).about
 
-    def on_progress(progress: dqn.Progress) -> None:
-        done = progress.update / progress.updates
-        jobs.report(id, attempt, progress=round(done, 4), eta_s=round(progress.eta_s, 1))
+    def on_progress(done: float, eta_s: float) -> None:
+        jobs.report(id, attempt, progress=round(done, 4), eta_s=round(eta_s, 1))
 
-    policy = dqn.train(
+    policy = methods.make(
+        about.method,
         policies.task(about),
-        read_settings(about.options),
+        about.options,
         about.seed,
-        on_progress,
-        policies.checkpoints(id),
-        cancelled.is_set,
         about.spec,
+        policies.checkpoints(id),
+        on_progress,
+        cancelled.is_set,
     )
-    policies.finish(id, policy.weights(), {**policy.card, "map_id": about.map_id})
+    policies.finish(id, policy.weights(), {**policy.card, "map_id": about.map_id, "seed": about.seed})
 
 
 @contextmanager

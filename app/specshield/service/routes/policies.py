@@ -8,9 +8,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import TypeAdapter
 
-from specshield.errors import InUse, SpecshieldError, TrainingUnavailable, Unsupported
-from specshield.policy.settings import options_of, read_settings
-from specshield.service import examples
+from specshield.errors import InUse, SpecshieldError, TrainingUnavailable
+from specshield.service import examples, methods
 from specshield.service.jobs import Training
 from specshield.service.policies import Description, Record, describe
 from specshield.service.routes import uploads
@@ -51,6 +50,7 @@ async def create(request: Request, server: ServerState) -> Any:
     Policies are immutable and known by the hash of task, method, options and seed: the same request again
     answers the policy there is, and queues it once more if it failed. A formula has to be a conjunction of
     `F[a,b]`, `G[a,b]` and `F[a,c] G[d,b]` over boolean combinations of predicates.
+    `dqn` learns, in minutes; `reachability` computes, in seconds, for robots that can wait.
     """
     if uploads.is_multipart(request):
         weights, card = await uploads.parts(request, "weights", "card")
@@ -66,11 +66,7 @@ def _add(server: Server, weights: bytes, content: bytes) -> Record:
 def _ask(server: Server, content: bytes) -> dict[str, Any]:
     body = uploads.parse(REQUEST, content).model_dump(exclude_unset=True)
     asked = PolicyRequest(**body)
-    if asked.method == "reachability":
-        raise Unsupported(
-            "policies by reachability are not there yet", path="method", got="reachability", expected="dqn"
-        )
-    options = options_of(read_settings(asked.options))
+    options = methods.complete(asked.method, asked.options)
     robot = body.get("robot", "stretch")
     about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, options)
     about = server.policies.resolve(about)
@@ -82,10 +78,13 @@ def _ask(server: Server, content: bytes) -> dict[str, Any]:
     record = server.policies.find(about, task)
     if record is not None and _training(server, record).status != "failed":
         return _show(server, record)
-    if not (server.worker or server.jobs.worker_there()):
-        raise TrainingUnavailable("no worker is there to train; start one with `specshield worker`")
+    here = server.worker is not None and asked.method in methods.available()
+    if not (here or server.jobs.worker_there(asked.method)):
+        raise TrainingUnavailable(
+            f"no worker is there that makes policies by {asked.method}; start one with `specshield worker`"
+        )
     record = record or server.policies.add(about, task)
-    server.jobs.start(record.id)
+    server.jobs.start(record.id, asked.method)
     return _show(server, record)
 
 
