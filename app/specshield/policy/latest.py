@@ -1,26 +1,31 @@
 """The latest feasible time: one number a pose and progress from which a formula can still be satisfied.
 
-Where the robot can wait and no `always` begins or ends within the horizon, feasibility is monotone in time:
-what can
-be done from time t can be done from any earlier one, by waiting. So with p the set of settled goals
+Where the robot can wait, and as long as no `always` begins or ends, feasibility is monotone in time: what
+can be
+done from time t can be done from any earlier one, by waiting. So time falls into phases, in which the same
+`always` hold, and in each phase, with p the set of settled goals,
 
-    L(s, p) = max( max_a L(f(s, a), p) - 1,   max_J m(s, p, J) )          J: goals to settle by waiting at s
+    L(s, p) = max( max_a L(f(s, a), p) - 1,   max_J m(s, p, J),   the phase's end if the next one can be
+    entered )
 
-m(s, p, J) is the latest time from which waiting at s settles all of J and leaves L(s, p + J) ahead: for
-F[a,b] at most
-b, with L >= a; for F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, at most c1 + c2 and L - n + 1, with L
->= a + b.
-Backward dynamic programming, by in-place semi-Lagrangian sweeps (values off the lattice bilinear).
+m(s, p, J) is the latest time from which waiting at s settles all of the goals J and leaves L(s, p + J)
+ahead: for
+F[a,b] at most b, with L >= a; for F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, at most c1 + c2 and L -
+n + 1,
+with L >= a + b. Backward dynamic programming, by in-place semi-Lagrangian sweeps (values off the lattice
+bilinear).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from specshield.policy.lattice import Lattice
-from specshield.policy.progress import EVENTUALLY_ALWAYS, Rules
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
 NEVER = -1.0
 SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged
@@ -48,29 +53,93 @@ def _latest(rules: Rules, k: int) -> int:
     return int(rules.last[k])
 
 
+@dataclass(frozen=True)
+class Phase:
+    """Steps `start` to `end`, in which the same `always` (indices) hold."""
+
+    start: int
+    end: int
+    always: tuple[int, ...]
+
+
+def phases_of(rules: Rules, horizon: int) -> tuple[Phase, ...]:
+    """The phases of [0, horizon], in order."""
+
+    def holding(t: int) -> tuple[int, ...]:
+        return tuple(
+            k for k in np.flatnonzero(rules.kind == ALWAYS).tolist() if rules.a[k] <= t <= rules.b[k]
+        )
+
+    starts = [t for t in range(horizon + 1) if t == 0 or holding(t) != holding(t - 1)]
+    ends = [*(t - 1 for t in starts[1:]), horizon]
+    return tuple(Phase(start, end, holding(start)) for start, end in zip(starts, ends, strict=True))
+
+
 def latest_times(
     lattice: Lattice,
     rules: Rules,
     holds: NDArray[np.uint8],
     goals: NDArray[np.int64],
     masks: list[int],
-    horizon: int,
-) -> NDArray[np.float32]:
-    """L for each mask of `masks`, [masks, ny, nx, H]; NEVER where the formula cannot be satisfied."""
+    phases: tuple[Phase, ...],
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """L for each phase and mask, [phases, masks, ny, nx, H], NEVER where there is no such time in the phase.
+
+    Also where a pose is free and keeps the phase's `always`, [phases, ny, nx, H].
+    """
     index = {mask: n for n, mask in enumerate(masks)}
-    tables = np.full((len(masks), *lattice.valid.shape), NEVER, np.float32)
-    full = (1 << len(goals)) - 1
-    tables[index[full]][lattice.valid == 1] = horizon
-    for mask in masks[1:]:
-        table = tables[index[mask]]
-        for after in masks:
-            if after & mask == mask and after != mask:
-                added = np.array(
-                    [goals[g] for g in range(len(goals)) if after >> g & 1 and not mask >> g & 1]
-                )
-                _settle(rules, holds, added, tables[index[after]], table)
-        _sweep(lattice, table)
-    return tables
+    tables = np.full((len(phases), len(masks), *lattice.valid.shape), NEVER, np.float32)
+    valid = np.stack([lattice.valid & np.all(holds[list(phase.always)], axis=0) for phase in phases])
+    for i in reversed(range(len(phases))):
+        phase = phases[i]
+        for mask in masks:
+            table = tables[i, index[mask]]
+            if i + 1 < len(phases):
+                following = phases[i + 1].start
+                _enter(lattice, valid[i + 1], tables[i + 1, index[mask]], following, table)
+            elif mask == masks[0]:
+                table[:] = phase.end
+            for after in masks:
+                if after & mask == mask and after != mask:
+                    added = np.array([g for n, g in enumerate(goals) if (after ^ mask) >> n & 1])
+                    _settle(rules, holds, added, tables[i, index[after]], float(phase.start), table)
+                    if np.any(rules.kind[added] == EVENTUALLY_ALWAYS):
+                        through = np.ones_like(lattice.valid)
+                        for j in range(i + 1, len(phases)):  # a dwell that goes on in a later phase
+                            through &= valid[j]
+                            later = np.where(through, tables[j, index[after]], np.float32(NEVER))
+                            _settle(rules, holds, added, later, float(phases[j].start), table)
+            table[table > phase.end] = phase.end
+            table[(table < phase.start) | (valid[i] == 0)] = NEVER
+            _sweep(lattice, valid[i], float(phase.start), table)
+    return tables, valid
+
+
+@njit(cache=True, nogil=True)
+def _enter(
+    lattice: Lattice,
+    valid: NDArray[np.uint8],
+    following: NDArray[np.float32],
+    start: int,
+    table: NDArray[np.float32],
+) -> None:
+    """The last step before the next phase's `start`, where some motion leads to a pose feasible at it."""
+    ny, nx, headings = table.shape
+    for j in range(ny):
+        for i in range(nx):
+            for h in range(headings):
+                best = following[j, i, h] if valid[j, i, h] else np.float32(NEVER)
+                for d in range(lattice.far_u.shape[3]):
+                    u = lattice.far_u[j, i, h, d]
+                    if u != np.float32(-1.0):
+                        v, w = lattice.far_v[j, i, h, d], lattice.far_h[j, i, h, d]
+                        best = max(best, np.float32(bilinear(valid, following, v, u, w)))
+                for r in range(lattice.shift.shape[0]):
+                    w = (h + lattice.shift[r]) % headings
+                    if lattice.turns[j, i, h, r] and valid[j, i, w]:
+                        best = max(best, following[j, i, w])
+                if best >= start:
+                    table[j, i, h] = start - 1
 
 
 @njit(cache=True, nogil=True)
@@ -79,9 +148,10 @@ def _settle(
     holds: NDArray[np.uint8],
     added: NDArray[np.int64],
     ahead: NDArray[np.float32],
+    start: float,
     table: NDArray[np.float32],
 ) -> None:
-    """m(s, p, J) into `table` where it is later. added: J; ahead: L(., p + J)."""
+    """m(s, p, J) into `table` where it is later. added: J; ahead: L(., p + J) from step `start` on."""
     for j in range(table.shape[0]):
         for i in range(table.shape[1]):
             for h in range(table.shape[2]):
@@ -93,14 +163,14 @@ def _settle(
                         break
                     if rules.kind[k] == EVENTUALLY_ALWAYS:
                         dwell = rules.b[k] - rules.c2[k] + 1
-                        if left < rules.a[k] + rules.b[k]:
+                        if left < max(start, rules.a[k] + rules.b[k]):
                             latest = np.float32(NEVER)
                             break
                         latest = min(
                             latest, np.float32(rules.c1[k] + rules.c2[k]), np.float32(left - dwell + 1)
                         )
                     else:
-                        if left < rules.a[k]:
+                        if left < max(start, rules.a[k]) or start > rules.b[k]:
                             latest = np.float32(NEVER)
                             break
                         latest = min(latest, np.float32(rules.b[k]))
@@ -130,10 +200,13 @@ def bilinear(valid: NDArray[np.uint8], table: NDArray[np.float32], v: float, u: 
 
 
 @njit(cache=True, nogil=True)
-def _sweep(lattice: Lattice, table: NDArray[np.float32]) -> None:
-    """Relaxes max_a L(f(s, a)) - 1 in place to its fixed point, visiting only cells near what changed."""
+def _sweep(lattice: Lattice, valid: NDArray[np.uint8], start: float, table: NDArray[np.float32]) -> None:
+    """Relaxes max_a L(f(s, a)) - 1 in place to its fixed point, visiting only cells near what changed.
+
+    start: the phase's first step, before which there is no time.
+    """
     ny, nx, headings = table.shape
-    valid, reach = lattice.valid, lattice.reach
+    reach = lattice.reach
     active = np.zeros((ny, nx), np.uint8)
     for j in range(ny):
         for i in range(nx):
@@ -165,7 +238,7 @@ def _sweep(lattice: Lattice, table: NDArray[np.float32]) -> None:
                                 - 1.0
                             )
                             best = max(best, np.float32(found))
-                    if best > table[j, i, h] + SETTLED_CHANGE and best >= 0.0:
+                    if best > table[j, i, h] + SETTLED_CHANGE and best >= start:
                         table[j, i, h] = best
                         gained = True
                 turned = True
@@ -177,7 +250,7 @@ def _sweep(lattice: Lattice, table: NDArray[np.float32]) -> None:
                         for r in range(lattice.shift.shape[0]):
                             if lattice.turns[j, i, h, r]:
                                 found = table[j, i, (h + lattice.shift[r]) % headings] - np.float32(1.0)
-                                if found > table[j, i, h] + SETTLED_CHANGE and found >= 0.0:
+                                if found > table[j, i, h] + SETTLED_CHANGE and found >= start:
                                     table[j, i, h] = found
                                     turned = gained = True
                 if gained:

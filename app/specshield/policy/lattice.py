@@ -15,21 +15,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, value_count
+from specshield.policy.progress import STACK, Rules, read_predicates, value_count
 from specshield.robot.unicycle import Body, in_collision, step
 
 MAX_HEADINGS = 120
-MAX_POSES = 40_000_000
 
 
 class Lattice(NamedTuple):
     """Poses [ny, nx, H] in the grid frame, spaced `pitch` [m] and 2 pi / H.
 
-    valid: the footprint is free and every lasting `always` holds.
-    far_u, far_v [ny, nx, H, D]: where each of the D translating motions leads, in cells of the lattice (-1:
-    nowhere
-    else); far_h: with which heading. turns [ny, nx, H, R]: whether each turn is possible; shift [R]: by how
-    many headings.
+    valid: the footprint is free. far_u, far_v [ny, nx, H, D]: where each of the D translating motions leads,
+    in cells of the lattice (-1: nowhere else); far_h: with which heading. turns [ny, nx, H, R]: whether each
+    turn is possible; shift [R]: by how many headings. reach: the longest move, in cells, rounded up.
     """
 
     pitch: float
@@ -40,7 +37,7 @@ class Lattice(NamedTuple):
     far_h: NDArray[np.int16]
     turns: NDArray[np.uint8]
     shift: NDArray[np.int64]
-    reach: int  # the longest move, in cells, rounded up
+    reach: int
 
 
 def heading_count(rotations: list[float]) -> int:
@@ -52,17 +49,14 @@ def heading_count(rotations: list[float]) -> int:
     return 72
 
 
-def make_lattice(body: Body, rules: Rules, pitch: float, end: int) -> Lattice:
-    """Simulates every motion from every pose of the lattice once. An `always` on [0, b] with b >= end is
-    lasting.
-    """
+def make_lattice(body: Body, pitch: float) -> Lattice:
+    """Simulates every motion from every pose of the lattice once."""
     height, width = body.occupied.shape
     ny, nx = (max(math.ceil(n * body.resolution / pitch - 1e-9), 1) for n in (height, width))
     headings = heading_count([float(r) for r in body.rotate if r != 0.0])
     moving = np.flatnonzero(body.translate != 0.0)
     turning = np.flatnonzero((body.translate == 0.0) & (body.rotate != 0.0))
     shape = (ny, nx, headings)
-    lasting = (rules.kind == ALWAYS) & (rules.a == 0) & (rules.b >= end)
     lattice = Lattice(
         pitch=pitch,
         headings=headings,
@@ -74,7 +68,7 @@ def make_lattice(body: Body, rules: Rules, pitch: float, end: int) -> Lattice:
         shift=np.array([round(body.rotate[m] * headings / (2.0 * math.pi)) for m in turning], np.int64),
         reach=math.ceil(float(np.max(np.abs(body.translate))) / pitch) + 1,
     )
-    _simulate_all(body, rules, lattice, moving, turning, lasting)
+    _simulate_all(body, lattice, moving, turning)
     return lattice
 
 
@@ -104,26 +98,14 @@ def coordinates(
 
 @njit(cache=True, nogil=True)
 def _simulate_all(
-    body: Body,
-    rules: Rules,
-    lattice: Lattice,
-    moving: NDArray[np.int64],
-    turning: NDArray[np.int64],
-    lasting: NDArray[np.bool_],
+    body: Body, lattice: Lattice, moving: NDArray[np.int64], turning: NDArray[np.int64]
 ) -> None:
     ny, nx, headings = lattice.valid.shape
-    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
     for j in range(ny):
         for i in range(nx):
             for h in range(headings):
                 x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
                 if in_collision(body, x, y, theta):
-                    continue
-                read_predicates(rules, x, y, theta, values, stack, predicates)
-                kept = True
-                for k in range(lasting.shape[0]):
-                    kept = kept and (not lasting[k] or predicates[k] > rules.margin)
-                if not kept:
                     continue
                 lattice.valid[j, i, h] = 1
                 for d in range(moving.shape[0]):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
 from specshield.errors import FragmentError, PolicyError
-from specshield.policy.latest import latest_times, masks_of
-from specshield.policy.lattice import MAX_POSES, heading_count, holds_at, make_lattice
+from specshield.policy.latest import Phase, latest_times, masks_of, phases_of
+from specshield.policy.lattice import heading_count, holds_at, make_lattice
 from specshield.policy.policy import Card, Proposal, make_card, read_tensors, wait_motion
 from specshield.policy.progress import (
     ALWAYS,
@@ -29,6 +29,7 @@ from specshield.policy.search import INVALID, SCALE, Tables, propose_all
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
 
+MAX_ENTRIES = 100_000_000  # 400 MB while the tables are made
 BAND = -3.0  # [steps] of slack: how far the tables are trusted not to err
 
 
@@ -125,12 +126,12 @@ def synthesise(
     settings = settings or Settings()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     goals = _check(task, rules)
-    _check_size(task, settings)
-    lattice = make_lattice(body, rules, settings.pitch, _end(rules, goals))
-    masks = masks_of(rules, goals)
-    latest = latest_times(lattice, rules, holds_at(body, rules, lattice), goals, masks, task.horizon)
-    tables = _pack(lattice.valid, latest, masks, goals, len(rules.kind), settings.pitch)
-    start = latest[masks.index(0)][lattice.valid == 1]
+    _check_size(task, rules, goals, settings)
+    lattice = make_lattice(body, settings.pitch)
+    masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
+    latest, valid = latest_times(lattice, rules, holds_at(body, rules, lattice), goals, masks, phases)
+    tables = _pack(latest, valid, masks, phases, goals, len(rules.kind), settings.pitch)
+    start = latest[0, masks.index(0)][valid[0] == 1]
     metrics = {
         "feasible_start": round(float((start >= 0.0).mean()), 4) if len(start) else 0.0,
         "size_bytes": int(tables.code.nbytes + tables.cell.nbytes),
@@ -145,9 +146,9 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
     settings = read_settings(card.get("options", {}))
     rules = make_rules(task)
     goals = _check(task, rules)
-    _check_size(task, settings)
+    _check_size(task, rules, goals, settings)
     tensors = read_tensors(weights)
-    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 1)}
+    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
     for name, (dtype, rank) in wanted.items():
         array = tensors.get(name)
         if array is None or array.dtype != dtype or array.ndim != rank:
@@ -158,8 +159,9 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
             )  # fmt: skip
     cell, code, table = tensors["cell"], tensors["code"], tensors["table"]
     shape, headings = _shape(task, settings)
+    phases = phases_of(rules, task.horizon)
     fits = (
-        cell.shape == shape and code.shape[2] == headings and table.shape == (1 << len(goals),)
+        cell.shape == shape and code.shape[2] == headings and table.shape == (len(phases), 1 << len(goals))
         and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
         and table.min() >= -1 and table.max() < code.shape[0]
     )  # fmt: skip
@@ -167,12 +169,11 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
         raise PolicyError(
             "the tables do not fit the task", path="weights",
             got=[list(cell.shape), list(code.shape), list(table.shape)],
-            expected=f"cell {list(shape)}, code [tables, cells, {headings}], table [{1 << len(goals)}]",
+            expected=f"cell {list(shape)}, code [tables, cells, {headings}], "
+            f"table [{len(phases)}, {1 << len(goals)}]",
         )  # fmt: skip
-    tables = Tables(
-        np.ascontiguousarray(cell), np.ascontiguousarray(code), np.ascontiguousarray(table),
-        _bits(goals, len(rules.kind)), settings.pitch,
-    )  # fmt: skip
+    cell, code, table = (np.ascontiguousarray(array) for array in (cell, code, table))
+    tables = Tables(cell, code, table, *_times(phases), _bits(goals, len(rules.kind)), settings.pitch)
     return ReachabilityPolicy(task, card, settings, tables)
 
 
@@ -187,21 +188,7 @@ def _check(task: Task, rules: Rules) -> NDArray[np.int64]:
             "reachability needs a robot that can wait", path="robot", got=list(task.robot.action_names),
             expected="an action with translate 0 and rotate 0; or method 'dqn'",
         )  # fmt: skip
-    goals = np.flatnonzero(rules.kind != ALWAYS)
-    end = _end(rules, goals)
-    for k in np.flatnonzero(rules.kind == ALWAYS):
-        if rules.a[k] > 0 or rules.b[k] < end:
-            raise FragmentError(
-                "reachability does not cover a G that begins late or ends before another window",
-                path="formula", got=f"G[{rules.a[k]},{rules.b[k]}]",
-                expected=f"G[0,b] with b >= {end}; or method 'dqn'",
-            )  # fmt: skip
-    return goals
-
-
-def _end(rules: Rules, goals: NDArray[np.int64]) -> int:
-    """The step by which every goal is decided."""
-    return int(rules.last[goals].max()) if len(goals) else 0
+    return np.flatnonzero(rules.kind != ALWAYS)
 
 
 def _shape(task: Task, settings: Settings) -> tuple[tuple[int, int], int]:
@@ -212,12 +199,14 @@ def _shape(task: Task, settings: Settings) -> tuple[tuple[int, int], int]:
     return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
 
 
-def _check_size(task: Task, settings: Settings) -> None:
+def _check_size(task: Task, rules: Rules, goals: NDArray[np.int64], settings: Settings) -> None:
     (ny, nx), headings = _shape(task, settings)
-    if ny * nx * headings > MAX_POSES:
+    tables = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
+    if ny * nx * headings * tables > MAX_ENTRIES:
         raise PolicyError(
-            "the lattice is too large", path="options.pitch", got=f"{ny} x {nx} x {headings} poses",
-            expected=f"at most {MAX_POSES}: a larger pitch",
+            "the tables are too large", path="options.pitch",
+            got=f"{tables} tables of {ny} x {nx} x {headings} poses",
+            expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer windows that overlap",
         )  # fmt: skip
 
 
@@ -228,24 +217,35 @@ def _bits(goals: NDArray[np.int64], obligations: int) -> NDArray[np.int64]:
 
 
 def _pack(
-    valid: NDArray[np.uint8],
     latest: NDArray[np.float32],
+    valid: NDArray[np.uint8],
     masks: list[int],
+    phases: tuple[Phase, ...],
     goals: NDArray[np.int64],
     obligations: int,
     pitch: float,
 ) -> Tables:
-    used = valid.any(axis=2)
+    used = valid.any(axis=(0, 3))
     cell = np.full(used.shape, -1, np.int32)
     cell[used] = np.arange(int(used.sum()))
-    kept = [
-        n for n, mask in enumerate(masks) if mask != (1 << len(goals)) - 1
-    ]  # with every goal settled: no table
-    code = np.zeros((len(kept), int(used.sum()), valid.shape[2]), np.uint16)
-    table = np.full(1 << len(goals), -1, np.int32)
-    for row, n in enumerate(kept):
-        values = latest[n][used]
-        code[row] = np.where(values >= 0.0, 1.0 + np.floor(SCALE * values), 0.0).astype(np.uint16)
-        code[row][valid[used] == 0] = INVALID
-        table[masks[n]] = row
-    return Tables(cell, code, table, _bits(goals, obligations), pitch)
+    table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
+    codes: list[NDArray[np.uint16]] = []
+    for i in range(len(phases)):
+        for n, mask in enumerate(masks):
+            values = latest[i, n][used]
+            settled = mask == masks[0] and i == len(phases) - 1  # nothing left to do
+            if settled or not np.any(values >= 0.0):
+                continue
+            code = np.where(values >= 0.0, 1.0 + np.floor(SCALE * values), 0.0).astype(np.uint16)
+            code[valid[i][used] == 0] = INVALID
+            table[i, mask] = len(codes)
+            codes.append(code)
+    shape = (len(codes), int(used.sum()), valid.shape[3])
+    code = np.array(codes, np.uint16).reshape(shape)
+    return Tables(cell, code, table, *_times(phases), _bits(goals, obligations), pitch)
+
+
+def _times(phases: tuple[Phase, ...]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """The phase of each step, and each phase's last step."""
+    ends = np.array([phase.end for phase in phases], np.int32)
+    return np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32), ends

@@ -40,14 +40,17 @@ class Tables(NamedTuple):
     """Latest feasible times, stored over the cells that have a valid pose.
 
     cell [ny, nx]: row of `code`, -1 where no pose is valid. code [P, cells, H]: INVALID, 0 for never, else
-    1 + SCALE * L. table [2^G]: which table a set of settled goals has, -1 if it has none. bit [K]: the
-    obligation's bit
-    in that set, 0 for an `always`.
+    1 + SCALE * L. table [phases, 2^G]: which table a set of settled goals has in a phase, -1 if it has none.
+    phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
+    settled
+    goals, 0 for an `always`.
     """
 
     cell: NDArray[np.int32]
     code: NDArray[np.uint16]
     table: NDArray[np.int32]
+    phase: NDArray[np.int32]
+    end: NDArray[np.int32]
     bit: NDArray[np.int64]
     pitch: float
 
@@ -106,19 +109,28 @@ def slack(
         every |= tables.bit[k]
         if status[k] == SETTLED:
             mask |= tables.bit[k]
-    if mask == every:
+    if mask == every and tables.phase[t] == len(tables.end) - 1:
         return SAFE
     v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
     best = HOPELESS
-    if tables.table[mask] >= 0:
-        best = latest_at(tables, tables.table[mask], v, u, h) - t
+    table = tables.table[tables.phase[t], mask]
+    if table >= 0:
+        best = latest_at(tables, table, v, u, h) - t
     for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
-            ahead = tables.table[mask | tables.bit[k]]
-            if ahead >= 0:
-                left = rules.b[k] - rules.c2[k] + 1 - run[k]
-                best = max(best, latest_at(tables, ahead, v, u, h) - t - left)
+            over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
+            if over < tables.phase.shape[0]:
+                best = max(best, _after_dwell(tables, mask | tables.bit[k], every, over, v, u, h))
     return best
+
+
+@njit(cache=True, nogil=True)
+def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: float, h: float) -> float:
+    """The slack once a dwell is over, at step t and where it was begun."""
+    if mask == every and tables.phase[t] == len(tables.end) - 1:
+        return float(tables.end[-1] - t)
+    table = tables.table[tables.phase[t], mask]
+    return latest_at(tables, table, v, u, h) - t if table >= 0 else HOPELESS
 
 
 @njit(cache=True, nogil=True)
@@ -137,19 +149,25 @@ def _score(
     x: float,
     y: float,
     theta: float,
+    t: int,
     status: NDArray[np.int8],
     run: NDArray[np.int64],
     wait: int,
     scores: NDArray[np.float64],
 ) -> None:
-    """L after each motion (M,), contact and the step's own progress left out: a cheap order to try motions
+    """L after each motion (M,) from x_t, contact and the step's own progress left out: a cheap order to try
+    motions
     in.
     """
-    mask = 0
+    mask, every = 0, 0
     for k in range(status.shape[0]):
+        every |= tables.bit[k]
         if status[k] == SETTLED:
             mask |= tables.bit[k]
-    table = tables.table[mask]
+    if mask == every and tables.phase[t + 1] == len(tables.end) - 1:
+        scores[:] = SAFE
+        return
+    table = tables.table[tables.phase[t + 1], mask]
     headings = tables.code.shape[2]
     v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
     grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
@@ -160,12 +178,12 @@ def _score(
         if w < 0.0:
             w += headings
         scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w) if table >= 0 else HOPELESS
-    for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
+    for k in range(status.shape[0]):
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
-            ahead = tables.table[mask | tables.bit[k]]
-            if ahead >= 0:
-                left = rules.b[k] - rules.c2[k] + 1 - run[k]
-                scores[wait] = max(scores[wait], latest_at(tables, ahead, v, u, h) - left + 1.0)
+            over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
+            if over < tables.phase.shape[0]:
+                spare = _after_dwell(tables, mask | tables.bit[k], every, over, v, u, h)
+                scores[wait] = max(scores[wait], spare + t + 1.0)
 
 
 @njit(cache=True, nogil=True)
@@ -197,12 +215,15 @@ def greedy(
     read_predicates(rules, x, y, theta, values, stack, predicates)
     advance(rules, t + 1, predicates, status, run)
     ahead = slack(body, rules, tables, x, y, theta, t + 1, status, run)
+    last_phase = len(tables.end) - 1
     motions[0] = first
     poses[0, 0], poses[0, 1], poses[0, 2] = x, y, theta
     n = 1
-    while n < steps and not goals_settled(rules, status):
-        _score(body, rules, tables, x, y, theta, status, run, wait, scores)
-        if not _pays_to_wait(rules, t + n, predicates, status):
+    while n < steps and not (goals_settled(rules, status) and tables.phase[t + n] == last_phase):
+        _score(body, rules, tables, x, y, theta, t + n, status, run, wait, scores)
+        phase = tables.phase[t + n + 1]
+        waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - 0.1
+        if not waits_for_phase and not _pays_to_wait(rules, t + n, predicates, status):
             scores[wait] = HOPELESS
         last = motions[n - 1]
         for m in range(scores.shape[0]):  # tables err by a little: never straight back
@@ -240,7 +261,7 @@ def greedy(
             motions[n] = wait
             poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
             n += 1
-            if np.any(status != kept_status):
+            if np.any(status != kept_status) or n == steps or tables.phase[t + n + 1] != phase:
                 break
         if _is_broken(status):
             break
@@ -310,6 +331,7 @@ def beam(
                     here[w, 0],
                     here[w, 1],
                     here[w, 2],
+                    t + n,
                     here_status[w],
                     here_run[w],
                     wait,
