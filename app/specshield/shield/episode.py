@@ -251,7 +251,8 @@ def _history(poses: ArrayLike) -> Floats:
     """Poses [t + 1, 3] with theta in (-pi, pi], as f has it. Raises PoseError where they are not finite."""
     array = np.array(poses, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not np.isfinite(array).all():
-        raise PoseError("not poses", path="poses", got=str(poses)[:80], expected="a list of finite [x, y, theta]")
+        got = str(poses)[:80]
+        raise PoseError("not poses", path="poses", got=got, expected="a list of finite [x, y, theta]")
     array[:, 2] = [wrap(theta) for theta in array[:, 2]]
     return array
 
