@@ -121,17 +121,17 @@ def evaluate(
 
 def train(
     case: Annotated[str, typer.Option(help="A case of maps/.")],
-    method: Annotated[str, typer.Option(help="How the policy is made: dqn.")] = "dqn",
+    method: Annotated[str, typer.Option(help="How the policy is made: dqn or reachability.")] = "dqn",
     seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
     option: Annotated[list[str] | None, typer.Option(help="A setting, as units=128; repeatable.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: models/<case>]")] = None,
     resume: Annotated[bool, typer.Option(help="Take up a run that was killed.")] = False,
 ) -> None:
-    """Train a policy for a case; it shows how far it is and how often it satisfies the rule."""
-    from specshield.sim import commands
+    """Make a policy for a case. Learning shows how far it is and how often the rule is satisfied."""
+    from specshield.sim import training
 
-    raise typer.Exit(commands.train(case, method, seed, updates, option or [], out, resume))
+    raise typer.Exit(training.train(case, method, seed, updates, option or [], out, resume))
 
 
 if __name__ == "__main__":

@@ -86,7 +86,7 @@ def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
     command.wait()
     assert not (out / "card.json").exists()
     done = specshield(*arguments, "--resume")
-    assert "of 50 starts" in done.stdout
+    assert "satisfies alone from" in done.stdout
     assert sorted(path.name for path in out.iterdir()) == ["card.json", "policy.safetensors"]
     card = json.loads((out / "card.json").read_text())
     assert card["options"]["units"] == 8
@@ -94,12 +94,20 @@ def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
     load_policy((out / "policy.safetensors").read_bytes(), card, case.task)
 
 
+def test_train_computes_a_policy_too(tmp_path):
+    done = specshield("train", "--case", "case1", "--method", "reachability", "--out", str(tmp_path))
+    assert "feasible from" in done.stdout
+    card = json.loads((tmp_path / "card.json").read_text())
+    assert card["metrics"]["feasible_start"] > 0.95
+    load_policy((tmp_path / "policy.safetensors").read_bytes(), card, load_case("case1").task)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["evaluate", "--case", "case9"], "one of case1, case2"),
         (["train", "--case", "case1", "--option", "units=9000"], "from 4 to 128"),
-        (["train", "--case", "case1", "--method", "magic"], "only a DQN"),
+        (["train", "--case", "case1", "--method", "magic"], "'dqn' or 'reachability'"),
     ],
 )
 def test_a_mistake_is_told_in_a_line(arguments, said):

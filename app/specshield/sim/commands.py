@@ -1,21 +1,16 @@
-"""What `specshield demo`, `evaluate` and `train` do. Each returns the command's exit status."""
+"""What `specshield demo` and `evaluate` do. Each returns the command's exit status."""
 
 from __future__ import annotations
 
 import json
-import shutil
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from specshield.client import ShieldClient
-from specshield.errors import Unsupported
-from specshield.policy.settings import read_settings
 from specshield.sim import picture, report
 from specshield.sim.campaign import Campaign, run
-from specshield.sim.cases import MODELS, Case, case_names, load_case
+from specshield.sim.cases import Case, case_names, load_case
 from specshield.sim.progress import StatusLine, duration
 from specshield.sim.service import own_server
 
@@ -61,60 +56,6 @@ def evaluate(case: str, runs: int, seed: int, as_json: bool) -> int:
     else:
         print(report.table([figures]))
     return _exit_status([campaign])
-
-
-def train(
-    case: str,
-    method: str,
-    seed: int,
-    updates: int | None,
-    options: Sequence[str],
-    out: Path | None,
-    resume: bool,
-) -> int:
-    """Trains pi_phi for a case and writes policy.safetensors and card.json to `out`.
-
-    options: "name=value", of `policy.settings.Settings`. What is done is saved to `out`/checkpoint at every
-    evaluation; `resume` takes that up after a kill.
-    """
-    if method != "dqn":
-        raise Unsupported("only a DQN is trained", path="method", got=method, expected="'dqn'")
-    from specshield.policy.dqn import Progress, train
-
-    settings = read_settings(_options(options) | ({} if updates is None else {"updates": updates}))
-    loaded, out, status = load_case(case), out or MODELS / case, StatusLine()
-    checkpoint = out / "checkpoint"
-    if not resume:
-        shutil.rmtree(checkpoint, ignore_errors=True)
-
-    def show(progress: Progress) -> None:
-        rate = "not measured yet" if progress.satisfied is None else f"satisfied {progress.satisfied:.1%}"
-        done = f"{case}: update {progress.update} of {progress.updates}"
-        status.say(f"{done}, {rate}, {duration(progress.eta_s)} left")
-
-    policy = train(loaded.task, settings, seed, show, checkpoint, spec=dict(loaded.spec))
-    (out / "policy.safetensors").write_bytes(policy.weights())
-    (out / "card.json").write_text(json.dumps(policy.card, indent=1) + "\n")
-    shutil.rmtree(checkpoint)
-    status.clear()
-    metrics = policy.card["metrics"]
-    print(
-        f"{out}: satisfies from {metrics['satisfied']:.1%} of {metrics['starts']} starts, "
-        f"{metrics['feasible_start']:.1%} after some first action; {duration(metrics['wall_time_s'])}"
-    )
-    return 0
-
-
-def _options(texts: Sequence[str]) -> dict[str, Any]:
-    """The settings that "name=value" texts name, each value read as JSON or else as the text it is."""
-    settings: dict[str, Any] = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            settings[name] = json.loads(value)
-        except ValueError:
-            settings[name] = value
-    return settings
 
 
 def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: StatusLine) -> Campaign:
