@@ -64,7 +64,9 @@ WORLDS = {
 
 @pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
 def test_s_t_is_the_exact_feasible_set_where_it_can_be_enumerated(cells):
-    """On a lattice that f never leaves, every pose at every step of random ways: none claimed falsely, none missed."""
+    """On a lattice that f never leaves, every pose at every step of random ways: none claimed falsely, none
+    missed.
+    """
     shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
     random, seen = np.random.default_rng(2), set()
     for i, j, heading in [(i, j, h) for i, j in ((0, 0), (0, 1), (2, 1), (2, 2), (4, 2)) for h in range(4)]:

@@ -27,12 +27,16 @@ from specshield.policy.progress import (
     read_predicates,
     value_count,
 )
-from specshield.robot.unicycle import Body, step
+from specshield.robot.unicycle import Body, simulate, step
 
 SCALE = 64.0  # table codes a step
 INVALID = 65535  # code of a pose that is in collision or breaks a lasting `always`
 HOPELESS = -1e9
 SAFE = 1e6
+PATIENCE = 5  # steps without gain after which the greedy walk is taken to go round in a circle
+ESCAPE_GAIN = 2.0  # [steps] later than where it got stuck: what a way out has to reach
+ESCAPE_DEPTH = 24
+MAX_ESCAPES = 8
 NUDGE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
 
 
@@ -197,14 +201,17 @@ def greedy(
     run: NDArray[np.int64],
     first: int,
     wait: int,
+    width: int,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> tuple[bool, float]:
     """Follows the latest feasible time uphill from (x_t, t) to the horizon, after the motion `first`.
 
-    status, run (K,): progress after x_t, left as they are. Writes motions (T - t,), poses (T - t, 3).
-    Returns whether
-    every goal was settled and nothing broken, and the slack after the first motion.
+    Where the tables lead it round in a circle, a beam of `width` looks for a way out. status, run (K,):
+    progress
+    after x_t, left as they are. Writes motions (T - t,), poses (T - t, 3). Returns whether every goal was
+    settled
+    and nothing broken, and the slack after the first motion.
     """
     k_count, steps = status.shape[0], motions.shape[0]
     status, run = status.copy(), run.copy()
@@ -219,7 +226,35 @@ def greedy(
     motions[0] = first
     poses[0, 0], poses[0, 1], poses[0, 2] = x, y, theta
     n = 1
+    high, high_n, escapes = ahead + t + 1, n, 0  # the latest time reached so far, and the state there
+    high_pose, high_status, high_run = poses[0].copy(), status.copy(), run.copy()
     while n < steps and not (goals_settled(rules, status) and tables.phase[t + n] == last_phase):
+        if n > high_n:
+            value = slack(body, rules, tables, x, y, theta, t + n, status, run) + t + n
+            if value > high + 0.25 or np.any(status != high_status):
+                high, high_n = value, n
+                high_pose[0], high_pose[1], high_pose[2] = x, y, theta
+                high_status[:], high_run[:] = status, run
+            elif n - high_n >= PATIENCE:
+                if escapes == MAX_ESCAPES:
+                    break
+                escapes += 1
+                depth = min(steps - high_n, ESCAPE_DEPTH)
+                taken = beam(
+                    body, rules, tables, high_pose, t + high_n, high_status, high_run, -1, wait, width,
+                    0.5 * HOPELESS, high + ESCAPE_GAIN, motions[high_n : high_n + depth],
+                )  # fmt: skip
+                if taken == 0:
+                    break
+                x, y, theta = high_pose[0], high_pose[1], high_pose[2]
+                status[:], run[:] = high_status, high_run
+                for n in range(high_n, high_n + taken):
+                    x, y, theta = step(body, x, y, theta, motions[n])
+                    poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+                    read_predicates(rules, x, y, theta, values, stack, predicates)
+                    advance(rules, t + n + 1, predicates, status, run)
+                n = high_n + taken
+                continue
         _score(body, rules, tables, x, y, theta, t + n, status, run, wait, scores)
         phase = tables.phase[t + n + 1]
         waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - 0.1
@@ -265,6 +300,7 @@ def greedy(
                 break
         if _is_broken(status):
             break
+        high, high_n = -np.inf, n - 1  # waiting is no circle: what comes next counts anew
     for rest in range(n, steps):
         motions[rest] = wait
         poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
@@ -299,13 +335,16 @@ def beam(
     wait: int,
     width: int,
     band: float,
+    target: float,
     motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-) -> bool:
-    """Keeps the `width` poses with the most slack at every step; True once one has settled every goal.
+) -> int:
+    """Keeps the `width` poses with the most slack at every step, until one has settled every goal or has a
+    latest
+    feasible time above `target`.
 
-    band: poses with less slack than this are given up. Other arguments as `greedy`; motions and poses are
-    written only on success.
+    first: the first motion, -1 for any. band: poses with less slack than this are given up. Returns how
+    many of
+    motions (n,) it took, 0 where none was found.
     """
     k_count, m_count, steps = status.shape[0], body.translate.shape[0], motions.shape[0]
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(k_count)
@@ -323,7 +362,7 @@ def beam(
     for n in range(steps):
         found = 0
         for w in range(count):
-            if n > 0:
+            if n > 0 or first < 0:
                 _score(
                     body,
                     rules,
@@ -338,7 +377,7 @@ def beam(
                     scores,
                 )
             for m in range(m_count):
-                if m != first if n == 0 else scores[m] - (t + n + 1) < band:
+                if m != first if n == 0 and first >= 0 else scores[m] - (t + n + 1) < band:
                     continue
                 x, y, theta = step(body, here[w, 0], here[w, 1], here[w, 2], m)
                 read_predicates(rules, x, y, theta, values, stack, predicates)
@@ -350,9 +389,12 @@ def beam(
                 new[found, 0], new[found, 1], new[found, 2] = x, y, theta
                 new_slack[found], new_from[found], new_motion[found] = ahead, w, m
                 found += 1
-                if ahead == SAFE:
-                    _write(body, pose, n, w, m, parent, taken, wait, motions, poses)
-                    return True
+                if ahead == SAFE or ahead + (t + n + 1) > target:
+                    motions[n] = m
+                    for back in range(n - 1, -1, -1):
+                        motions[back] = taken[back, w]
+                        w = parent[back, w]
+                    return n + 1
         count = 0
         order = np.argsort(-new_slack[:found], kind="mergesort")
         for o in order:
@@ -364,8 +406,8 @@ def beam(
             parent[n, count], taken[n, count] = new_from[o], new_motion[o]
             count += 1
         if count == 0:
-            return False
-    return False
+            return 0
+    return 0
 
 
 @njit(cache=True, nogil=True)
@@ -392,30 +434,6 @@ def _is_twin(
 
 
 @njit(cache=True, nogil=True)
-def _write(
-    body: Body,
-    pose: NDArray[np.float64],
-    last: int,
-    w: int,
-    m: int,
-    parent: NDArray[np.int32],
-    taken: NDArray[np.int16],
-    wait: int,
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-) -> None:
-    motions[last + 1 :] = wait
-    motions[last] = m
-    for n in range(last - 1, -1, -1):
-        motions[n] = taken[n, w]
-        w = parent[n, w]
-    x, y, theta = pose[0], pose[1], pose[2]
-    for n in range(motions.shape[0]):
-        x, y, theta = step(body, x, y, theta, motions[n])
-        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-
-
-@njit(cache=True, nogil=True)
 def propose_all(
     body: Body,
     rules: Rules,
@@ -430,19 +448,25 @@ def propose_all(
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> int:
-    """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); the motion of most
-    slack.
+    """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); returns the motion of
+    most slack.
 
-    The beam is tried where the greedy one fails and the table sees at least `band` steps of slack (it errs
-    a little).
+    The beam is tried all the way where the greedy walk fails and the tables see at least `band` steps of
+    slack
+    (they err a little).
     """
     best, best_slack = wait, -np.inf
+    found = np.empty(motions.shape[1], np.int64)
     for m in range(motions.shape[0]):
-        settled, ahead = greedy(body, rules, tables, pose, t, status, run, m, wait, motions[m], poses[m])
+        settled, ahead = greedy(
+            body, rules, tables, pose, t, status, run, m, wait, width, motions[m], poses[m]
+        )
         if not settled and ahead >= band:
-            settled = beam(
-                body, rules, tables, pose, t, status, run, m, wait, width, band, motions[m], poses[m]
-            )
+            taken = beam(body, rules, tables, pose, t, status, run, m, wait, width, band, np.inf, found)
+            if taken > 0:
+                motions[m, :taken] = found[:taken]
+                motions[m, taken:] = wait
+                simulate(body, pose, motions[m], poses[m])
         if ahead > best_slack or (ahead == best_slack and m == wait):
             best, best_slack = m, ahead
     return best
