@@ -5,7 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+from tests.serving import serving
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -39,17 +39,14 @@ def test_the_loop_with_curl_alone(server):
     assert re.fullmatch(r"rule satisfied after \d+ steps\n", run(server, "bash", "-c", loop))
 
 
-@pytest.mark.parametrize(
-    ("mentions", "answer"),
-    [
-        ("/v1/maps", '"id":"'),
-        ("/v1/specs/validate", '"horizon":120'),
-        ("/v1/policies", "training-unavailable"),  # the tests' server trains nothing: all else was right
-    ],
-)
-def test_bring_your_own(server, mentions, answer):
-    (command,) = (block for block in blocks("bash") if mentions in block)
-    assert answer in run(server, "bash", "-c", command)
+def test_bring_your_own(tmp_path):
+    """Map, rule and robot to a policy and a session, on a server that makes policies."""
+    (commands,) = (block for block in blocks("bash") if "policies" in block)
+    with serving(tmp_path, SPECSHIELD_WORKER="true") as own:
+        *_, validated, made, session = run(own, "bash", "-c", commands).splitlines()
+    assert '"horizon":120' in validated
+    assert '"status":"ready"' in made
+    assert '"spec_status":"pending"' in session
 
 
 def test_the_table_is_of_both_cases():
