@@ -7,8 +7,11 @@ from pathlib import Path
 
 from tests.serving import serving
 
+from specshield.sim import report
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+TIMES = {"p50": 0.0, "p99": 0.0}
 ADDRESS = "http://127.0.0.1:8000"
 
 
@@ -49,6 +52,19 @@ def test_bring_your_own(tmp_path):
     assert '"spec_status":"pending"' in session
 
 
-def test_the_table_is_of_both_cases():
-    (table,) = (block for block in blocks("") if "rule satisfied" in block)
-    assert table.count("20 of 20") >= 2
+def test_the_table_is_what_the_demo_prints():
+    (printed,) = blocks("text")
+    figures = {
+        **dict.fromkeys(("satisfied", "main_done", "kl_per_decision", "kl_per_episode", "extra_steps"), 0),
+        "modes": {},
+        "spread": 1.0,
+        "round_trip_ms": TIMES,
+        "server_ms": TIMES,
+    }
+    table = report.table(
+        [{"case": "", "runs": 20, "refused_starts": 0, "without_shield": figures, "with_shield": figures}]
+    )
+    rows = [line[:26].rstrip() for line in table.splitlines()[2:]]
+    assert [line[:26].rstrip() for line in printed.splitlines()[-len(rows) :]] == rows
+    (kept,) = re.findall("^rule satisfied.*$", printed, re.MULTILINE)
+    assert kept.count("20 of 20") == 2

@@ -9,6 +9,7 @@ import random
 import httpx
 import numpy as np
 import pytest
+
 from specshield import errors
 from specshield.client import AsyncShieldClient, ShieldClient
 

@@ -10,8 +10,9 @@ import time
 
 import httpx
 import pytest
-import specshield.client
 from client_script import SESSION
+
+import specshield.client
 from specshield import errors
 from specshield.client import AsyncShieldClient, ShieldClient, aio, sync
 

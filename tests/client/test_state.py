@@ -4,6 +4,7 @@ import json
 
 import pytest
 from client_script import SESSION, answer, drive, lost, problem
+
 from specshield import errors
 from specshield.client.models import SessionInfo, build
 from specshield.client.state import SessionState

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from specshield import errors
 from specshield.client import wire
 from specshield.client.wire import Reply

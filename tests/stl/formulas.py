@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hypothesis import strategies as st
+
 from specshield import stl
 
 NAMES = ("x", "y", "Charger1", "Bedroom_2", "_", "GF", "notable")

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
 from specshield import stl
 from specshield.stl.formula import Node
 

@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+
 from specshield.world.geodesic import geodesic_distance
 
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
+
 from specshield.errors import MapError
 from specshield.world.map_server import dump_map, from_occupancy_grid, load_map
 from specshield.world.occupancy import OccupancyGrid

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+
 from specshield.errors import MapError
 from specshield.world.occupancy import MAX_SIDE, OccupancyGrid
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import ndimage
+
 from specshield.errors import MapError
 from specshield.world.procthor import load_house, start_pose
 from specshield.world.regions import Union, signed_distance
