@@ -1,4 +1,4 @@
-"""Reachability: the exact feasible set where every future can be tried, and refusals where it does not reach."""
+"""Reachability: the exact feasible set where every future can be tried, and what is refused."""
 
 from __future__ import annotations
 
