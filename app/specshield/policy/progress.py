@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from specshield.errors import FragmentError
 from specshield.stl import Obligation, obligations
 from specshield.stl.program import STACK_SIZE, compile_predicate, evaluate_packed, pack
 from specshield.task import POSE_NAMES, Task
@@ -47,8 +48,10 @@ class Rules(NamedTuple):
 
 
 def make_rules(task: Task, margin: float = 0.0) -> Rules:
-    """Compiles the task's formula. Raises FragmentError where it lies outside the paper's fragment."""
+    """Compiles the task's formula. Raises FragmentError outside the paper's fragment or MAX_OBLIGATIONS."""
     parts = obligations(task.formula)
+    if len(parts) > MAX_OBLIGATIONS:
+        raise FragmentError("too many obligations", got=len(parts), expected=f"at most {MAX_OBLIGATIONS}")
     names = [*POSE_NAMES, *task.regions, *task.signals]
     slots = {name: i for i, name in enumerate(names)}
     ops, args, starts = pack([compile_predicate(part.predicate, slots) for part in parts])

@@ -18,7 +18,6 @@ from specshield.policy.lattice import heading_count, holds_at, make_lattice
 from specshield.policy.policy import Card, Proposal, make_card, read_tensors, wait_motion
 from specshield.policy.progress import (
     ALWAYS,
-    MAX_OBLIGATIONS,
     Rules,
     forgive,
     make_rules,
@@ -125,8 +124,7 @@ def synthesise(
     began = time.perf_counter()
     settings = settings or Settings()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
-    goals = _check(task, rules)
-    _check_size(task, rules, goals, settings)
+    goals = _goals(task, rules, settings)
     lattice = make_lattice(body, settings.pitch)
     masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
     latest, valid = latest_times(lattice, rules, holds_at(body, rules, lattice), goals, masks, phases)
@@ -145,8 +143,7 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_settings(card.get("options", {}))
     rules = make_rules(task)
-    goals = _check(task, rules)
-    _check_size(task, rules, goals, settings)
+    goals = _goals(task, rules, settings)
     tensors = read_tensors(weights)
     wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
     for name, (dtype, rank) in wanted.items():
@@ -177,29 +174,19 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
     return ReachabilityPolicy(task, card, settings, tables)
 
 
-def _check(task: Task, rules: Rules) -> NDArray[np.int64]:
-    """The goals (obligations that are not `always`), where the tables cover the formula."""
-    if len(rules.kind) > MAX_OBLIGATIONS:
-        raise FragmentError(
-            "too many obligations", path="formula", got=len(rules.kind), expected=f"at most {MAX_OBLIGATIONS}"
-        )
+def check(task: Task, settings: Settings) -> None:
+    """Raises what `synthesise` would for a task it cannot serve, without making anything."""
+    _goals(task, make_rules(task), settings)
+
+
+def _goals(task: Task, rules: Rules, settings: Settings) -> NDArray[np.int64]:
+    """The obligations that are not `always`, where the tables cover task and settings."""
     if wait_motion(task.robot) < 0:
         raise FragmentError(
             "reachability needs a robot that can wait", path="robot", got=list(task.robot.action_names),
             expected="an action with translate 0 and rotate 0; or method 'dqn'",
         )  # fmt: skip
-    return np.flatnonzero(rules.kind != ALWAYS)
-
-
-def _shape(task: Task, settings: Settings) -> tuple[tuple[int, int], int]:
-    ny, nx = (
-        max(int(np.ceil(n * task.grid.resolution / settings.pitch - 1e-9)), 1)
-        for n in (task.grid.height, task.grid.width)
-    )
-    return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
-
-
-def _check_size(task: Task, rules: Rules, goals: NDArray[np.int64], settings: Settings) -> None:
+    goals = np.flatnonzero(rules.kind != ALWAYS)
     (ny, nx), headings = _shape(task, settings)
     tables = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
     if ny * nx * headings * tables > MAX_ENTRIES:
@@ -208,6 +195,15 @@ def _check_size(task: Task, rules: Rules, goals: NDArray[np.int64], settings: Se
             got=f"{tables} tables of {ny} x {nx} x {headings} poses",
             expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer windows that overlap",
         )  # fmt: skip
+    return goals
+
+
+def _shape(task: Task, settings: Settings) -> tuple[tuple[int, int], int]:
+    ny, nx = (
+        max(int(np.ceil(n * task.grid.resolution / settings.pitch - 1e-9)), 1)
+        for n in (task.grid.height, task.grid.width)
+    )
+    return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
 
 
 def _bits(goals: NDArray[np.int64], obligations: int) -> NDArray[np.int64]:

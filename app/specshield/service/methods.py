@@ -37,6 +37,16 @@ def complete(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return asdict(reachability.read_settings(options))
 
 
+def check(method: str, task: Task, options: Mapping[str, Any]) -> None:
+    """Raises what `make` would for a task that the method cannot serve. Needs no torch."""
+    from specshield.policy import reachability
+    from specshield.policy.progress import make_rules
+
+    if method == "reachability":
+        reachability.check(task, reachability.read_settings(options))
+    make_rules(task)
+
+
 def make(
     method: str,
     task: Task,

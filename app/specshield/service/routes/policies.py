@@ -8,14 +8,13 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import TypeAdapter
 
-from specshield.errors import InUse, SpecshieldError, TrainingUnavailable
+from specshield.errors import FragmentError, InUse, TrainingUnavailable
 from specshield.service import examples, methods
 from specshield.service.jobs import Training
 from specshield.service.policies import Description, Record, describe
 from specshield.service.routes import uploads
 from specshield.service.schemas import Card, Id, PolicyList, PolicyRequest, PolicyResponse
 from specshield.service.state import Cursor, Limit, Server, ServerState, problems
-from specshield.stl import obligations
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
 MODELS = (PolicyRequest,)  # documented by hand
@@ -72,9 +71,9 @@ def _ask(server: Server, content: bytes) -> dict[str, Any]:
     about = server.policies.resolve(about)
     task = server.policies.task(about)
     try:
-        obligations(task.formula)
-    except SpecshieldError as error:
-        raise error.at("spec") from None
+        methods.check(asked.method, task, options)
+    except FragmentError as error:
+        raise (error if error.path == "robot" else error.at("spec.formula")) from None
     record = server.policies.find(about, task)
     if record is not None and _training(server, record).status != "failed":
         return _show(server, record)
