@@ -434,6 +434,77 @@ def _is_twin(
 
 
 @njit(cache=True, nogil=True)
+def retrace(
+    body: Body,
+    rules: Rules,
+    tables: Tables,
+    pose: NDArray[np.float64],
+    t: int,
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+    first: int,
+    back: int,
+    wait: int,
+    base: NDArray[np.int64],
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+) -> bool:
+    """Tries `first`, the motion `back` that undoes it (-1: none is needed), then `base`, a way from x_t to
+    every goal.
+
+    The steps lost are made up for where `base` (T - t,) waits. Other arguments and result as `greedy`.
+    """
+    steps, last_phase = motions.shape[0], len(tables.end) - 1
+    status, run = status.copy(), run.copy()
+    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(status.shape[0])
+    behind = 1 if back < 0 else 2
+    x, y, theta = pose[0], pose[1], pose[2]
+    n, at = 0, 0
+    while n < steps:
+        if n == 0:
+            motion = first
+        elif n == 1 and back >= 0:
+            motion = back
+        else:
+            while behind > 0 and at < steps and base[at] == wait:
+                at += 1
+                behind -= 1
+            motion = base[at] if at < steps else wait
+            at += 1
+        x, y, theta = step(body, x, y, theta, motion)
+        motions[n] = motion
+        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+        n += 1
+        read_predicates(rules, x, y, theta, values, stack, predicates)
+        advance(rules, t + n, predicates, status, run)
+        over = goals_settled(rules, status) and tables.phase[t + n] == last_phase
+        if over or _is_broken(status):
+            break
+    motions[n:] = wait
+    for rest in range(n, steps):
+        poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
+    return goals_settled(rules, status)
+
+
+@njit(cache=True, nogil=True)
+def _undoing(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]) -> int:
+    """The motion that leads from `reached` back to `pose`, -1 where it is the same, -2 where none does."""
+    if _same(pose[0], pose[1], pose[2], reached):
+        return -1
+    for m in range(body.translate.shape[0]):
+        x, y, theta = step(body, reached[0], reached[1], reached[2], m)
+        if _same(x, y, theta, pose):
+            return m
+    return -2
+
+
+@njit(cache=True, nogil=True)
+def _same(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
+    turn = abs(theta - pose[2])
+    return abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6
+
+
+@njit(cache=True, nogil=True)
 def propose_all(
     body: Body,
     rules: Rules,
@@ -449,24 +520,58 @@ def propose_all(
     poses: NDArray[np.float64],
 ) -> int:
     """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); returns the motion of
-    most slack.
+    most
+    slack.
 
-    The beam is tried all the way where the greedy walk fails and the tables see at least `band` steps of
-    slack
-    (they err a little).
+    The motion of most slack is walked out greedily. For any other it is enough to undo it and go the same
+    way; where
+    that comes too late it is walked out itself, and where the walk fails though the tables see at least
+    `band` steps
+    of slack (they err a little), a beam looks all the way.
     """
-    best, best_slack = wait, -np.inf
-    found = np.empty(motions.shape[1], np.int64)
-    for m in range(motions.shape[0]):
-        settled, ahead = greedy(
-            body, rules, tables, pose, t, status, run, m, wait, width, motions[m], poses[m]
-        )
-        if not settled and ahead >= band:
+    count, steps = motions.shape
+    slacks, undo = np.empty(count), np.empty(count, np.int64)
+    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(status.shape[0])
+    for m in range(count):
+        x, y, theta = step(body, pose[0], pose[1], pose[2], m)
+        poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
+        undo[m] = _undoing(body, pose, poses[m, 0])
+        after_status, after_run = status.copy(), run.copy()
+        read_predicates(rules, x, y, theta, values, stack, predicates)
+        advance(rules, t + 1, predicates, after_status, after_run)
+        slacks[m] = slack(body, rules, tables, x, y, theta, t + 1, after_status, after_run)
+    preferred = wait if slacks[wait] == slacks.max() else int(np.argmax(slacks))
+    base, found = -1, np.empty(steps, np.int64)
+    for m in np.argsort(-slacks, kind="mergesort"):
+        settled = False
+        if base >= 0 and undo[m] >= -1:
+            settled = retrace(
+                body,
+                rules,
+                tables,
+                pose,
+                t,
+                status,
+                run,
+                m,
+                undo[m],
+                wait,
+                motions[base],
+                motions[m],
+                poses[m],
+            )
+        hopeful = slacks[m] >= band
+        if not settled and (hopeful or base < 0 or undo[m] < -1):
+            settled, _ = greedy(
+                body, rules, tables, pose, t, status, run, m, wait, width, motions[m], poses[m]
+            )
+        if not settled and hopeful:
             taken = beam(body, rules, tables, pose, t, status, run, m, wait, width, band, np.inf, found)
             if taken > 0:
+                settled = True
                 motions[m, :taken] = found[:taken]
                 motions[m, taken:] = wait
                 simulate(body, pose, motions[m], poses[m])
-        if ahead > best_slack or (ahead == best_slack and m == wait):
-            best, best_slack = m, ahead
-    return best
+        if settled and base < 0:
+            base = m
+    return preferred
