@@ -16,9 +16,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from specshield.policy.progress import STACK, Rules, read_predicates, value_count
-from specshield.robot.unicycle import Body, in_collision, step
+from specshield.robot.unicycle import TOUCH, Body, free_distance, in_collision, step, wrap
+from specshield.stl.program import VALUE
+from specshield.task import POSE_NAMES
 
 MAX_HEADINGS = 120
+HEADING_SLOT = POSE_NAMES.index("theta")
 
 
 class Lattice(NamedTuple):
@@ -101,22 +104,35 @@ def _simulate_all(
     body: Body, lattice: Lattice, moving: NDArray[np.int64], turning: NDArray[np.int64]
 ) -> None:
     ny, nx, headings = lattice.valid.shape
+    turns_within = body.radius + math.hypot(body.offset_x, body.offset_y) + TOUCH
+    moves_within = turns_within + np.max(np.abs(body.translate))
     for j in range(ny):
         for i in range(nx):
+            u, v = (i + 0.5) * lattice.pitch, (j + 0.5) * lattice.pitch
+            room = free_distance(body, u, v, moves_within)
             for h in range(headings):
                 x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
-                if in_collision(body, x, y, theta):
+                if room < turns_within and in_collision(body, x, y, theta):
                     continue
                 lattice.valid[j, i, h] = 1
                 for d in range(moving.shape[0]):
-                    nx_, ny_, nth = step(body, x, y, theta, moving[d])
-                    if nx_ != x or ny_ != y or nth != theta:
-                        v, u, w = coordinates(body, lattice.pitch, headings, nx_, ny_, nth)
+                    if room >= moves_within:  # nothing in reach: f without its search for contact
+                        distance = body.translate[moving[d]]
+                        x1, y1 = x + distance * math.cos(theta), y + distance * math.sin(theta)
+                        angle = body.rotate[moving[d]]
+                        theta1 = wrap(theta + angle) if angle != 0.0 else theta
+                    else:
+                        x1, y1, theta1 = step(body, x, y, theta, moving[d])
+                    if x1 != x or y1 != y or theta1 != theta:
+                        v, u, w = coordinates(body, lattice.pitch, headings, x1, y1, theta1)
                         lattice.far_u[j, i, h, d], lattice.far_v[j, i, h, d] = u, v
                         lattice.far_h[j, i, h, d] = round(w) % headings
                 for r in range(turning.shape[0]):
-                    _, _, nth = step(body, x, y, theta, turning[r])
-                    lattice.turns[j, i, h, r] = nth != theta
+                    if room >= turns_within:
+                        theta1 = wrap(theta + body.rotate[turning[r]])
+                    else:
+                        _, _, theta1 = step(body, x, y, theta, turning[r])
+                    lattice.turns[j, i, h, r] = theta1 != theta
 
 
 @njit(cache=True, nogil=True)
@@ -125,12 +141,17 @@ def holds_at(body: Body, rules: Rules, lattice: Lattice) -> NDArray[np.uint8]:
     ny, nx, headings = lattice.valid.shape
     out = np.zeros((rules.kind.shape[0], ny, nx, headings), np.uint8)
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
+    turns_matter = np.any((rules.ops == VALUE) & (rules.args == HEADING_SLOT))
     for j in range(ny):
         for i in range(nx):
+            fresh = True
             for h in range(headings):
-                if lattice.valid[j, i, h]:
+                if not lattice.valid[j, i, h]:
+                    continue
+                if fresh or turns_matter:
                     x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
                     read_predicates(rules, x, y, theta, values, stack, predicates)
-                    for k in range(predicates.shape[0]):
-                        out[k, j, i, h] = predicates[k] > rules.margin
+                    fresh = False
+                for k in range(predicates.shape[0]):
+                    out[k, j, i, h] = predicates[k] > rules.margin
     return out
