@@ -16,7 +16,9 @@ from specshield.shield.shaping import log_softmax
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 
-EPISODES = {"case1": 180, "case2": 36}
+EPISODES = {  # 212 of them; learned policies take longer to ask
+    ("case1", "dqn"): 64, ("case2", "dqn"): 20, ("case1", "reachability"): 64, ("case2", "reachability"): 64,
+}  # fmt: skip
 
 
 class Noise:
@@ -120,10 +122,11 @@ def check(decision, logits, terminal, horizon):
 
 
 def test_once_feasible_always_feasible_whatever_the_model_wants(case, shield):
+    n = EPISODES[case.name, shield.policies[0].card["method"]]
     with ThreadPoolExecutor(2) as threads:
-        outcomes = list(threads.map(lambda i: episode(case, shield, i), range(EPISODES[case.name])))
+        outcomes = list(threads.map(lambda i: episode(case, shield, i), range(n)))
     ran = [outcome for outcome in outcomes if outcome is not None]
-    assert len(ran) >= 0.9 * EPISODES[case.name]
+    assert len(ran) >= 0.95 * n
     assert all(rho > 0.0 for _, rho in ran)
     assert set().union(*(modes for modes, _ in ran)) >= {"shaped", "prior"}
 
