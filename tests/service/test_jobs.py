@@ -93,10 +93,9 @@ def test_a_policy_is_computed_and_serves(client):
 
 
 def test_a_run_that_cannot_be_says_why(client):
-    restless = {**ROBOT, "actions": [action for action in ROBOT["actions"] if action["name"] != "wait"]}
-    policy = ask(client, method="reachability", options={}, robot=restless)
-    wait_for(lambda: read(client, policy)["status"] == "failed", 30.0)
-    assert "wait" in read(client, policy)["error"]
+    policy = ask(client, robot={**ROBOT, "footprint": {"radius": 5.0}})
+    wait_for(lambda: read(client, policy)["status"] == "failed", 60.0)
+    assert "no free space" in read(client, policy)["error"]
 
 
 def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
