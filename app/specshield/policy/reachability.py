@@ -24,7 +24,8 @@ from specshield.policy.progress import (
     replay,
     signal_rows,
 )
-from specshield.policy.search import INVALID, SCALE, Tables, propose_all
+from specshield.policy.search import propose_all
+from specshield.policy.tables import INVALID, SCALE, Tables
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
 
@@ -66,7 +67,7 @@ def read_settings(options: Mapping[str, Any]) -> Settings:
 
 @dataclass(frozen=True, eq=False)
 class ReachabilityPolicy:
-    """Follows the tables of latest feasible times (policy/latest.py, policy/search.py)."""
+    """Follows the tables of latest feasible times (policy/tables.py, policy/search.py)."""
 
     task: Task
     card: Card
