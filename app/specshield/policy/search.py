@@ -229,7 +229,7 @@ def _undoing(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]
 @njit(cache=True, nogil=True)
 def _same(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
     turn = abs(theta - pose[2])
-    return abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6
+    return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)
 
 
 @njit(cache=True, nogil=True)
