@@ -35,11 +35,19 @@ lint: .venv/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: .venv/.dev
-	$(BIN)/python -m benchmarks
+# What only the benchmarks need stays out of .venv; the rest they take from it.
+.venv-bench/.done: .venv/.dev benchmarks/requirements.txt
+	$(BIN)/python -m venv .venv-bench
+	$(BIN)/python -c "import sysconfig as s; print(f'import site; site.addsitedir({s.get_path(\"purelib\")!r})')" \
+	  > $$(.venv-bench/bin/python -c "import sysconfig as s; print(s.get_path('purelib'))")/project.pth
+	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check -r benchmarks/requirements.txt
+	touch $@
+
+bench: .venv-bench/.done
+	.venv-bench/bin/python -m benchmarks $(ARGS)
 
 openapi: .venv/.server
 	$(BIN)/specshield openapi > openapi.json
 
 clean:
-	rm -rf .venv build out
+	rm -rf .venv .venv-bench build out

@@ -1,0 +1,1 @@
+"""What a decision costs beside the paper's algorithm written plainly: `make bench`."""

@@ -1,0 +1,92 @@
+"""How a decision grows with the horizon and with the number of distinct actions, on made tasks."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from benchmarks.decisions import ask, warm
+from benchmarks.states import State, shipped_dqn
+from benchmarks.timing import summary
+from specshield.policy import reachability
+from specshield.policy.environment import free_poses
+from specshield.policy.network import NAMES, make_network
+from specshield.policy.observation import observation_size
+from specshield.policy.policy import Policy, make_card
+from specshield.policy.progress import make_rules
+from specshield.robot import STRETCH, Robot
+from specshield.robot.actions import Action
+from specshield.robot.unicycle import make_body
+from specshield.shield.episode import make_shield
+from specshield.sim.cases import load_case
+from specshield.task import Task, make_task
+
+HORIZONS = (20, 50, 100, 200, 500, 1000)
+ACTIONS = (7, 16, 32, 64)
+UNITS = 64
+
+
+def by_horizon(horizons: tuple[int, ...], n: int, repeats: int, seed: int) -> list[dict[str, Any]]:
+    """Case 2 with its windows stretched to each horizon; the shipped DQN's weights see them as their own."""
+    case, rows = load_case("case2"), []
+    network = shipped_dqn(case).network
+    for horizon in horizons:
+        a, b = horizon // 3, 2 * horizon // 3
+        formula = (
+            f"F[0,{a}] Region1 and F[{a},{b}] Region2 and F[{b},{horizon}] Region3 "
+            f"and G[0,{horizon}] not Forbidden"
+        )
+        task = make_task(case.task.grid, STRETCH, formula, case.spec["regions"])
+        dqn = Policy(task, make_card(task, "dqn", {}, 0, {}), network)
+        rows.append({"horizon": horizon, **_row(task, dqn, n, repeats, seed)})
+    return rows
+
+
+def by_actions(counts: tuple[int, ...], n: int, repeats: int, seed: int) -> list[dict[str, Any]]:
+    """Case 2 for robots with so many distinct motions; a DQN of the shipped one's width, random weights."""
+    case, rows = load_case("case2"), []
+    for count in counts:
+        task = make_task(case.task.grid, made_robot(count), case.spec["formula"], case.spec["regions"])
+        rows.append({"actions": count, **_row(task, random_dqn(task, seed), n, repeats, seed)})
+    return rows
+
+
+def made_robot(count: int) -> Robot:
+    """The first `count` of: wait, ahead, back, then turns and arcs to either side by 6 degrees more each."""
+    moves = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0)]
+    for k in range(1, count):
+        angle = math.radians(6.0 * (1 + (k - 1) % 15))
+        ahead = (0.0, 0.1, 0.2)[(k - 1) // 15 % 3]
+        moves += [(ahead, angle), (ahead, -angle)]
+    actions = tuple(Action(f"a{i}", *move) for i, move in enumerate(moves[:count]))
+    return Robot(f"made{count}", STRETCH.radius, STRETCH.offset, STRETCH.on_contact, actions)
+
+
+def random_dqn(task: Task, seed: int) -> Policy:
+    body = make_body(task.robot, task.grid)
+    random = np.random.default_rng(seed)
+    widths = [observation_size(make_rules(task), body), UNITS, UNITS, len(body.translate)]
+    arrays = {}
+    for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
+        scale = 1.0 / math.sqrt(fan_in)
+        arrays[NAMES[2 * i]] = random.normal(0.0, scale, (fan_in, fan_out)).astype(np.float32)
+        arrays[NAMES[2 * i + 1]] = np.zeros(fan_out, np.float32)
+    network = make_network(arrays, widths[0], widths[-1])
+    return Policy(task, make_card(task, "dqn", {}, seed, {}), network)
+
+
+def _row(task: Task, dqn: Policy, n: int, repeats: int, seed: int) -> dict[str, Any]:
+    """Quantiles of (c) and (d) from the same starts, feasible or not, and the seconds synthesis took."""
+    reach = reachability.synthesise(task)
+    random = np.random.default_rng([seed, 20])
+    poses = free_poses(task, make_body(task.robot, task.grid), n, random)
+    states = [State(pose[None], np.zeros(len(task.robot.actions)), None) for pose in poses]
+    row: dict[str, Any] = {"synthesis_s": reach.card["metrics"]["wall_time_s"]}
+    for key, policy in (("c", dqn), ("d", reach)):
+        shield = make_shield([policy])
+        warm(shield, states[0])
+        row[key] = summary([ask(shield, state, repeats) for state in states])
+    return row

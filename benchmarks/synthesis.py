@@ -1,0 +1,133 @@
+"""What it costs to make a policy: reachability, our DQN, stable-baselines3's DQN on the same environment."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from benchmarks.states import shipped_dqn
+from benchmarks.timing import quietest
+from specshield.policy import reachability
+from specshield.policy.environment import Environment, free_poses
+from specshield.policy.network import NAMES, make_network
+from specshield.policy.policy import wait_motion
+from specshield.policy.reachability import load_reachability
+from specshield.policy.rollout import satisfies
+from specshield.policy.settings import Settings
+from specshield.sim.cases import Case, load_case
+
+STARTS = 1000
+EVERY = 10_000  # steps of stable-baselines3 between two measurements
+
+
+def reach(case_name: str, repeats: int) -> dict[str, Any]:
+    """Seconds to make the tables and to load them, their size, and the shipped DQN's card beside them."""
+    case = load_case(case_name)
+    reachability.synthesise(case.task)  # compiles, or loads what is compiled
+    seconds = quietest(lambda: reachability.synthesise(case.task), repeats)
+    policy = reachability.synthesise(case.task)
+    weights = policy.weights()
+    card = shipped_dqn(case).card
+    return {
+        "synthesis_s": seconds,
+        "load_s": quietest(lambda: load_reachability(weights, policy.card, case.task), repeats),
+        "size_bytes": len(weights),
+        "feasible_start": policy.card["metrics"]["feasible_start"],
+        "dqn": {"updates": card["options"]["updates"], **card["metrics"]},
+    }
+
+
+def race(case_name: str, rate: float, minutes: float, seed: int) -> dict[str, Any]:
+    """Our DQN and stable-baselines3's, each until pi_phi satisfies from `rate` of the starts or time is up.
+
+    Each gives its curve, [seconds, rate]; measuring is left out of stable-baselines3's seconds, not of ours.
+    """
+    case = load_case(case_name)
+    ours, theirs = _ours(case, rate, minutes, seed), _sb3(case, rate, minutes, seed)
+    result = {"case": case_name, "rate": rate, "minutes": minutes, "seed": seed}
+    return result | {"specshield DQN": ours, "stable-baselines3 DQN": theirs}
+
+
+def _ours(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]]:
+    from specshield.policy.dqn import Progress, Stopped, train
+
+    curve: list[list[float]] = []
+    began = time.perf_counter()
+
+    def note(progress: Progress) -> None:
+        if progress.satisfied is not None and (not curve or progress.update % 500 == 0):
+            curve.append([time.perf_counter() - began, progress.satisfied])
+
+    def enough() -> bool:
+        return _enough(curve, rate) or time.perf_counter() - began > 60 * minutes
+
+    settings = replace(Settings(), evaluate_every=500, evaluation_starts=STARTS)
+    with suppress(Stopped):
+        train(case.task, settings, seed, note, should_stop=enough)
+    return curve
+
+
+def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]]:
+    """Its defaults, with our network's size, discount and learning rate, one gymnasium robot."""
+    import gymnasium
+    from stable_baselines3 import DQN
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    practice = Environment(case.task, 1, seed)
+    inputs, outputs = practice.observations.shape[1], len(practice.body.translate)
+
+    class Practice(gymnasium.Env[np.ndarray, np.int64]):
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
+        action_space = gymnasium.spaces.Discrete(outputs)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+            return practice.observations[0].copy(), {}  # an episode that ends begins anew at once
+
+        def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+            rewards, ended = practice.step(np.array([action]))
+            return practice.observations[0].copy(), float(rewards[0]), bool(ended[0]), False, {}
+
+    poses = free_poses(case.task, practice.body, STARTS, np.random.default_rng(0))
+    curve: list[list[float]] = []
+    began, measuring = time.perf_counter(), 0.0
+
+    class Watch(BaseCallback):
+        def _on_step(self) -> bool:
+            nonlocal measuring
+            if self.num_timesteps % EVERY:
+                return True
+            now = time.perf_counter()
+            curve.append([now - began - measuring, measure()])
+            measuring += time.perf_counter() - now
+            return not _enough(curve, rate) and curve[-1][0] < 60 * minutes
+
+    def measure() -> float:
+        tensors = [p.detach().cpu().numpy() for p in model.q_net.parameters()]
+        weights = {n: np.ascontiguousarray(t.T) for n, t in zip(NAMES, tensors, strict=True)}
+        net = make_network(weights, inputs, outputs)
+        args = (
+            practice.body,
+            practice.rules,
+            practice.sight,
+            net,
+            poses,
+            False,
+            wait_motion(case.task.robot),
+        )
+        return float(satisfies(*args).mean())
+
+    ours = Settings()
+    model = DQN(
+        "MlpPolicy", Practice(), learning_rate=ours.learning_rate, gamma=ours.discount, seed=seed,
+        policy_kwargs={"net_arch": [ours.units, ours.units]},
+    )  # fmt: skip
+    model.learn(2_000_000, callback=Watch())
+    return curve
+
+
+def _enough(curve: list[list[float]], rate: float) -> bool:
+    return bool(curve) and curve[-1][1] >= rate

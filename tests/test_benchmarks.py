@@ -1,0 +1,67 @@
+"""The benchmark's four programs are the same algorithm: equal J on the same states."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from benchmarks.decisions import ROUNDING, ask
+from benchmarks.plain import Plain
+from benchmarks.states import shipped_dqn, starts
+from benchmarks.sweep import made_robot
+
+from specshield.policy import reachability
+from specshield.shield.episode import decide, make_shield
+from specshield.sim.cases import load_case
+from specshield.stl import SATISFIED_ABOVE, robustness
+
+
+@pytest.fixture(scope="module", params=["case1", "case2"])
+def dqn(request):
+    return shipped_dqn(load_case(request.param))
+
+
+def test_the_plain_batched_version_has_our_robustness(dqn):
+    """(b) and (c), and (c)'s witness by (b)'s dynamics; along an episode too."""
+    plain, shield = Plain(dqn), make_shield([dqn])
+    going = ~dqn.task.robot.terminal
+    for state in starts(shield, 1, seed=7):
+        history = state.history
+        for _ in range(2):
+            decision = decide(shield, history, np.zeros(len(going)))
+            ours = np.array(decision.robustness, dtype=np.float64)[going]
+            np.testing.assert_allclose(plain.batched(history)[going], ours, rtol=0, atol=ROUNDING)
+            history = np.concatenate([history, decision.next_poses[[decision.action]]])
+
+
+def test_rtamt_action_by_action_has_our_j(dqn):
+    """(a) and (c)."""
+    pytest.importorskip("rtamt", reason="rtamt is of the benchmarks' own environment: make bench")
+    shield = make_shield([dqn])
+    state = starts(shield, 1, seed=3)[0]
+    theirs = Plain(dqn).one_by_one(state.history) > SATISFIED_ABOVE
+    ours = np.array(decide(shield, state.history, state.logits).j_values, dtype=np.float64) > 0.0
+    going = ~dqn.task.robot.terminal
+    assert theirs[going].tolist() == ours[going].tolist()
+
+
+def test_what_reachability_certifies_holds_by_the_plain_dynamics(dqn):
+    """(d): each witness, simulated in NumPy, satisfies; so J = 1 means the same for it."""
+    task, plain = dqn.task, Plain(dqn)
+    shield = make_shield([reachability.synthesise(task)])
+    state = starts(shield, 1, seed=5)[0]
+    decision = decide(shield, state.history, state.logits, witnesses=True)
+    certified = [a for a, j in enumerate(decision.j_values) if j == 1.0 and not task.robot.terminal[a]]
+    assert certified
+    poses = np.repeat(state.history, len(certified), axis=0)
+    trajectory = [poses]
+    plans = np.array([[a, *decision.witnesses[a]] for a in certified])
+    for step in range(task.horizon):
+        poses = plain.world.next_poses(poses, task.robot.motion_of[plans[:, step]])
+        trajectory.append(poses)
+    rho = robustness(task.formula, plain.samples(np.stack(trajectory, axis=1)))
+    assert np.all(rho > SATISFIED_ABOVE)
+    assert ask(shield, state, 1) > 0.0
+
+
+def test_made_robots_have_as_many_distinct_motions_as_they_say():
+    assert [len(made_robot(n).motions) for n in (7, 16, 32, 64)] == [7, 16, 32, 64]
