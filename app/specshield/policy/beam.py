@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel, leaf
 from specshield.policy.progress import STACK, Rules, advance, read_predicates, value_count
 from specshield.policy.tables import SAFE, Tables, score, slack
 from specshield.robot.unicycle import Body, step
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def beam(
     body: Body,
     rules: Rules,
@@ -99,7 +99,7 @@ def beam(
     return 0
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _is_twin(
     new: NDArray[np.float64],
     new_status: NDArray[np.int8],

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel
 from specshield.errors import MapError
 from specshield.policy.funnel import Funnels, make_funnels, reward
 from specshield.policy.observation import Sight, make_sight, observation_size, observe, outcome
@@ -80,7 +80,7 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> N
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _colliding(body: Body, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     out = np.empty(poses.shape[0], np.bool_)
     for i in range(poses.shape[0]):
@@ -88,7 +88,7 @@ def _colliding(body: Body, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _predicates_at(rules: Rules, poses: NDArray[np.float64]) -> NDArray[np.float64]:
     out = np.empty((poses.shape[0], rules.kind.shape[0]))
     values, stack = np.empty(value_count(rules)), np.empty(STACK)
@@ -97,7 +97,7 @@ def _predicates_at(rules: Rules, poses: NDArray[np.float64]) -> NDArray[np.float
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _begin(
     rules: Rules,
     t: int,
@@ -119,7 +119,7 @@ def _begin(
     advance(rules, t, predicates, status, run)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _step_all(
     body: Body,
     rules: Rules,

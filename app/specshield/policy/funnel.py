@@ -15,9 +15,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import leaf
 from specshield.policy.observation import Sight, current_goal, field_at
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 from specshield.robot.unicycle import Body
@@ -72,7 +72,7 @@ def make_funnels(
     return Funnels(gamma_0, gamma_inf, rate, clock, rho_max, literal)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def gamma(funnels: Funnels, k: int, t: int) -> float:
     """Eq. 4 at step t; gamma_0 before the window."""
     elapsed = max(t - funnels.clock[k], 0)
@@ -80,7 +80,7 @@ def gamma(funnels: Funnels, k: int, t: int) -> float:
     return float(decayed + funnels.gamma_inf[k])
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def reward(
     body: Body,
     rules: Rules,

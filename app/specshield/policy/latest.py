@@ -21,9 +21,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel, leaf
 from specshield.policy.lattice import Lattice
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
@@ -115,7 +115,7 @@ def latest_times(
     return tables, valid
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _enter(
     lattice: Lattice,
     valid: NDArray[np.uint8],
@@ -142,7 +142,7 @@ def _enter(
                     table[j, i, h] = start - 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(
     rules: Rules,
     holds: NDArray[np.uint8],
@@ -177,7 +177,7 @@ def _settle(
                 table[j, i, h] = max(table[j, i, h], latest)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def bilinear(valid: NDArray[np.uint8], table: NDArray[np.float32], v: float, u: float, h: int) -> float:
     """The table at lattice coordinates, over the corners whose pose is valid; NEVER where none is."""
     ny, nx = table.shape[0], table.shape[1]
@@ -199,7 +199,7 @@ def bilinear(valid: NDArray[np.uint8], table: NDArray[np.float32], v: float, u: 
     return total / weights if weights > 1e-6 else NEVER
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep(lattice: Lattice, valid: NDArray[np.uint8], start: float, table: NDArray[np.float32]) -> None:
     """Relaxes max_a L(f(s, a)) - 1 in place to its fixed point, visiting only cells near what changed.
 

@@ -12,9 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel, leaf
 from specshield.policy.progress import STACK, Rules, read_predicates, value_count
 from specshield.robot.unicycle import TOUCH, Body, free_distance, in_collision, step, wrap
 from specshield.stl.program import VALUE
@@ -75,7 +75,7 @@ def make_lattice(body: Body, pitch: float) -> Lattice:
     return lattice
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def pose_of(
     body: Body, pitch: float, headings: int, j: float, i: float, h: float
 ) -> tuple[float, float, float]:
@@ -87,7 +87,7 @@ def pose_of(
     return x, y, theta if theta <= math.pi else theta - 2.0 * math.pi
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def coordinates(
     body: Body, pitch: float, headings: int, x: float, y: float, theta: float
 ) -> tuple[float, float, float]:
@@ -99,7 +99,7 @@ def coordinates(
     return v, u, h if h >= 0.0 else h + headings
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _simulate_all(
     body: Body, lattice: Lattice, moving: NDArray[np.int64], turning: NDArray[np.int64]
 ) -> None:
@@ -135,7 +135,7 @@ def _simulate_all(
                     lattice.turns[j, i, h, r] = theta1 != theta
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def holds_at(body: Body, rules: Rules, lattice: Lattice) -> NDArray[np.uint8]:
     """Where each obligation's predicate holds, [K, ny, nx, H]; 0 where the pose is not valid."""
     ny, nx, headings = lattice.valid.shape

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import leaf
 from specshield.errors import PolicyError
 
 NAMES = ("w1", "b1", "w2", "b2", "w3", "b3")
@@ -57,7 +57,7 @@ def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, output
     return Network(*(np.ascontiguousarray(weights[name]) for name in NAMES))
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _layer(
     x: NDArray[np.float32], w: NDArray[np.float32], b: NDArray[np.float32], out: NDArray[np.float32]
 ) -> None:
@@ -70,7 +70,7 @@ def _layer(
                 out[j] += xi * w[i, j]
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def greedy(
     net: Network,
     observation: NDArray[np.float32],

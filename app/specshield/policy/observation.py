@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from specshield.compiled import kernel, leaf
 from specshield.policy.progress import (
     ALWAYS,
     BROKEN,
@@ -93,7 +93,7 @@ def _fill(distance: NDArray[np.float64], resolution: float) -> NDArray[np.float6
     return filled
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _predicate_maps(rules: Rules, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Each obligation's predicate at points (N, 2), heading 0. Shape (K, N)."""
     out = np.empty((rules.kind.shape[0], points.shape[0]))
@@ -104,7 +104,7 @@ def _predicate_maps(rules: Rules, points: NDArray[np.float64]) -> NDArray[np.flo
     return out
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def field_at(body: Body, field: NDArray[np.float64], x: float, y: float) -> float:
     """A field [height, width] of cell centres, bilinear at a point of the map frame, held beyond its edge."""
     dx, dy = x - body.origin_x, y - body.origin_y
@@ -121,7 +121,7 @@ def field_at(body: Body, field: NDArray[np.float64], x: float, y: float) -> floa
     return float(low * (1.0 - q) + high * q)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def current_goal(rules: Rules, status: NDArray[np.int8]) -> int:
     """The pending goal with the earliest deadline, -1 where none is left."""
     best = -1
@@ -135,7 +135,7 @@ def current_goal(rules: Rules, status: NDArray[np.int8]) -> int:
     return best
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def outcome(status: NDArray[np.int8]) -> int:
     """BROKEN if any obligation is, SETTLED if all are, else PENDING."""
     settled = True
@@ -146,7 +146,7 @@ def outcome(status: NDArray[np.int8]) -> int:
     return SETTLED if settled else PENDING
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def observe(
     body: Body,
     rules: Rules,
@@ -212,7 +212,8 @@ def observe(
         if moved > 0.0 or body.rotate[m] != 0.0:
             read_predicates(rules, nx, ny, nth, values, stack, after)
         else:
-            after[:] = predicates
+            for k in range(after.shape[0]):
+                after[k] = predicates[k]
         for k in range(rules.kind.shape[0]):
             if rules.kind[k] == ALWAYS and rules.a[k] <= t + 1 <= rules.b[k]:
                 safe = min(safe, max(after[k] / NEAR_ALWAYS, -1.0))

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel, leaf
 from specshield.errors import FragmentError
 from specshield.stl import Obligation, obligations
 from specshield.stl.program import STACK_SIZE, compile_predicate, evaluate_packed, pack
@@ -90,12 +90,12 @@ def signal_rows(task: Task, signals: Mapping[str, NDArray[np.float64]], n: int) 
     return np.array(rows, dtype=np.float64).reshape(-1, n).T.copy()
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def value_count(rules: Rules) -> int:
     return int(3 + rules.region_starts.shape[0] - 1 + rules.signals.shape[0])
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def read_values(rules: Rules, x: float, y: float, theta: float, values: NDArray[np.float64]) -> None:
     """What the predicates read at a pose, into `values`, shape (value_count,)."""
     values[0], values[1], values[2] = x, y, theta
@@ -108,7 +108,7 @@ def read_values(rules: Rules, x: float, y: float, theta: float, values: NDArray[
         values[3 + n + i] = rules.signals[i]
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def read_predicates(
     rules: Rules,
     x: float,
@@ -124,7 +124,7 @@ def read_predicates(
         out[k] = evaluate_packed(k, rules.ops, rules.args, rules.starts, values, stack)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def advance(
     rules: Rules, t: int, predicates: NDArray[np.float64], status: NDArray[np.int8], run: NDArray[np.int64]
 ) -> None:
@@ -156,7 +156,7 @@ def advance(
                 status[k] = BROKEN
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def replay(
     rules: Rules,
     poses: NDArray[np.float64],
@@ -178,7 +178,7 @@ def replay(
         advance(rules, t, predicates, status, run)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def forgive(rules: Rules, t: int, status: NDArray[np.int8]) -> None:
     """What is broken at step t and what a policy goes on with: an `always` holds again from t + 1, the rest
     is dropped.

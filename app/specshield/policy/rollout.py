@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel
 from specshield.policy.network import Network, greedy
 from specshield.policy.observation import Sight, observe, outcome
 from specshield.policy.progress import PENDING, STACK, Rules, advance, read_predicates, value_count
 from specshield.robot.unicycle import Body, successors
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rollout(
     body: Body,
     rules: Rules,
@@ -78,7 +78,7 @@ def rollout(
     return outcome(status)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rollout_all(
     body: Body,
     rules: Rules,
@@ -97,7 +97,7 @@ def rollout_all(
         rollout(body, rules, sight, net, pose, t, status, run, m, wait, motions[m], poses[m])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def satisfies(
     body: Body,
     rules: Rules,

@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel, leaf
 from specshield.policy.beam import beam
 from specshield.policy.progress import (
     ALWAYS,
@@ -34,7 +34,7 @@ MAX_ESCAPES = 8
 NUDGE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def greedy(
     body: Body,
     rules: Rules,
@@ -151,7 +151,7 @@ def greedy(
     return goals_settled(rules, status), ahead
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _pays_to_wait(rules: Rules, t: int, predicates: NDArray[np.float64], status: NDArray[np.int8]) -> bool:
     """Whether a goal that holds here is still to open, or a dwell to go on."""
     for k in range(status.shape[0]):
@@ -161,7 +161,7 @@ def _pays_to_wait(rules: Rules, t: int, predicates: NDArray[np.float64], status:
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def retrace(
     body: Body,
     rules: Rules,
@@ -214,7 +214,7 @@ def retrace(
     return goals_settled(rules, status)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _undoing(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]) -> int:
     """The motion that leads from `reached` back to `pose`, -1 where it is the same, -2 where none does."""
     if _same(pose[0], pose[1], pose[2], reached):
@@ -226,13 +226,13 @@ def _undoing(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]
     return -2
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _same(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
     turn = abs(theta - pose[2])
     return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def propose_all(
     body: Body,
     rules: Rules,

@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import leaf
 from specshield.policy.lattice import coordinates
 from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 from specshield.robot.unicycle import Body
@@ -38,7 +38,7 @@ class Tables(NamedTuple):
     pitch: float
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float:
     """L at lattice coordinates: linear in x, y and heading over the corners that are valid; HOPELESS where
     none is.
@@ -70,7 +70,7 @@ def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float
     return total / weights if weights > 1e-6 else HOPELESS
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def slack(
     body: Body,
     rules: Rules,
@@ -107,7 +107,7 @@ def slack(
     return best
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: float, h: float) -> float:
     """The slack once a dwell is over, at step t and where it was begun."""
     if mask == every and tables.phase[t] == len(tables.end) - 1:
@@ -116,7 +116,7 @@ def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: flo
     return latest_at(tables, table, v, u, h) - t if table >= 0 else HOPELESS
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
     for k in range(status.shape[0]):
         if status[k] == BROKEN or (rules.kind[k] != ALWAYS and status[k] == PENDING):
@@ -124,12 +124,15 @@ def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def is_broken(status: NDArray[np.int8]) -> bool:
-    return bool(np.any(status == BROKEN))
+    broken = False
+    for k in range(status.shape[0]):
+        broken = broken or status[k] == BROKEN
+    return broken
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def score(
     body: Body,
     rules: Rules,

@@ -14,9 +14,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import leaf
 from specshield.robot.actions import Robot
 from specshield.world.occupancy import OccupancyGrid
 
@@ -66,7 +66,7 @@ def make_body(robot: Robot, grid: OccupancyGrid) -> Body:
     )
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def wrap(theta: float) -> float:
     """The angle in (-pi, pi]."""
     if -math.pi < theta <= math.pi:
@@ -76,7 +76,7 @@ def wrap(theta: float) -> float:
     return theta if -math.pi < theta <= math.pi else math.pi
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
     """The footprint's centre in grid metres: along the grid's columns and rows from its lower-left corner."""
     c, s = math.cos(theta), math.sin(theta)
@@ -85,34 +85,34 @@ def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
     return body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _is_occupied(body: Body, row: int, col: int) -> bool:
     if row < 0 or col < 0 or row >= body.occupied.shape[0] or col >= body.occupied.shape[1]:
         return True
     return bool(body.occupied[row, col] != 0)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _cell(body: Body, u: float, v: float) -> tuple[int, int]:
     """Row and column of a point (grid metres), held to the ring: one far off fits no integer."""
     h, (height, width) = body.resolution, body.occupied.shape
     return math.floor(min(max(v / h, -1.0), height)), math.floor(min(max(u / h, -1.0), width))
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _rows(body: Body, low: float, high: float) -> tuple[int, int]:
     """The range of rows between two heights (grid metres), with the ring that stands for the outside."""
     h = body.resolution
     return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[0]) + 1
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _columns(body: Body, low: float, high: float) -> tuple[int, int]:
     h = body.resolution
     return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[1]) + 1
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
     """Whether the clearance field alone shows no obstacle within `distance` [m] of a point (grid metres)."""
     h = body.resolution
@@ -123,7 +123,7 @@ def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
     return bool(body.clearance[row, col] - off_centre >= distance)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     """Exact distance [m] from a point (grid metres) to the nearest occupied square, at most `limit`."""
     h = body.resolution
@@ -145,7 +145,7 @@ def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     return math.sqrt(best)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _depth(body: Body, u: float, v: float) -> float:
     """How far inside occupied space a point lies [m]: to the nearest free square, DEEP cells at most."""
     h = body.resolution
@@ -164,7 +164,7 @@ def _depth(body: Body, u: float, v: float) -> float:
         half *= 2
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _enters_slab(p: float, d: float, low: float, high: float) -> tuple[float, float]:
     """The parameters at which p + s d enters and leaves (low, high)."""
     if d == 0.0:
@@ -175,7 +175,7 @@ def _enters_slab(p: float, d: float, low: float, high: float) -> tuple[float, fl
     return min(first, last), max(first, last)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _enters_box(
     pu: float, pv: float, du: float, dv: float, u0: float, u1: float, v0: float, v1: float
 ) -> float:
@@ -187,7 +187,7 @@ def _enters_box(
     return np.inf
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _enters_disc(pu: float, pv: float, du: float, dv: float, cu: float, cv: float, r: float) -> float:
     """(du, dv) is a unit vector."""
     qu, qv = pu - cu, pv - cv
@@ -202,7 +202,7 @@ def _enters_disc(pu: float, pv: float, du: float, dv: float, cu: float, cv: floa
     return max(-along - math.sqrt(root), 0.0)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length: float, r: float) -> float:
     """How far [m] a disc of radius r moves from (u, v) along a unit vector until it overlaps; inf: never."""
     h = body.resolution
@@ -228,7 +228,7 @@ def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length:
     return first if first < length else np.inf
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _move(body: Body, x: float, y: float, theta: float, distance: float) -> float:
     """How far of `distance` [m, signed] the robot can go straight on: all of it, or up to the contact."""
     u, v = centre(body, x, y, theta)
@@ -250,7 +250,7 @@ def _move(body: Body, x: float, y: float, theta: float, distance: float) -> floa
     return sign * max(contact - SKIN, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _escape(body: Body, u: float, v: float, du: float, dv: float, length: float) -> float:
     """From a centre inside an obstacle: as far as the way never leads deeper, in steps of a quarter cell."""
     n = math.ceil(length / (0.25 * body.resolution))
@@ -264,7 +264,7 @@ def _escape(body: Body, u: float, v: float, du: float, dv: float, length: float)
     return length
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def _can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> bool:
     if body.offset_x == 0.0 and body.offset_y == 0.0:
         return True
@@ -290,7 +290,7 @@ def _can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> boo
     return True
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[float, float, float]:
     """f: the pose after one motion (an index into `Robot.motions`). theta in and out in (-pi, pi]."""
     distance, angle = body.translate[motion], body.rotate[motion]
@@ -309,7 +309,7 @@ def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[flo
     return nx, ny, theta
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def simulate(
     body: Body, pose: NDArray[np.float64], motions: NDArray[np.int64], out: NDArray[np.float64]
 ) -> None:
@@ -320,7 +320,7 @@ def simulate(
         out[k, 0], out[k, 1], out[k, 2] = x, y, theta
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def successors(body: Body, pose: NDArray[np.float64], out: NDArray[np.float64]) -> None:
     """The pose after each motion. pose (3,), out (M, 3)."""
     for motion in range(body.translate.shape[0]):
@@ -328,13 +328,13 @@ def successors(body: Body, pose: NDArray[np.float64], out: NDArray[np.float64]) 
         out[motion, 0], out[motion, 1], out[motion, 2] = x, y, theta
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def overlap(body: Body, x: float, y: float, theta: float) -> float:
     """How deep [m] the footprint overlaps an obstacle: 0 where free, radius where its centre is inside."""
     u, v = centre(body, x, y, theta)
     return body.radius - free_distance(body, u, v, body.radius)
 
 
-@njit(cache=True, nogil=True)
+@leaf
 def in_collision(body: Body, x: float, y: float, theta: float) -> bool:
     return overlap(body, x, y, theta) > TOUCH

@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel, leaf
 from specshield.errors import FormulaError, FragmentError
 from specshield.stl.formula import (
     Abs,
@@ -110,8 +110,15 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
             raise FragmentError(problem, got=str(node), expected=expected)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _run(ops, args, start, stop, values, stack):  # type: ignore[no-untyped-def]
+@leaf
+def _run(
+    ops: NDArray[np.int64],
+    args: NDArray[np.float64],
+    start: int,
+    stop: int,
+    values: NDArray[np.float64],
+    stack: NDArray[np.float64],
+) -> float:
     top = -1
     for i in range(start, stop):
         op = ops[i]
@@ -145,16 +152,23 @@ def _run(ops, args, start, stop, values, stack):  # type: ignore[no-untyped-def]
                 if not math.isfinite(left):
                     return math.nan
                 stack[top] = left
-    return stack[0] + 0.0  # one zero, as in `robustness`
+    return float(stack[0] + 0.0)  # one zero, as in `robustness`
 
 
-@njit(cache=True, nogil=True)
-def evaluate(ops, args, values):  # type: ignore[no-untyped-def]
+@kernel
+def evaluate(ops: NDArray[np.int64], args: NDArray[np.float64], values: NDArray[np.float64]) -> float:
     """The robustness of one program, values float64[slots]."""
     return _run(ops, args, 0, len(ops), values, np.empty(STACK_SIZE))
 
 
-@njit(cache=True, nogil=True)
-def evaluate_packed(k, ops, args, starts, values, stack):  # type: ignore[no-untyped-def]
+@leaf
+def evaluate_packed(
+    k: int,
+    ops: NDArray[np.int64],
+    args: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    values: NDArray[np.float64],
+    stack: NDArray[np.float64],
+) -> float:
     """The robustness of program k of `Programs`; stack float64[STACK_SIZE] is scratch."""
     return _run(ops, args, starts[k], starts[k + 1], values, stack)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import heapq
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from specshield.compiled import kernel
 
 EXACT_WITHIN = (
     12  # cells around the goal where straight lines are used: a point source is where upwinding errs most
@@ -30,8 +31,10 @@ def geodesic_distance(
     return result
 
 
-@numba.njit(cache=True, nogil=True)
-def _march(free, goal, blocked):  # type: ignore[no-untyped-def]
+@kernel
+def _march(
+    free: NDArray[np.bool_], goal: NDArray[np.bool_], blocked: NDArray[np.int64]
+) -> NDArray[np.float64]:
     h, w = free.shape
     distance = np.full((h, w), np.inf)
     done = np.zeros((h, w), dtype=np.bool_)
@@ -64,8 +67,8 @@ def _march(free, goal, blocked):  # type: ignore[no-untyped-def]
     return distance
 
 
-@numba.njit(cache=True, nogil=True)
-def _straight_lines(i, j, blocked, distance):  # type: ignore[no-untyped-def]
+@kernel
+def _straight_lines(i: int, j: int, blocked: NDArray[np.int64], distance: NDArray[np.float64]) -> None:
     """Exact distances from goal cell (i, j) to nearby cells, where the whole rectangle between is free."""
     h, w = distance.shape
     for y in range(max(0, i - EXACT_WITHIN), min(h, i + EXACT_WITHIN + 1)):
@@ -78,8 +81,8 @@ def _straight_lines(i, j, blocked, distance):  # type: ignore[no-untyped-def]
                 distance[y, x] = d
 
 
-@numba.njit(cache=True, nogil=True)
-def _upwind(distance, done, i, j):  # type: ignore[no-untyped-def]
+@kernel
+def _upwind(distance: NDArray[np.float64], done: NDArray[np.bool_], i: int, j: int) -> float:
     """d with (d - a)^2 + (d - b)^2 = 1 over the smaller settled neighbour of each axis, or min + 1."""
     h, w = distance.shape
     a = b = np.inf

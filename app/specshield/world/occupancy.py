@@ -7,10 +7,10 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from specshield.compiled import kernel
 from specshield.errors import MapError
 from specshield.world import checks
 
@@ -126,8 +126,8 @@ def check_size(width: int, height: int) -> None:
             )
 
 
-@numba.njit(cache=True, nogil=True)
-def _squared_half_cells(occupied):  # type: ignore[no-untyped-def]
+@kernel
+def _squared_half_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Squared distance from cell centres to the nearest occupied square, in half cells: whole, so exact.
 
     On the lattice of half cells a centre is (2i + 1, 2j + 1) and the nearest point of a square is one of its

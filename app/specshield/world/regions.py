@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from specshield.compiled import kernel, leaf
 from specshield.errors import MapError
 from specshield.world import checks
 from specshield.world.simple import crossing_edges
@@ -134,8 +134,16 @@ def pack_regions(regions: Sequence[Region]) -> PackedRegions:
     )
 
 
-@numba.njit(cache=True, nogil=True)
-def region_distance(i, starts, kinds, offsets, data, x, y):  # type: ignore[no-untyped-def]
+@leaf
+def region_distance(
+    i: int,
+    starts: NDArray[np.int64],
+    kinds: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    data: NDArray[np.float64],
+    x: float,
+    y: float,
+) -> float:
     """Signed distance of the point (x, y) to packed region i, metres, positive inside."""
     best = -np.inf
     for part in range(starts[i], starts[i + 1]):
@@ -152,8 +160,8 @@ def region_distance(i, starts, kinds, offsets, data, x, y):  # type: ignore[no-u
     return best
 
 
-@numba.njit(cache=True, nogil=True)
-def _polygon_distance(data, begin, end, x, y):  # type: ignore[no-untyped-def]
+@leaf
+def _polygon_distance(data: NDArray[np.float64], begin: int, end: int, x: float, y: float) -> float:
     """Nearest edge for the size, the parity of edges crossed going right for the sign."""
     inside = False
     nearest = np.inf
@@ -171,8 +179,14 @@ def _polygon_distance(data, begin, end, x, y):  # type: ignore[no-untyped-def]
     return math.sqrt(nearest) if inside else -math.sqrt(nearest)
 
 
-@numba.njit(cache=True, nogil=True)
-def _distances(starts, kinds, offsets, data, points):  # type: ignore[no-untyped-def]
+@kernel
+def _distances(
+    starts: NDArray[np.int64],
+    kinds: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    data: NDArray[np.float64],
+    points: NDArray[np.float64],
+) -> NDArray[np.float64]:
     out = np.empty(points.shape[0])
     for k in range(points.shape[0]):
         out[k] = region_distance(0, starts, kinds, offsets, data, points[k, 0], points[k, 1])

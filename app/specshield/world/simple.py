@@ -1,17 +1,22 @@
 """Whether a polygon is simple: no two of its edges touch, but for neighbours at the vertex they share."""
 
-import numba
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel
 
 
-@numba.njit(cache=True, nogil=True)
-def _side(ax, ay, bx, by, cx, cy):  # type: ignore[no-untyped-def]
+@kernel
+def _side(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> int:
     """1, 0 or -1: c is left of, on or right of the line from a to b."""
     cross = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
     return (cross > 0.0) - (cross < 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
-def crossing_edges(v):  # type: ignore[no-untyped-def]
+@kernel
+def crossing_edges(v: NDArray[np.float64]) -> tuple[int, int]:
     """The first two edges of a closed polygon v[n, 2] that share a point they should not, or (-1, -1)."""
     n = v.shape[0]
     for i in range(n):
