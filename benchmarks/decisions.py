@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from benchmarks.plain import Plain
-from benchmarks.states import State, along, shipped_dqn, starts
+from benchmarks.states import Floats, State, along, shipped_dqn, starts
 from benchmarks.timing import quietest, summary
 from specshield.policy import reachability
 from specshield.shield.episode import Shield, decide, make_shield
@@ -34,25 +35,73 @@ def compare(
     case = load_case(case_name)
     shields = {"c": make_shield([shipped_dqn(case)]), "d": make_shield([reachability.synthesise(case.task)])}
     plain = Plain(shipped_dqn(case))
-    result: dict[str, Any] = {"agreement": {}}
+    result: dict[str, Any] = {}
     for place in ("start", "along"):
-        times: dict[str, list[float]] = {}
-        raw: dict[str, list[float]] = {}
+        here: dict[str, Any] = {"once": {}, "parts": {}}
         for key, shield in shields.items():
             states = starts(shield, n, seed) if place == "start" else along(case, shield, episodes, seed)
             warm(shield, states[0])
-            raw[key] = [ask(shield, state, 1) for state in states]
-            times[key] = [ask(shield, state, repeats) for state in states]
-            result.setdefault("parts", {}).setdefault(place, {})[key] = parts(shield, states[:60], repeats)
+            here["once"][key] = summary([ask(shield, state, 1) for state in states])
+            here[key] = summary([ask(shield, state, repeats) for state in states])
+            here["parts"][key] = parts(shield, states[:60], repeats)
             if key == "c":
                 chosen = spread(states, plain_states)
-        few = chosen[: max(len(chosen) // 3, 2)]
-        times["a"] = [quietest(lambda s=s: plainly(plain.one_by_one, s), 1) for s in few]
-        times["b"] = [quietest(lambda s=s: plainly(plain.batched, s), 2) for s in chosen]
-        result[place] = {key: summary(times[key]) for key in sorted(times)}
-        result[f"{place}_once"] = {key: summary(seconds) for key, seconds in raw.items()}
-        result["agreement"][place] = agreement(plain, shields["c"], chosen, few)
+        result[place] = here | beside(plain, shields, chosen, repeats)
     return result
+
+
+def beside(
+    plain: Plain, shields: Mapping[str, Shield], states: Sequence[State], repeats: int
+) -> dict[str, Any]:
+    """(a) and (b) on a few states, how many times longer they take than (c) and (d), whether J agrees."""
+    times: dict[str, list[float]] = {key: [] for key in "abcd"}
+    found = Agreement()
+    for state in states:
+        for key, shield in shields.items():
+            times[key].append(ask(shield, state, repeats))
+        for key, values_of in (("a", plain.one_by_one), ("b", plain.batched)):
+            began = time.perf_counter()
+            values = values_of(state.history)
+            if state.logits is not None:
+                restrict(log_softmax(state.logits), values > SATISFIED_ABOVE)
+            times[key].append(time.perf_counter() - began)
+            found.add(shields["c"], state, values)
+    ratios = {
+        f"{plainly}/{ours}": float(np.median(np.array(times[plainly]) / times[ours]))
+        for plainly in "ab"
+        for ours in "cd"
+    }
+    return {"a": summary(times["a"]), "b": summary(times["b"]), "ratios": ratios, "agreement": vars(found)}
+
+
+@dataclass
+class Agreement:
+    """J of (a) and (b) against that of (c), over pairs of state and action.
+
+    satisfied: pairs with J = 1. rho: the largest difference in robustness [m]. A witness carried would only
+    add to S_t, so (c) decides without one here. float32 sums may be ordered in another way, so a rollout may
+    in principle part from ours where two Q-values are as good as equal: `parted`; elsewhere J has to agree.
+    """
+
+    pairs: int = 0
+    satisfied: int = 0
+    parted: int = 0
+    differ: int = 0
+    rho: float = 0.0
+
+    def add(self, ours: Shield, state: State, values: Floats) -> None:
+        """values: rho of each action, [A]. Raises AssertionError where J differs without a reason."""
+        going = ~ours.task.robot.terminal
+        decision = decide(ours, state.history, np.zeros(len(going)))
+        mine, theirs = np.array(decision.robustness, dtype=np.float64)[going], values[going]
+        parted = np.abs(mine - theirs) > ROUNDING
+        differ = (mine > SATISFIED_ABOVE) != (theirs > SATISFIED_ABOVE)
+        assert not np.any(differ & ~parted), f"J differs at t = {state.t}: {mine} and {theirs}"
+        self.pairs += len(mine)
+        self.satisfied += int((mine > SATISFIED_ABOVE).sum())
+        self.parted += int(parted.sum())
+        self.differ += int(differ.sum())
+        self.rho = max(self.rho, float(np.abs(mine - theirs)[~parted].max(initial=0.0)))
 
 
 def ask(shield: Shield, state: State, repeats: int) -> float:
@@ -63,44 +112,6 @@ def ask(shield: Shield, state: State, repeats: int) -> float:
 def warm(shield: Shield, state: State) -> None:
     for _ in range(3):
         ask(shield, state, 1)
-
-
-def plainly(values_of: Any, state: State) -> np.ndarray | None:
-    """Algorithm 1's answer out of rho of each action."""
-    feasible = values_of(state.history) > SATISFIED_ABOVE
-    return None if state.logits is None else restrict(log_softmax(state.logits), feasible)
-
-
-def agreement(plain: Plain, ours: Shield, states: Sequence[State], few: Sequence[State]) -> dict[str, Any]:
-    """Pairs (state, action) on which J of (a) or (b) is not that of (c), and the largest difference in rho.
-
-    A witness carried would only add to S_t, so (c) decides without one here. float32 sums may be ordered in
-    another way, so a rollout may in principle part from ours where two Q-values are as good as equal: that is
-    counted (`parted`), and J has to be equal in every other.
-    """
-    going = ~plain.task.robot.terminal
-    count: Counter[str] = Counter()
-    largest = 0.0
-    for key, among, values_of in (("a", few, plain.one_by_one), ("b", states, plain.batched)):
-        for state in among:
-            decision = decide(ours, state.history, np.zeros(len(going)))
-            if decision.spec_status != "pending":
-                continue
-            mine = np.array(decision.robustness, dtype=np.float64)[going]
-            theirs = values_of(state.history)[going]
-            parted = np.abs(mine - theirs) > ROUNDING
-            differs = (mine > SATISFIED_ABOVE) != (theirs > SATISFIED_ABOVE)
-            assert not np.any(differs & ~parted), f"({key}) and (c) disagree on J at t = {state.t}"
-            count["pairs"] += len(mine)
-            count["parted"] += int(parted.sum())
-            count["j_differs"] += int(differs.sum())
-            largest = max(largest, float(np.abs(mine - theirs)[~parted].max(initial=0.0)))
-    return {
-        "pairs": count["pairs"],
-        "parted": count["parted"],
-        "j_differs": count["j_differs"],
-        "rho": largest,
-    }
 
 
 def parts(shield: Shield, states: Sequence[State], repeats: int) -> dict[str, float]:

@@ -20,7 +20,7 @@ from specshield.policy.progress import make_rules
 from specshield.robot import STRETCH, Robot
 from specshield.robot.actions import Action
 from specshield.robot.unicycle import make_body
-from specshield.shield.episode import make_shield
+from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
 from specshield.task import Task, make_task
 
@@ -89,4 +89,6 @@ def _row(task: Task, dqn: Policy, n: int, repeats: int, seed: int) -> dict[str, 
         shield = make_shield([policy])
         warm(shield, states[0])
         row[key] = summary([ask(shield, state, repeats) for state in states])
+        answers = [decide(shield, state.history, state.logits) for state in states]
+        row[key]["feasible"] = float(np.mean([answer.feasible_mass > 0.0 for answer in answers]))
     return row

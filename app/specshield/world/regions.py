@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,7 +93,7 @@ def signed_distance(region: Region, points: ArrayLike) -> NDArray[np.float64]:
     """Metres to the region's boundary, positive inside. points [..., 2] in the map frame, result [...]."""
     array = np.asarray(points, dtype=np.float64)
     flat = np.ascontiguousarray(array.reshape(-1, 2))
-    result: NDArray[np.float64] = _distances(*pack_regions([region]), flat).reshape(array.shape[:-1])
+    result: NDArray[np.float64] = _distances(*_packed(region), flat).reshape(array.shape[:-1])
     return result
 
 
@@ -109,6 +110,11 @@ class PackedRegions(NamedTuple):
     kinds: NDArray[np.int64]
     offsets: NDArray[np.int64]
     data: NDArray[np.float64]
+
+
+@lru_cache(maxsize=1024)
+def _packed(region: Region) -> PackedRegions:
+    return pack_regions([region])
 
 
 def pack_regions(regions: Sequence[Region]) -> PackedRegions:
