@@ -19,7 +19,7 @@ import torch
 from benchmarks import cold, decisions, report, sweep, synthesis, timing
 from specshield.sim.cases import REPOSITORY, case_names
 
-QUICK = {"n": 100, "episodes": 2, "plain": 6, "repeats": 3, "sweep": 12}
+QUICK = {"n": 100, "episodes": 2, "plain": 4, "repeats": 3, "sweep": 12}
 FULL = {"n": 1000, "episodes": 20, "plain": 30, "repeats": 3, "sweep": 50}
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,18 +59,20 @@ def beside(
         for key, shield in shields.items():
             times[key].append(ask(shield, state, repeats))
         for key, values_of in (("a", plain.one_by_one), ("b", plain.batched)):
-            began = time.perf_counter()
-            values = values_of(state.history)
-            if state.logits is not None:
-                restrict(log_softmax(state.logits), values > SATISFIED_ABOVE)
-            times[key].append(time.perf_counter() - began)
-            found.add(shields["c"], state, values)
+            times[key].append(quietest(lambda s=state, v=values_of: plainly(v, s), repeats))
+            found.add(shields["c"], state, values_of(state.history))
     ratios = {
-        f"{plainly}/{ours}": float(np.median(np.array(times[plainly]) / times[ours]))
-        for plainly in "ab"
+        f"{plain_key}/{ours}": float(np.median(np.array(times[plain_key]) / times[ours]))
+        for plain_key in "ab"
         for ours in "cd"
     }
     return {"a": summary(times["a"]), "b": summary(times["b"]), "ratios": ratios, "agreement": vars(found)}
+
+
+def plainly(values_of: Callable[[Floats], Floats], state: State) -> Floats | None:
+    """Algorithm 1's answer out of rho of each action."""
+    feasible = values_of(state.history) > SATISFIED_ABOVE
+    return None if state.logits is None else restrict(log_softmax(state.logits), feasible)
 
 
 @dataclass

@@ -37,8 +37,8 @@ def _lines(figures: Figures, race: Figures | None) -> Iterator[str]:
     yield (
         f"Written by `{figures['command']}` in {figures['seconds']} s: {machine['cpu']}, one core of "
         f"{machine['cores']}, one thread, Python {machine['python']}, load {machine['load']:.1f} before. "
-        f"A call is made {size['repeats']} times and the quickest counts, since the machine is shared, (a) "
-        f"and (b) once. Milliseconds, unless it says otherwise. All figures: `benchmarks/figures.json`."
+        f"A call is made {size['repeats']} times and the quickest counts, since the machine is shared. "
+        f"Milliseconds, unless it says otherwise. All figures: `benchmarks/figures.json`."
     )
     yield ""
     yield "Four programs decide the same states, 20 Stretch actions:"

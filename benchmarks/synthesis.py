@@ -98,12 +98,13 @@ def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]
     class Watch(BaseCallback):
         def _on_step(self) -> bool:
             nonlocal measuring
-            if self.num_timesteps % EVERY:
-                return True
             now = time.perf_counter()
-            curve.append([now - began - measuring, measure()])
-            measuring += time.perf_counter() - now
-            return not _enough(curve, rate) and curve[-1][0] < 60 * minutes
+            spent = now - began - measuring
+            last = spent >= 60 * minutes
+            if last or self.num_timesteps % EVERY == 0:
+                curve.append([spent, measure()])
+                measuring += time.perf_counter() - now
+            return not (last or _enough(curve, rate))
 
     def measure() -> float:
         tensors = [p.detach().cpu().numpy() for p in model.q_net.parameters()]
