@@ -30,7 +30,8 @@ from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
 
 MAX_ENTRIES = 100_000_000  # 400 MB while the tables are made
-BAND = -3.0  # [steps] of slack: how far the tables are trusted not to err
+LATE = 20  # [steps] left: so near the end a wide beam costs little, and finds more
+BAND = -12.0  # [steps] of slack: how far the tables err, in tight rooms
 
 
 @dataclass(frozen=True)
