@@ -199,6 +199,9 @@ def observe(
         out[at + 8] = min(max(((rules.last[k] - t) * sight.stride - d) / 5.0, -1.0), 1.0)
         out[at + 9] = run[k] / (rules.b[k] - rules.c2[k] + 1.0) if rules.kind[k] == EVENTUALLY_ALWAYS else 0.0
         at += PER_GOAL
+    guarded = False
+    for k in range(rules.kind.shape[0]):
+        guarded = guarded or (rules.kind[k] == ALWAYS and rules.a[k] <= t + 1 <= rules.b[k])
     for m in range(body.translate.shape[0]):
         nx, ny, nth = nexts[m, 0], nexts[m, 1], nexts[m, 2]
         moved = math.hypot(nx - x, ny - y)
@@ -208,14 +211,14 @@ def observe(
         if target >= 0 and moved > 0.0:
             gain = here - field_at(body, sight.distance[sight.goal[target]], nx, ny)
             out[at + 1] = min(max(gain / sight.stride, -1.5), 1.5)
-        safe = 1.0
-        if moved > 0.0 or body.rotate[m] != 0.0:
-            read_predicates(rules, nx, ny, nth, values, stack, after)
-        else:
-            for k in range(after.shape[0]):
-                after[k] = predicates[k]
-        for k in range(rules.kind.shape[0]):
-            if rules.kind[k] == ALWAYS and rules.a[k] <= t + 1 <= rules.b[k]:
-                safe = min(safe, max(after[k] / NEAR_ALWAYS, -1.0))
-        out[at + 2] = safe
+        out[at + 2] = 1.0
+        if guarded:  # by an `always` that holds at the next step
+            if moved > 0.0 or body.rotate[m] != 0.0:
+                read_predicates(rules, nx, ny, nth, values, stack, after)
+            else:
+                for k in range(after.shape[0]):
+                    after[k] = predicates[k]
+            for k in range(rules.kind.shape[0]):
+                if rules.kind[k] == ALWAYS and rules.a[k] <= t + 1 <= rules.b[k]:
+                    out[at + 2] = min(out[at + 2], np.float32(max(after[k] / NEAR_ALWAYS, -1.0)))
         at += PER_MOTION
