@@ -1,7 +1,7 @@
 """Writes data/rtamt.json.gz: random formulas, traces, and rtamt's offline discrete-time robustness at time 0.
 
-    python3 -m venv /tmp/rtamt && /tmp/rtamt/bin/pip install rtamt==0.4.10
-    /tmp/rtamt/bin/python tests/stl/rtamt_vectors.py
+    python3 -m venv build/rtamt && build/rtamt/bin/pip install rtamt==0.4.10
+    build/rtamt/bin/python tests/stl/rtamt_vectors.py
 
 It needs rtamt and nothing of specshield. Both tools mean the same by every operator here: rtamt's bounded
 until, too, asks for its left side on [t, t') only. rtamt has no unary minus on a name, so it is given 0 - x,
