@@ -20,9 +20,9 @@ def kernel(function: F) -> F:
 def leaf(function: F) -> F:
     """A compiled function that allocates nothing: called in inner loops, with structs of arrays.
 
-    numba counts a reference for each array of a struct at each call, with atomic operations: three
-    quarters of a rollout's time, measured. What allocates nothing needs no counting. The option is not in
-    numba's manual; where it is gone, the kernels are slower and the same.
+    numba counts a reference for each array of a struct at each call, with atomic operations: most of
+    a rollout's time. What allocates nothing needs no counting. The option is not in numba's manual; where it
+    is gone, the kernels are slower and the same.
     """
     try:
         compiled: F = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 from PIL import Image
 from tests.oracles.judge import margin
@@ -11,13 +12,14 @@ from specshield.client import ShieldClient
 from specshield.sim import picture, report
 from specshield.sim.campaign import run
 
-RUNS = 3
+RUNS = 20  # with seed 0: the episodes of `make demo`
+SEED = 0
 
 
 @pytest.fixture(scope="module")
 def campaign(server, case):
     with ShieldClient(server.url, timeout=10.0) as client:
-        yield run(client, case, RUNS, seed=1)
+        yield run(client, case, RUNS, seed=SEED)
 
 
 def test_with_the_shield_the_rule_is_kept_and_without_it_broken(campaign, case):
@@ -43,7 +45,7 @@ def padded(episode, case):
 
 def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
     with ShieldClient(server.url, timeout=10.0) as client:
-        again = run(client, case, 1, seed=1)
+        again = run(client, case, 1, seed=SEED)
     for name in ("shielded", "unshielded"):
         first, second = getattr(campaign, name)[0], getattr(again, name)[0]
         assert second.poses == first.poses
@@ -60,10 +62,8 @@ def test_the_table_and_the_json_say_what_happened(campaign):
     every = [value for episode in campaign.shielded for value in episode.kl]
     assert kept["kl_per_episode"] == pytest.approx(sum(every) / RUNS, abs=1e-3)
     assert kept["kl_per_decision"] == pytest.approx(sum(every) / len(every), abs=1e-3)
-    later = sorted(
-        s.ended_at - u.ended_at for s, u in zip(campaign.shielded, campaign.unshielded, strict=True)
-    )
-    assert kept["extra_steps"] == later[RUNS // 2]
+    later = [s.ended_at - u.ended_at for s, u in zip(campaign.shielded, campaign.unshielded, strict=True)]
+    assert kept["extra_steps"] == np.median(later)
     lines = report.table([figures, figures]).splitlines()
     assert lines[2].split() == ["rule", "satisfied", *f"0 of {RUNS} {RUNS} of {RUNS}".split() * 2]
     assert len({len(line) for line in lines[2:]}) <= 2
