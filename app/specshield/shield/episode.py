@@ -17,14 +17,21 @@ from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.robot.unicycle import in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
-from specshield.shield.feasibility import Best, Futures, best_of, futures, rho
-from specshield.shield.residual import residuals
+from specshield.shield.feasibility import futures, rho
+from specshield.shield.judgement import (
+    Judged,
+    as_actions,
+    feasible_mass_of,
+    j_values_of,
+    judge,
+    robustness_of,
+    witnesses_of,
+)
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "close", "decide", "make_shield", "start"]
 
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Signals = Mapping[str, Floats]
 SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
 
@@ -104,51 +111,37 @@ def decide(
         judged = None
         answer = _unmodified(shield, log_prior)
     else:
-        judged = _judge(shield, poses, signals, tail, prefix, violated=spec_status == "violated")
+        judged = judge(shield, poses, signals, tail, prefix, violated=spec_status == "violated")
         answer = _answer(shield, log_prior, judged, main_task_done)
         if spec_status == "violated":
             answer = _Answer(answer.distribution, "violated", answer.reason)
 
     action = _draw(answer.distribution, shield.config.seed, t)
     moved = judged.completion if judged is not None and robot.terminal[action] else action
-    certified = _witnesses(shield, judged)
+    certified = witnesses_of(shield, judged)
     return Decision(
         t=t,
         mode=answer.mode,
         distribution=answer.distribution,
-        j_values=_j_values(shield, judged),
-        robustness=_robustness(shield, judged),
+        j_values=j_values_of(shield, judged),
+        robustness=robustness_of(shield, judged),
         action=action,
         action_name=robot.actions[action].name,
         completion_action=None if judged is None else judged.completion,
         spec_status=spec_status,
-        feasible_mass=_feasible_mass(shield, log_prior, judged),
+        feasible_mass=feasible_mass_of(shield, log_prior, judged),
         kl=None if log_prior is None else shaping.divergence(answer.distribution, log_prior),
         reason=answer.reason,
         finished=(spec_status != "pending" and main_task_done) or t >= shield.max_steps,
         next_poses=np.where(robot.terminal[:, None], poses[-1], nexts[robot.motion_of]),
         residual=residual,
         in_collision=bool(in_collision(shield.body, *poses[-1])),
-        witness=_as_actions(shield, certified, moved),
-        witnesses=tuple(_as_actions(shield, certified, a) for a in range(len(robot.actions)))
+        witness=as_actions(shield, certified, moved),
+        witnesses=tuple(as_actions(shield, certified, a) for a in range(len(robot.actions)))
         if witnesses
         else (),
         carry=Carry(t, nexts, certified),
     )
-
-
-@dataclass(frozen=True)
-class _Judged:
-    """The actions' futures at one step."""
-
-    tried: Futures
-    best: Best
-    feasible_motion: Bools  # [M]
-    feasible: Bools  # [A], S_t; false for a terminal action
-    values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf for a terminal action
-    robustness: Floats  # [A], rho of the whole formula along the same trajectories
-    completion: int
-    margin_unattainable: bool  # the margin asked for was lowered
 
 
 @dataclass(frozen=True)
@@ -158,48 +151,7 @@ class _Answer:
     reason: Reason | None
 
 
-def _judge(
-    shield: Shield,
-    poses: Floats,
-    signals: Signals,
-    tail: bytes | None,
-    prefix: Mapping[str, Floats],
-    violated: bool,
-) -> _Judged:
-    task, robot, asked = shield.task, shield.task.robot, shield.config.margin
-    motions = len(robot.motions)
-    tried = futures(task, shield.body, shield.policies, poses, signals, tail, asked)
-    whole = rho(task, task.formula, tried, signals)
-    best, feasible, lowered = best_of(tried, whole, motions), np.zeros(motions, bool), False
-    for formula in residuals(task.formula, prefix, len(poses) - 1) if violated else (task.formula,):
-        values = rho(task, formula, tried, signals) if violated else whole
-        best = best_of(tried, values, motions)
-        feasible = best.robustness > SATISFIED_ABOVE + asked
-        highest = best.robustness.max()
-        lowered = not feasible.any() and highest > SATISFIED_ABOVE
-        if lowered:  # the largest margin that can be had
-            feasible = best.robustness >= highest
-        if feasible.any():
-            break
-    first = tried.preferred
-    if tail and feasible[tail[0]]:
-        first = tail[0]
-    elif feasible.any() and not feasible[first]:
-        first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
-    of = robot.motion_of
-    return _Judged(
-        tried=tried,
-        best=best,
-        feasible_motion=feasible,
-        feasible=feasible[of] & ~robot.terminal,
-        values=np.where(robot.terminal, -np.inf, best.robustness[of]),
-        robustness=whole[best.row][of],
-        completion=int(robot.representative[first]),
-        margin_unattainable=lowered,
-    )
-
-
-def _answer(shield: Shield, log_prior: Floats | None, judged: _Judged, main_task_done: bool) -> _Answer:
+def _answer(shield: Shield, log_prior: Floats | None, judged: Judged, main_task_done: bool) -> _Answer:
     """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`."""
     terminal = shield.task.robot.terminal
     any_feasible = bool(judged.feasible.any())
@@ -304,45 +256,6 @@ def _follow(carry: Carry | None, poses: Floats) -> tuple[bytes | None, tuple[flo
     nearest = int(np.argmin(gap))
     tail = carry.witnesses[certified[0]] if certified else None
     return tail or None, (float(move[nearest]), float(turn[nearest]))
-
-
-def _witnesses(shield: Shield, judged: _Judged | None) -> tuple[bytes | None, ...]:
-    """Each motion's certified continuation, as the motions that follow it."""
-    if judged is None:
-        return (None,) * len(shield.task.robot.motions)
-    rows = judged.tried.motions[judged.best.row, 1:].astype(np.uint8)
-    return tuple(rows[m].tobytes() if ok else None for m, ok in enumerate(judged.feasible_motion))
-
-
-def _as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
-    motion = int(shield.task.robot.motion_of[action])
-    found = certified[motion] if motion >= 0 else None
-    return None if found is None else tuple(shield.task.robot.representative[list(found)].tolist())
-
-
-def _j_values(shield: Shield, judged: _Judged | None) -> tuple[float | None, ...]:
-    terminal = shield.task.robot.terminal
-    if judged is None:
-        return (None,) * len(terminal)
-    binary = shield.config.evaluation == "feasibility"
-    values = judged.feasible.astype(np.float64) if binary else judged.values
-    return tuple(np.where(terminal, values[~terminal].max(), values).tolist())
-
-
-def _robustness(shield: Shield, judged: _Judged | None) -> tuple[float | None, ...]:
-    terminal = shield.task.robot.terminal
-    if judged is None:
-        return (None,) * len(terminal)
-    return tuple(None if end else v for end, v in zip(terminal, judged.robustness.tolist(), strict=True))
-
-
-def _feasible_mass(shield: Shield, log_prior: Floats | None, judged: _Judged | None) -> float | None:
-    if log_prior is None or judged is None:
-        return None
-    going_on = np.where(shield.task.robot.terminal, -np.inf, log_prior)
-    if not np.isfinite(going_on).any():
-        return None
-    return shaping.feasible_mass(shaping.log_softmax(going_on), judged.feasible)
 
 
 def _draw(distribution: Floats, seed: int, t: int) -> int:

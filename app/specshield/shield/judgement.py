@@ -1,0 +1,119 @@
+"""What the futures at one step say of each action: S_t, J, rho, witnesses, and the certified continuation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.shield import shaping
+from specshield.shield.decision import Shield
+from specshield.shield.feasibility import Best, Futures, best_of, futures, rho
+from specshield.shield.residual import residuals
+from specshield.stl import SATISFIED_ABOVE
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Signals = Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The actions' futures at one step."""
+
+    tried: Futures
+    best: Best
+    feasible_motion: Bools  # [M]
+    feasible: Bools  # [A], S_t; false for a terminal action
+    values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf for a terminal action
+    robustness: Floats  # [A], rho of the whole formula along the same trajectories
+    completion: int
+    margin_unattainable: bool  # the margin asked for was lowered
+
+
+def judge(
+    shield: Shield,
+    poses: Floats,
+    signals: Signals,
+    tail: bytes | None,
+    prefix: Mapping[str, Floats],
+    violated: bool,
+) -> Judged:
+    """Tries the futures from x_t and judges the motions by the most that can still be kept.
+
+    poses [t + 1, 3]; tail: the witness the robot follows, one motion a byte; prefix: the task's samples [t
+    + 1];
+    violated: whether the prefix decides so.
+    """
+    task, robot, asked = shield.task, shield.task.robot, shield.config.margin
+    motions = len(robot.motions)
+    tried = futures(task, shield.body, shield.policies, poses, signals, tail, asked)
+    whole = rho(task, task.formula, tried, signals)
+    best, feasible, lowered = best_of(tried, whole, motions), np.zeros(motions, bool), False
+    for formula in residuals(task.formula, prefix, len(poses) - 1) if violated else (task.formula,):
+        values = rho(task, formula, tried, signals) if violated else whole
+        best = best_of(tried, values, motions)
+        feasible = best.robustness > SATISFIED_ABOVE + asked
+        highest = best.robustness.max()
+        lowered = not feasible.any() and highest > SATISFIED_ABOVE
+        if lowered:  # the largest margin that can be had
+            feasible = best.robustness >= highest
+        if feasible.any():
+            break
+    first = tried.preferred
+    if tail and feasible[tail[0]]:
+        first = tail[0]
+    elif feasible.any() and not feasible[first]:
+        first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
+    of = robot.motion_of
+    return Judged(
+        tried=tried,
+        best=best,
+        feasible_motion=feasible,
+        feasible=feasible[of] & ~robot.terminal,
+        values=np.where(robot.terminal, -np.inf, best.robustness[of]),
+        robustness=whole[best.row][of],
+        completion=int(robot.representative[first]),
+        margin_unattainable=lowered,
+    )
+
+
+def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, ...]:
+    """Each motion's certified continuation, as the motions that follow it."""
+    if judged is None:
+        return (None,) * len(shield.task.robot.motions)
+    rows = judged.tried.motions[judged.best.row, 1:].astype(np.uint8)
+    return tuple(rows[m].tobytes() if ok else None for m, ok in enumerate(judged.feasible_motion))
+
+
+def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
+    motion = int(shield.task.robot.motion_of[action])
+    found = certified[motion] if motion >= 0 else None
+    return None if found is None else tuple(shield.task.robot.representative[list(found)].tolist())
+
+
+def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
+    terminal = shield.task.robot.terminal
+    if judged is None:
+        return (None,) * len(terminal)
+    binary = shield.config.evaluation == "feasibility"
+    values = judged.feasible.astype(np.float64) if binary else judged.values
+    return tuple(np.where(terminal, values[~terminal].max(), values).tolist())
+
+
+def robustness_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
+    terminal = shield.task.robot.terminal
+    if judged is None:
+        return (None,) * len(terminal)
+    return tuple(None if end else v for end, v in zip(terminal, judged.robustness.tolist(), strict=True))
+
+
+def feasible_mass_of(shield: Shield, log_prior: Floats | None, judged: Judged | None) -> float | None:
+    if log_prior is None or judged is None:
+        return None
+    going_on = np.where(shield.task.robot.terminal, -np.inf, log_prior)
+    if not np.isfinite(going_on).any():
+        return None
+    return shaping.feasible_mass(shaping.log_softmax(going_on), judged.feasible)
