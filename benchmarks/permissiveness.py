@@ -151,7 +151,7 @@ class Model:
         if self.kind == "seeker":
             x, y, theta = history[-1].tolist()
             self.sim.pose = (x, y, theta)
-            return self.seeker.logits(self.sim.observe())
+            return self.seeker.logits(self.sim)
         noise = self.random.normal(size=len(end))
         if self.kind == "adversary":
             low = 30.0 * np.clip(self.spare.after(history), -5.0, 40.0)

@@ -61,7 +61,7 @@ def along(case: Case, shield: Shield, episodes: int, seed: int) -> list[State]:
         model.reset(np.random.default_rng([seed, episode]))
         poses, over, carry = [robot.pose], False, None
         while len(poses) <= case.task.horizon:
-            logits = None if over else model.logits(robot.observe())
+            logits = None if over else model.logits(robot)
             decision = decide(shield, poses, logits, over, carry=carry)
             if decision.spec_status != "pending":
                 break

@@ -64,7 +64,7 @@ class Seeker:
         self.model.reset(random)
 
     def logits(self, robot, decision):
-        return self.model.logits(robot.observe())
+        return self.model.logits(robot)
 
 
 PRIORS = (Noise, Saboteur, Idler, Seeker)

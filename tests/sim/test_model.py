@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from tests.oracles.judge import margin
 
+from specshield.errors import NotFound
 from specshield.policy.environment import free_poses
 from specshield.robot import STRETCH
-from specshield.sim.model import GoalSeeker, Observation, softmax
-from specshield.sim.robot import SimulatedRobot
+from specshield.sim.model import GoalSeeker, make_model, softmax
+from specshield.sim.robot import Observation, SimulatedRobot
 
 NAMES = list(STRETCH.action_names)
 
@@ -21,7 +22,7 @@ def mean_probabilities(observation, n=400):
     model = GoalSeeker(STRETCH)
     model.reset(np.random.default_rng(0))
     return dict(
-        zip(NAMES, np.mean([softmax(model.logits(observation)) for _ in range(n)], axis=0), strict=True)
+        zip(NAMES, np.mean([softmax(model.react(observation)) for _ in range(n)], axis=0), strict=True)
     )
 
 
@@ -52,7 +53,7 @@ def test_every_logit_is_finite_and_the_distribution_spread():
     random = np.random.default_rng(1)
     entropies = []
     for _ in range(500):
-        logits = model.logits(seen(random.uniform(0, 10), random.uniform(-math.pi, math.pi)))
+        logits = model.react(seen(random.uniform(0, 10), random.uniform(-math.pi, math.pi)))
         assert logits.shape == (20,)
         assert np.all(np.isfinite(logits))
         p = softmax(logits)
@@ -72,11 +73,18 @@ def test_it_repeats_itself_and_remembers_within_an_episode_but_not_beyond():
     model, first = GoalSeeker(STRETCH), []
     for seed in (0, 0, 1):
         model.reset(np.random.default_rng(seed))
-        first.append([model.logits(seen()) for _ in range(3)])
+        first.append([model.react(seen()) for _ in range(3)])
     assert np.array_equal(first[0], first[1])
     assert not np.array_equal(first[0], first[2])
-    noise = np.array([model.logits(seen())[0] for _ in range(2000)])
+    noise = np.array([model.react(seen())[0] for _ in range(2000)])
     assert np.corrcoef(noise[:-1], noise[1:])[0, 1] == pytest.approx(GoalSeeker.DRIFT, abs=0.08)
+
+
+def test_models_go_by_name(case):
+    assert isinstance(make_model("goal-seeker", case), GoalSeeker)
+    with pytest.raises(NotFound) as error:
+        make_model("spoc", case)
+    assert "goal-seeker" in error.value.expected
 
 
 def test_alone_it_finds_its_target_from_everywhere_and_breaks_the_rule(case):
@@ -87,7 +95,7 @@ def test_alone_it_finds_its_target_from_everywhere_and_breaks_the_rule(case):
         model.reset(np.random.default_rng([i, 0]))
         poses = [robot.pose]
         for _ in range(600):
-            action = int(random.choice(20, p=softmax(model.logits(robot.observe()))))
+            action = int(random.choice(20, p=softmax(model.logits(robot))))
             if terminal[action]:
                 found += robot.at_target
                 break

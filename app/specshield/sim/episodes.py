@@ -77,7 +77,7 @@ def with_shield(session: Session, case: Case, model: FoundationModel, start: Pos
         while not session.finished:
             episode.poses.append(robot.pose)
             main_over = session.main_task_done
-            logits = None if main_over else model.logits(robot.observe())
+            logits = None if main_over else model.logits(robot)
             began = time.perf_counter()
             decision = session.step(robot.pose, logits)
             episode.count(decision, time.perf_counter() - began, main_over)
@@ -101,7 +101,7 @@ def without_shield(
     terminal = case.task.robot.terminal
     episode.poses.append(robot.pose)
     for _ in range(MAX_STEPS):
-        action = int(random.choice(len(terminal), p=softmax(model.logits(robot.observe()))))
+        action = int(random.choice(len(terminal), p=softmax(model.logits(robot))))
         if terminal[action]:
             episode.ended(robot)
             break

@@ -3,40 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.errors import NotFound
 from specshield.robot import Robot
+from specshield.sim.cases import Case
+from specshield.sim.robot import Observation, SimulatedRobot
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Observation:
-    """What the robot senses of where it is: egocentric, no pose, no map.
-
-    distance: to the target along free space [m]. bearing: of the way there, from the heading [rad].
-    blocked (A,): actions that something would stop short. last_action: the one executed last, None at first.
-    """
-
-    distance: float
-    bearing: float
-    blocked: NDArray[np.bool_]
-    last_action: int | None
-
-
 class FoundationModel(Protocol):
-    """A policy with a memory of its own: observations in, logits out."""
+    """A policy with a memory of its own: what the robot senses in, logits out."""
 
     def reset(self, random: np.random.Generator) -> None:
         """Forgets the last episode. All randomness of the next one comes from `random`."""
         ...
 
-    def logits(self, observation: Observation) -> Floats:
-        """Finite logits, shape (A,)."""
+    def logits(self, robot: SimulatedRobot) -> Floats:
+        """Finite logits, shape (A,). Called once a step; reads the robot's senses, never its pose."""
         ...
 
 
@@ -67,7 +56,11 @@ class GoalSeeker:
         self._random = random
         self._noise = random.normal(size=len(self._robot.actions))
 
-    def logits(self, observation: Observation) -> Floats:
+    def logits(self, robot: SimulatedRobot) -> Floats:
+        return self.react(robot.observe())
+
+    def react(self, observation: Observation) -> Floats:
+        """Logits (A,) for one observation."""
         fresh = self._random.normal(size=len(self._noise))
         self._noise = self.DRIFT * self._noise + math.sqrt(1.0 - self.DRIFT**2) * fresh
         logits = self.SHARPNESS * self._saved(observation) + self.NOISE * self._noise
@@ -85,6 +78,20 @@ class GoalSeeker:
         after = np.abs(np.remainder(bearing - self._rotate + math.pi, 2.0 * math.pi) - math.pi)
         saved: Floats = nearer + (abs(bearing) - after) / self._turn
         return np.where(observation.blocked, -1.0, saved)
+
+
+MODELS: dict[str, Callable[[Case], FoundationModel]] = {
+    "goal-seeker": lambda case: GoalSeeker(case.task.robot),
+}
+
+
+def make_model(name: str, case: Case) -> FoundationModel:
+    """A model of that name, told the case's instruction. Raises NotFound."""
+    if name not in MODELS:
+        raise NotFound(
+            f"there is no model {name!r}", path="model", got=name, expected=f"one of {', '.join(MODELS)}"
+        )
+    return MODELS[name](case)
 
 
 def softmax(logits: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 
 from specshield.robot.unicycle import step, successors
 from specshield.sim.cases import Case
-from specshield.sim.model import Observation
 from specshield.world.geodesic import geodesic_distance
 
 COMFORT = 0.32  # [m] clearance in which a Stretch turns freely about its origin
@@ -18,6 +18,20 @@ LOOK_AHEAD = 10  # cells along the way
 NEAR = 1.0  # [m] along free space: an `end` within this has found the target
 
 Pose = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the robot senses of where it is: egocentric, no pose, no map.
+
+    distance: to the target along free space [m]. bearing: of the way there, from the heading [rad].
+    blocked (A,): actions that something would stop short. last_action: the one executed last, None at first.
+    """
+
+    distance: float
+    bearing: float
+    blocked: NDArray[np.bool_]
+    last_action: int | None
 
 
 class SimulatedRobot:
