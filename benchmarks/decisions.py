@@ -13,10 +13,10 @@ from benchmarks.states import Floats, State, along, shipped_dqn, starts
 from benchmarks.timing import quietest, summary
 from specshield.policy import reachability
 from specshield.shield.episode import Shield, decide, make_shield
-from specshield.shield.feasibility import futures, rho
+from specshield.shield.feasibility import futures, prefix_of, rho
 from specshield.shield.shaping import log_softmax, restrict
 from specshield.sim.cases import load_case
-from specshield.stl import SATISFIED_ABOVE, robustness_bounds
+from specshield.stl import SATISFIED_ABOVE
 
 ROUNDING = 1e-9  # [m] how far rho may differ between two programs that compute the same
 NAMES = {
@@ -120,12 +120,13 @@ def parts(shield: Shield, states: Sequence[State], repeats: int) -> dict[str, fl
     task, policy = shield.task, shield.policies[0]
     total, proposing, judging, prefixing = [], [], [], []
     for state in states:
-        tried = futures(task, shield.body, shield.policies, state.history, {}, None, 0.0)
+        prefix = prefix_of(task, task.formula, shield.view, state.history, {})
+        tried = futures(prefix, shield.body, shield.policies, None, 0.0)
         total.append(ask(shield, state, repeats))
         proposing.append(quietest(lambda s=state: policy.propose(s.history, {}, 0.0), repeats))
-        judging.append(quietest(lambda f=tried: rho(task, task.formula, f, {}), repeats))
+        judging.append(quietest(lambda p=prefix, f=tried: rho(p, f), repeats))
         prefixing.append(
-            quietest(lambda s=state: robustness_bounds(task.formula, task.samples(s.history)), repeats)
+            quietest(lambda s=state: prefix_of(task, task.formula, shield.view, s.history, {}), repeats)
         )
     medians = {
         "decide": total, "policy.propose": proposing, "robustness of the futures": judging,

@@ -86,8 +86,10 @@ def last_step(part: Obligation) -> int:
 
 def signal_rows(task: Task, signals: Mapping[str, NDArray[np.float64]], n: int) -> NDArray[np.float64]:
     """The signals' first n samples in the order of `Rules.signals`, shape (n, S). signals {name: [..n]}."""
-    rows = [task.signal(name, signals, n) for name in task.signals]
-    return np.array(rows, dtype=np.float64).reshape(-1, n).T.copy()
+    rows = np.empty((n, len(task.signals)))
+    for i, name in enumerate(task.signals):
+        rows[:, i] = task.signal(name, signals, n)
+    return rows
 
 
 @leaf

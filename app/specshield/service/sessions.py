@@ -39,6 +39,7 @@ from specshield.service.settings import Settings
 from specshield.service.store import Change, Record, Store
 from specshield.shield import episode
 from specshield.shield.decision import Carry, Config, Decision, Shield, make_shield
+from specshield.shield.view import view_of
 
 R = TypeVar("R")
 RACES = 10  # writes lost to others before a caller is told so
@@ -191,7 +192,8 @@ class Sessions:
         """Asks no policy: those of a session that is over may be gone."""
         config = session.config
         task = self._policies.task(Description(config["map_id"], config["robot"], config["spec"], "", 0, {}))
-        shield = Shield(task, (), Config(), make_body(task.robot, task.grid))
+        body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
+        shield = Shield(task, (), Config(), body, view)
         return episode.close(shield, session.poses, session.signals)
 
     async def trajectory(self, id: str) -> Iterator[bytes]:

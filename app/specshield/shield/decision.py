@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from specshield.errors import InputError, PolicyError, Unsupported
 from specshield.policy.policy import Proposer
 from specshield.robot.unicycle import Body, make_body
+from specshield.shield.view import View, view_of
 from specshield.stl import Verdict
 from specshield.task import Task
 
@@ -73,6 +74,7 @@ class Shield:
     policies: tuple[Proposer, ...]
     config: Config
     body: Body = field(repr=False)
+    view: View = field(repr=False)
 
     @property
     def max_steps(self) -> int:
@@ -92,7 +94,13 @@ def make_shield(policies: Sequence[Proposer], config: Config | None = None) -> S
                 "the policies were made for different tasks", path=f"policy_ids[{i}]",
                 got=policy.task.content_hash, expected=f"task {task.content_hash}, as policy_ids[0]",
             )  # fmt: skip
-    return Shield(task, tuple(policies), config or Config(), make_body(task.robot, task.grid))
+    return Shield(
+        task,
+        tuple(policies),
+        config or Config(),
+        make_body(task.robot, task.grid),
+        view_of(task, task.formula),
+    )
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +18,7 @@ from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.robot.unicycle import in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
-from specshield.shield.feasibility import futures, rho
+from specshield.shield.feasibility import futures, prefix_of, rho
 from specshield.shield.judgement import (
     Judged,
     as_actions,
@@ -59,8 +60,8 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
             "the footprint touches an obstacle", path="initial_pose", got=list(pose),
             expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
         )  # fmt: skip
-    tried = futures(shield.task, shield.body, shield.policies, history, {}, None, shield.config.margin)
-    values = rho(shield.task, shield.task.formula, tried, {})
+    prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
+    values = rho(prefix, futures(prefix, shield.body, shield.policies, None, shield.config.margin))
     if not np.any(values > SATISFIED_ABOVE):
         raise InfeasibleStart(
             f"no action from here has a future that satisfies the formula: the best robustness is "
@@ -100,18 +101,17 @@ def decide(
     nexts = np.empty((len(robot.motions), 3))
     successors(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
-    prefix = task.samples(poses, signals)
-    low, high = (float(v) for v in robustness_bounds(task.formula, prefix))
-    spec_status = _verdict(low, high)
-    margin = SATISFIED_ABOVE + shield.config.margin
-    kept_margin = low > margin or high <= margin  # nothing the robot still does can change whether it is kept
+    prefix = prefix_of(task, task.formula, shield.view, poses, signals)
+    spec_status = _verdict(prefix.low, prefix.high)
+    margin = SATISFIED_ABOVE + shield.config.margin  # is nothing left that could change whether it is kept?
+    kept_margin = prefix.low > margin or prefix.high <= margin
 
     answer: _Answer
     if t >= task.horizon or (spec_status == "satisfied" and kept_margin):
         judged = None
         answer = _unmodified(shield, log_prior)
     else:
-        judged = judge(shield, poses, signals, tail, prefix, violated=spec_status == "violated")
+        judged = judge(shield, prefix, tail, violated=spec_status == "violated")
         answer = _answer(shield, log_prior, judged, main_task_done)
         if spec_status == "violated":
             answer = _Answer(answer.distribution, "violated", answer.reason)
@@ -205,7 +205,8 @@ def _history(poses: ArrayLike) -> Floats:
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not np.isfinite(array).all():
         got = str(poses)[:80]
         raise PoseError("not poses", path="poses", got=got, expected="a list of finite [x, y, theta]")
-    array[:, 2] = [wrap(theta) for theta in array[:, 2]]
+    for i in np.flatnonzero(np.abs(array[:, 2]) >= math.pi):
+        array[i, 2] = wrap(array[i, 2])
     return array
 
 
@@ -260,6 +261,7 @@ def _follow(carry: Carry | None, poses: Floats) -> tuple[bytes | None, tuple[flo
 
 def _draw(distribution: Floats, seed: int, t: int) -> int:
     """An action drawn with the session's seed and t, so that a replay draws the same."""
-    edges = np.cumsum(distribution)
-    point = np.random.default_rng([seed, t]).random() * edges[-1]
-    return int(min(np.searchsorted(edges, point, side="right"), np.flatnonzero(distribution)[-1]))
+    drawn = blake2b(b"%d %d" % (seed, t), digest_size=8).digest()
+    edges = distribution.cumsum()
+    point = int.from_bytes(drawn, "big") / 2.0**64 * edges[-1]
+    return int(min(edges.searchsorted(point, side="right"), distribution.nonzero()[0][-1]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,13 +9,13 @@ from numpy.typing import NDArray
 
 from specshield.shield import shaping
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Best, Futures, best_of, futures, rho
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho
 from specshield.shield.residual import residuals
+from specshield.shield.view import view_of
 from specshield.stl import SATISFIED_ABOVE
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Signals = Mapping[str, Floats]
 
 
 @dataclass(frozen=True)
@@ -33,39 +32,30 @@ class Judged:
     margin_unattainable: bool  # the margin asked for was lowered
 
 
-def judge(
-    shield: Shield,
-    poses: Floats,
-    signals: Signals,
-    tail: bytes | None,
-    prefix: Mapping[str, Floats],
-    violated: bool,
-) -> Judged:
+def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) -> Judged:
     """Tries the futures from x_t and judges the motions by the most that can still be kept.
 
-    poses [t + 1, 3]; tail: the witness the robot follows, one motion a byte; prefix: the task's samples [t
-    + 1];
-    violated: whether the prefix decides so.
+    prefix: as the whole formula sees it; tail: the witness the robot follows, one motion a byte; violated:
+    whether the prefix decides so.
     """
     task, robot, asked = shield.task, shield.task.robot, shield.config.margin
     motions = len(robot.motions)
-    tried = futures(task, shield.body, shield.policies, poses, signals, tail, asked)
-    whole = rho(task, task.formula, tried, signals)
-    best, feasible, lowered = best_of(tried, whole, motions), np.zeros(motions, bool), False
-    for formula in residuals(task.formula, prefix, len(poses) - 1) if violated else (task.formula,):
-        values = rho(task, formula, tried, signals) if violated else whole
-        best = best_of(tried, values, motions)
-        feasible = best.robustness > SATISFIED_ABOVE + asked
-        highest = best.robustness.max()
-        lowered = not feasible.any() and highest > SATISFIED_ABOVE
-        if lowered:  # the largest margin that can be had
-            feasible = best.robustness >= highest
-        if feasible.any():
-            break
-    first = tried.preferred
+    tried = futures(prefix, shield.body, shield.policies, tail, asked)
+    whole = rho(prefix, tried)
+    best = best_of(tried, whole, motions)
+    feasible, lowered = _kept(best, asked)
+    if violated:
+        samples = task.samples(prefix.poses, prefix.signals)
+        for formula in residuals(task.formula, samples, prefix.t):
+            part = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
+            best = best_of(tried, rho(part, tried), motions)
+            feasible, lowered = _kept(best, asked)
+            if feasible.any():
+                break
+    some, first = bool(feasible.any()), tried.preferred
     if tail and feasible[tail[0]]:
         first = tail[0]
-    elif feasible.any() and not feasible[first]:
+    elif some and not feasible[first]:
         first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
     of = robot.motion_of
     return Judged(
@@ -78,6 +68,15 @@ def judge(
         completion=int(robot.representative[first]),
         margin_unattainable=lowered,
     )
+
+
+def _kept(best: Best, asked: float) -> tuple[Bools, bool]:
+    """Which motions keep the margin asked for, or else the largest there is; whether it was lowered."""
+    feasible = best.robustness > SATISFIED_ABOVE + asked
+    highest = best.robustness.max()
+    if feasible.any() or highest <= SATISFIED_ABOVE:
+        return feasible, False
+    return best.robustness >= highest, True
 
 
 def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, ...]:

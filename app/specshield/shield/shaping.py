@@ -12,10 +12,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 
+@kernel
 def log_softmax(logits: Floats) -> Floats:
     """Log-probabilities of logits in which -inf means impossible. At least one is finite. Shape (A,)."""
     top = np.max(logits)
@@ -23,11 +26,13 @@ def log_softmax(logits: Floats) -> Floats:
     return result
 
 
+@kernel
 def feasible_mass(log_prior: Floats, feasible: Bools) -> float:
     """pi_FM(S_t): the prior's mass on the feasible actions, log_prior conditional on not ending."""
     return float(min(np.sum(np.exp(log_prior[feasible])), 1.0))
 
 
+@kernel
 def restrict(log_prior: Floats, feasible: Bools) -> Floats | None:
     """Threshold 1: the prior on S_t, renormalised (the limit of eq. 16). None if it has no mass there."""
     logits = np.where(feasible, log_prior, -np.inf)
@@ -86,9 +91,13 @@ def tilt(log_prior: Floats, values: Floats, threshold: float) -> Floats | None:
         low, high = (middle, high) if short(middle) < 0.0 else (low, middle)
 
 
+@kernel
 def divergence(distribution: Floats, log_prior: Floats) -> float | None:
     """KL(distribution || prior) in nats; None where it leaves the prior's support. Shapes (A,)."""
-    on = distribution > 0.0
-    if np.any(np.isneginf(log_prior[on])):
-        return None
-    return max(float(np.sum(distribution[on] * (np.log(distribution[on]) - log_prior[on]))), 0.0)
+    total = 0.0
+    for share, log_share in zip(distribution, log_prior):  # noqa: B905 - compiled
+        if share > 0.0:
+            if log_share == -np.inf:
+                return None
+            total += share * (np.log(share) - log_share)
+    return max(total, 0.0)

@@ -211,20 +211,20 @@ def _until(left: Array, right: Array, width: int) -> Array:
 def _predicate(predicate: Atom | Comparison, seen: _Seen, start: int, stop: int) -> Array:
     """[1, *batch, stop - start] where the samples are known, [2, ...] where some are not."""
     known = max(0, min(stop, seen.known) - start)
-    difference = _difference(predicate)
-    values = value(difference, seen.values, start, start + known)
+    term = difference(predicate)
+    values = value(term, seen.values, start, start + known)
     exact = np.broadcast_to(values, (1, *seen.batch, known))
     if start + known == stop:
         return exact
     ends = np.empty((2, *seen.batch, stop - start))
     ends[..., :known] = exact
-    lo, hi = interval(difference)
+    lo, hi = interval(term)
     ends[0, ..., known:] = lo
     ends[1, ..., known:] = hi
     return ends
 
 
-def _difference(predicate: Atom | Comparison) -> Term:
+def difference(predicate: Atom | Comparison) -> Term:
     """The term whose value is the predicate's robustness."""
     match predicate:
         case Atom(name):

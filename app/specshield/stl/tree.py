@@ -1,0 +1,222 @@
+"""Whole formulas as flat trees for compiled code: one pass over a buffer, nothing allocated.
+
+A tree's value is `robustness(formula, ...)`, and its bounds `robustness_bounds`, bit for bit: minima and
+maxima of the same float64 numbers. Its leaves are the largest parts without a temporal operator (`Program`s);
+node n's values, rho at steps start to stop - 1, lie in the buffer from at[n], where its first operand's lay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import leaf
+from specshield.stl.formula import (
+    Always,
+    And,
+    Atom,
+    Comparison,
+    Eventually,
+    Formula,
+    Implies,
+    Node,
+    Not,
+    Or,
+    Until,
+)
+from specshield.stl.program import Program, Programs, compile_predicate, pack
+from specshield.stl.robustness import difference
+from specshield.stl.terms import interval
+
+NOT, AND, OR, ALWAYS, EVENTUALLY, UNTIL = range(6)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Tree(NamedTuple):
+    """A formula at step 0; n nodes in postfix order, l leaves. The value ends up at the buffer's start.
+
+    op, at, length, a, b [n]: what is done, where the values lie and how many come out, the window. right [n]:
+    where the second operand's values lie. leaf_at, leaf_start, leaf_stop [l]: where a leaf's values lie, and
+    of which steps; low, high [l]: its value where the samples are still to come. size: of the buffer.
+    """
+
+    op: Ints
+    at: Ints
+    length: Ints
+    a: Ints
+    b: Ints
+    right: Ints
+    leaf_at: Ints
+    leaf_start: Ints
+    leaf_stop: Ints
+    low: Floats
+    high: Floats
+    programs: Programs
+    size: int
+
+
+def compile_tree(formula: Formula, slots: Mapping[str, int]) -> Tree:
+    """The tree of `formula`, name n's sample at slots[n]. Raises FormulaError at a name without a slot."""
+    builder = _Builder(slots)
+    builder.add(formula, 0, 1)
+    op, at, length, a, b, right = np.array(builder.nodes, np.int64).reshape(-1, 6).T.copy()
+    leaf_at, leaf_start, leaf_stop = np.array(builder.leaves, np.int64).reshape(-1, 3).T.copy()
+    low, high = np.array(builder.unknown, np.float64).reshape(-1, 2).T.copy()
+    programs = pack(builder.programs)
+    return Tree(
+        op, at, length, a, b, right, leaf_at, leaf_start, leaf_stop, low, high, programs, builder.size
+    )
+
+
+class _Builder:
+    def __init__(self, slots: Mapping[str, int]) -> None:
+        self.slots = slots
+        self.nodes: list[tuple[int, ...]] = []
+        self.leaves: list[tuple[int, int, int]] = []
+        self.unknown: list[tuple[float, float]] = []
+        self.programs: list[Program] = []
+        self.size = 0
+
+    def add(self, formula: Node, start: int, stop: int) -> int:
+        """Adds rho at steps start to stop - 1; returns where in the buffer it will lie."""
+        count = stop - start
+        match formula:
+            case _ if not _is_temporal(formula):
+                return self._leaf(formula, start, stop)
+            case Not(child):
+                return self._node(NOT, self.add(child, start, stop), count)
+            case And(children) | Or(children):
+                op = AND if isinstance(formula, And) else OR
+                at = self.add(children[0], start, stop)
+                for child in children[1:]:
+                    self._node(op, at, count, right=self.add(child, start, stop))
+                return at
+            case Implies(left, right):
+                at = self._node(NOT, self.add(left, start, stop), count)
+                return self._node(OR, at, count, right=self.add(right, start, stop))
+            case Always(a, b, child) | Eventually(a, b, child):
+                op = ALWAYS if isinstance(formula, Always) else EVENTUALLY
+                return self._node(op, self.add(child, start + a, stop + b), count, a, b)
+            case Until(_, 0, _, right):
+                return self.add(right, start, stop)
+            case Until(a, b, left, right):
+                at = self.add(left, start, stop - 1 + b)
+                return self._node(UNTIL, at, count, a, b, self.add(right, start + a, stop + b))
+        raise TypeError(f"not a formula: {formula!r}")
+
+    def _leaf(self, formula: Node, start: int, stop: int) -> int:
+        at, self.size = self.size, self.size + stop - start
+        self.leaves.append((at, start, stop))
+        self.unknown.append(_unknown(formula))
+        self.programs.append(compile_predicate(formula, self.slots))
+        return at
+
+    def _node(self, op: int, at: int, count: int, a: int = 0, b: int = 0, right: int = -1) -> int:
+        self.nodes.append((op, at, count, a, b, right))
+        return at
+
+
+def _is_temporal(formula: Node) -> bool:
+    return isinstance(formula, (Always, Eventually, Until)) or any(map(_is_temporal, formula.parts))
+
+
+def _unknown(formula: Node) -> tuple[float, float]:
+    """Bounds on a leaf's robustness where every name may be any real number."""
+    match formula:
+        case Atom() | Comparison():
+            return interval(difference(formula))
+        case Not(child):
+            low, high = _unknown(child)
+            return -high, -low
+        case And(children):
+            lows, highs = zip(*map(_unknown, children), strict=True)
+            return min(lows), min(highs)
+        case Or(children):
+            lows, highs = zip(*map(_unknown, children), strict=True)
+            return max(lows), max(highs)
+        case Implies(left, right):
+            (low, high), (low_right, high_right) = _unknown(left), _unknown(right)
+            return max(-high, low_right), max(-low, high_right)
+    raise TypeError(f"not a predicate: {formula!r}")
+
+
+@leaf
+def tree_value(tree: Tree, buffer: Floats) -> float:
+    """rho, from the leaves' values in `buffer` (size,), which is overwritten."""
+    for n in range(tree.op.shape[0]):
+        if tree.op[n] == NOT:
+            for i in range(tree.at[n], tree.at[n] + tree.length[n]):
+                buffer[i] = -buffer[i]
+        else:
+            _apply(tree, n, buffer)
+    return float(buffer[0] + 0.0)  # one zero, as in `robustness`
+
+
+@leaf
+def tree_bounds(tree: Tree, low: Floats, high: Floats) -> tuple[float, float]:
+    """(lo, hi) of rho, from the leaves' lower and upper values; both buffers are overwritten."""
+    for n in range(tree.op.shape[0]):
+        if tree.op[n] == NOT:
+            for i in range(tree.at[n], tree.at[n] + tree.length[n]):
+                low[i], high[i] = -high[i], -low[i]
+        else:
+            _apply(tree, n, low)
+            _apply(tree, n, high)
+    return float(low[0] + 0.0), float(high[0] + 0.0)
+
+
+@leaf
+def _apply(tree: Tree, n: int, buffer: Floats) -> None:
+    """A monotone operator on one end, in place: each value is written after the last that reads it."""
+    op, at, count, right = tree.op[n], tree.at[n], tree.length[n], tree.right[n]
+    if op == AND:
+        for i in range(count):
+            buffer[at + i] = min(buffer[at + i], buffer[right + i])
+    elif op == OR:
+        for i in range(count):
+            buffer[at + i] = max(buffer[at + i], buffer[right + i])
+    elif op == UNTIL:
+        for i in range(count):
+            buffer[at + i] = _until(buffer, at + i, right + i, tree.a[n], tree.b[n])
+    else:
+        _slide(buffer, at, count, tree.b[n] - tree.a[n] + 1, op == ALWAYS)
+
+
+@leaf
+def _slide(buffer: Floats, at: int, count: int, width: int, least: bool) -> None:
+    """The extremum of each `width` neighbours, in log2(width) passes."""
+    if count == 1:
+        best = buffer[at]
+        for i in range(at + 1, at + width):
+            best = min(best, buffer[i]) if least else max(best, buffer[i])
+        buffer[at] = best
+        return
+    size, length = 1, count + width - 1
+    while 2 * size <= width:
+        length -= size
+        for i in range(at, at + length):
+            buffer[i] = min(buffer[i], buffer[i + size]) if least else max(buffer[i], buffer[i + size])
+        size *= 2
+    for i in range(at, at + count):
+        j = i + width - size
+        buffer[i] = min(buffer[i], buffer[j]) if least else max(buffer[i], buffer[j])
+
+
+@leaf
+def _until(buffer: Floats, left: int, right: int, a: int, b: int) -> float:
+    """max over k in [a, b] of min(right[k - a], min left[0 : k])."""
+    kept, best = np.inf, -np.inf
+    for k in range(a):
+        kept = min(kept, buffer[left + k])
+    for k in range(b - a + 1):
+        best = max(best, min(buffer[right + k], kept))
+        if kept <= best:  # what is kept only falls
+            break
+        if a + k < b:
+            kept = min(kept, buffer[left + a + k])
+    return best
