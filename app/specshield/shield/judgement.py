@@ -90,7 +90,11 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
     motion = int(shield.task.robot.motion_of[action])
     found = certified[motion] if motion >= 0 else None
-    return None if found is None else tuple(shield.task.robot.representative[list(found)].tolist())
+    return (
+        None
+        if found is None
+        else tuple(shield.task.robot.representative[np.frombuffer(found, np.uint8)].tolist())
+    )
 
 
 def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
