@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from specshield.errors import Conflict, InfeasibleStart, InputError, LimitReached, NotFound
+from specshield.policy.view import view_of
 from specshield.robot.unicycle import make_body
 from specshield.service import files
 from specshield.service.policies import Description, Policies
@@ -39,7 +40,6 @@ from specshield.service.settings import Settings
 from specshield.service.store import Change, Record, Store
 from specshield.shield import episode
 from specshield.shield.decision import Carry, Config, Decision, Shield, make_shield
-from specshield.shield.view import view_of
 
 R = TypeVar("R")
 RACES = 10  # writes lost to others before a caller is told so

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from specshield.errors import InputError, PolicyError, Unsupported
 from specshield.policy.policy import Proposer
+from specshield.policy.view import View, view_of
 from specshield.robot.unicycle import Body, make_body
-from specshield.shield.view import View, view_of
 from specshield.stl import Verdict
 from specshield.task import Task
 

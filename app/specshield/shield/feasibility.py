@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from specshield.policy.policy import Proposer
 from specshield.policy.progress import signal_rows
+from specshield.policy.view import View, best_rows, look, rate
 from specshield.robot.unicycle import Body, simulate
-from specshield.shield.view import View, best_rows, look, rate
 from specshield.stl import Formula, robustness, robustness_bounds
 from specshield.task import Task
 

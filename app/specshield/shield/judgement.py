@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.policy.view import view_of
 from specshield.shield import shaping
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho
 from specshield.shield.residual import residuals
-from specshield.shield.view import view_of
 from specshield.stl import SATISFIED_ABOVE
 
 Floats = NDArray[np.float64]
