@@ -81,11 +81,12 @@ def serve(
 def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
 ) -> None:
-    """Make the policies that are asked for, until stopped; those that are learned need torch."""
+    """Make the policies and do the runs that are asked for, until stopped; policies that learn need torch."""
     from specshield.service.settings import Settings
     from specshield.service.worker import serve as work
+    from specshield.sim.jobs import QUEUE
 
-    work(Settings(), until_eof)
+    work(Settings(), until_eof, [QUEUE])
 
 
 def openapi() -> None:

@@ -1,4 +1,4 @@
-"""The training worker: `specshield worker`. One process takes jobs, a fork of it runs each."""
+"""The worker: `specshield worker`. One process takes jobs, a fork of it runs each."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -25,8 +25,11 @@ from specshield.service.settings import Settings
 log = logging.getLogger("specshield")
 
 
-def serve(settings: Settings, until_eof: bool) -> None:
-    """Work until told to stop, or until standard input ends: the server that started this one is gone."""
+def serve(settings: Settings, until_eof: bool, others: Sequence[str] = ()) -> None:
+    """Work until told to stop, or until standard input ends: the server that started this one is gone.
+
+    others: queues of jobs that are no training runs and look after themselves.
+    """
     if settings.redis_url is None:
         embedded = EmbeddedStore(settings.data_dir)
         embedded.join()
@@ -35,15 +38,16 @@ def serve(settings: Settings, until_eof: bool) -> None:
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
     with _regularly(lambda: jobs.worker_lives(methods.available())):
-        _Worker(jobs).work(logging_level="WARNING")
+        _Worker(jobs, others).work(logging_level="WARNING")
 
 
 class _Worker(Worker):
     """rq's worker, which on SIGTERM ends the run at once: what it has learned is in its checkpoint."""
 
-    def __init__(self, jobs: Jobs) -> None:
+    def __init__(self, jobs: Jobs, others: Sequence[str]) -> None:
+        self._training = [queue_of(method) for method in methods.available()]
         super().__init__(
-            [queue_of(method) for method in methods.available()],
+            [*self._training, *others],
             connection=jobs.redis,
             serializer=JSONSerializer,
             work_horse_killed_handler=self._killed,
@@ -53,7 +57,7 @@ class _Worker(Worker):
         self._running: Any = None
 
     def execute_job(self, job: Job, queue: Any) -> None:
-        self._running = job.args
+        self._running = job
         super().execute_job(job, queue)
         self._running = None
 
@@ -74,11 +78,13 @@ class _Worker(Worker):
         if status and os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
         self._fail(
-            job.args, f"the training process ended {how}; ask for it again and it goes on from its checkpoint"
+            job, f"the training process ended {how}; ask for it again and it goes on from its checkpoint"
         )
 
-    def _fail(self, args: Any, reason: str) -> None:
-        id, attempt = args
+    def _fail(self, job: Job, reason: str) -> None:
+        if job.origin not in self._training:
+            return
+        id, attempt = job.args
         self._jobs.report(id, attempt, status="failed", error=reason, eta_s="")
 
 

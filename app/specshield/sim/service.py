@@ -35,7 +35,7 @@ def own_server() -> Iterator[str]:
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
-                preexec_fn=_follow_parent,
+                preexec_fn=follow_parent,
             )
         try:
             _wait_until_ready(url, server, log)
@@ -49,8 +49,8 @@ def own_server() -> Iterator[str]:
                 server.wait()
 
 
-def _follow_parent() -> None:
-    """Linux: the server is told to stop if this process is killed."""
+def follow_parent() -> None:
+    """Linux: a process that calls this as it begins is told to stop if the one that started it is killed."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 

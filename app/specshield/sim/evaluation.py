@@ -1,0 +1,100 @@
+"""All runs of an experiment, over processes or job workers: kept as they finish, taken up again."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+
+from specshield.errors import InputError
+from specshield.sim import jobs
+from specshield.sim.experiment import Experiment
+from specshield.sim.runs import Record, run
+from specshield.sim.service import follow_parent
+
+Missing = Mapping[int, Sequence[str]]  # {run: methods}
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def evaluate(
+    experiment: Experiment,
+    runs: int,
+    methods: Sequence[str],
+    folder: Path | None = None,
+    processes: int = 1,
+    redis_url: str | None = None,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> list[Record]:
+    """The records of `runs` runs by each method, by run and then by method.
+
+    folder: finished runs are kept there as they come, those that are there already are not made again.
+    processes: 1 is this one. redis_url: where job workers take the runs from instead. on_progress: how many
+    runs are finished. Raises InputError where `folder` holds another experiment.
+    """
+    done = {} if folder is None else _open(folder, experiment)
+    missing = {i: left for i in range(runs) if (left := [name for name in methods if (i, name) not in done])}
+    on_progress(runs - len(missing))
+    if redis_url is not None and missing:
+        made = jobs.over_workers(redis_url, experiment, missing)
+    elif processes > 1:
+        made = _over_processes(experiment, missing, processes)
+    else:
+        made = (run(experiment, i, names) for i, names in missing.items())
+    for finished, records in enumerate(made, runs - len(missing) + 1):
+        done.update({(record.run, record.method): record for record in records})
+        if folder is not None:
+            _keep(folder, records)
+        on_progress(finished)
+    return [done[i, name] for i in range(runs) for name in methods]
+
+
+def _over_processes(experiment: Experiment, missing: Missing, processes: int) -> Iterator[list[Record]]:
+    """Each run in one of `processes` fresh processes, which end with this one, however it goes."""
+    for name in THREADS:  # one thread each: the processes share the cores out
+        os.environ.setdefault(name, "1")
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), follow_parent)
+    try:
+        under_way: set[Future[list[Record]]] = {
+            pool.submit(run, experiment, i, list(names)) for i, names in missing.items()
+        }
+        while under_way:
+            finished, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]:
+    """What `folder` holds of the experiment."""
+    folder.mkdir(parents=True, exist_ok=True)
+    about, written = folder / "experiment.json", folder / "runs.jsonl"
+    if about.exists():
+        found = Experiment.from_json(json.loads(about.read_text()))
+        if found != experiment:
+            raise InputError(
+                "the folder holds another experiment", path="out", got=str(found.to_json()),
+                expected=f"{experiment.to_json()}, or another folder",
+            )  # fmt: skip
+    else:
+        about.write_text(json.dumps(experiment.to_json()) + "\n")
+    if not written.exists():
+        return {}
+    content = written.read_bytes()
+    os.truncate(written, content.rfind(b"\n") + 1)  # a line that was cut short
+    return {(record.run, record.method): record for record in read(folder)}
+
+
+def read(folder: Path) -> Iterator[Record]:
+    """The records kept in a folder."""
+    with open(folder / "runs.jsonl") as lines:
+        for line in lines:
+            yield Record.from_json(json.loads(line))
+
+
+def _keep(folder: Path, records: Sequence[Record]) -> None:
+    with open(folder / "runs.jsonl", "a") as lines:
+        lines.writelines(json.dumps(record.to_json()) + "\n" for record in records)

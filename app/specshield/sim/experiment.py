@@ -1,0 +1,147 @@
+"""An experiment: a case, a model, a disturbance and a seed; and what every process prepares for it once."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+from specshield.errors import InputError, NotFound
+from specshield.policy.load import load_policy
+from specshield.policy.policy import Policy, Proposer
+from specshield.policy.reachability import synthesise
+from specshield.robot.unicycle import Body, make_body
+from specshield.shield.decision import Config
+from specshield.shield.episode import Shield, make_shield
+from specshield.sim.cases import MODELS, Case, load_case
+from specshield.sim.decoding import HardDecoding, RobustDecoding
+from specshield.sim.disturbance import believed, check
+from specshield.sim.houses import load_house_case
+from specshield.sim.methods import Decoding, Method, Shielded, Simplex
+from specshield.sim.model import FoundationModel, make_model
+from specshield.task import Task
+
+METHODS = ("unmodified", "hcd", "rcd", "simplex", "paper", "ours", "lookahead")
+MARGINS = ("simplex", "ours", "lookahead")  # of these NAME@M asks for a margin of M metres
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """house: where `case` is "house", which one (sim/houses.py). noise: of sim/disturbance.py."""
+
+    case: str
+    house: str | None = None
+    model: str = "goal-seeker"
+    noise: str = "none"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check(self.noise)
+        if (self.case == "house") != (self.house is not None):
+            raise InputError(
+                "the case 'house' needs a house, and no other has one", path="house", got=self.house,
+                expected="a house's name or path, with case 'house'",
+            )  # fmt: skip
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Experiment:
+        return Experiment(**value)
+
+    @property
+    def setting(self) -> Setting:
+        return _setting(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What an experiment needs, prepared when it is first asked for. task, body: as the shield is told."""
+
+    experiment: Experiment
+    case: Case
+    task: Task
+    body: Body
+
+    @cached_property
+    def model(self) -> FoundationModel:
+        return make_model(self.experiment.model, self.case)
+
+    @cached_property
+    def learned(self) -> Policy | None:
+        """The DQN shipped for the case; None where there is none."""
+        folder = MODELS / self.case.name
+        if not (folder / "card.json").is_file():
+            return None
+        card = json.loads((folder / "card.json").read_text())
+        policy = load_policy((folder / "policy.safetensors").read_bytes(), card, self.case.task)
+        assert isinstance(policy, Policy)
+        return replace(policy, task=self.task)
+
+    @cached_property
+    def policies(self) -> tuple[Proposer, ...]:
+        """Reachability, then the DQN if there is one."""
+        computed = synthesise(self.task)
+        return (computed,) if self.learned is None else (computed, self.learned)
+
+    @cached_property
+    def paper(self) -> Shield:
+        """The paper's shield. Raises NotFound where there is no DQN for the case."""
+        if self.learned is None:
+            raise NotFound(
+                f"there is no learned policy for {self.case.name}", path="methods", got="paper",
+                expected="a case with a folder in models/, or other methods",
+            )  # fmt: skip
+        return make_shield([self.learned])
+
+    @cached_property
+    def ours(self) -> Shield:
+        return make_shield(self.policies)
+
+    def method(self, name: str) -> Method:
+        """A method by its name, NAME@M with a margin of M metres. Raises NotFound, InputError."""
+        kind, margin = split(name)
+        make: dict[str, Callable[[], Method]] = {
+            "unmodified": lambda: Decoding(self.task),
+            "hcd": lambda: Decoding(self.task, HardDecoding(self.task)),
+            "rcd": lambda: Decoding(self.task, RobustDecoding(self.task)),
+            "simplex": lambda: Simplex(make_shield(self.policies, Config(margin=margin))),
+            "paper": lambda: Shielded(self.paper, carries=False),
+            "ours": lambda: Shielded(make_shield(self.policies, Config(margin=margin))),
+            "lookahead": lambda: Shielded(
+                make_shield(self.policies, Config(margin=margin, shaping="lookahead"))
+            ),
+        }
+        return make[kind]()
+
+
+def split(method: str) -> tuple[str, float]:
+    """The kind of a method and its margin [m]. Raises NotFound or InputError."""
+    kind, at, text = method.partition("@")
+    if kind not in METHODS:
+        raise NotFound(
+            f"there is no method {kind!r}", path="methods", got=method, expected=f"of {', '.join(METHODS)}"
+        )
+    if not at:
+        return kind, 0.0
+    try:
+        margin = float(text)
+    except ValueError:
+        margin = math.nan
+    if kind not in MARGINS or not (math.isfinite(margin) and margin >= 0.0):
+        raise InputError(
+            "not a method with a margin", path="methods", got=method,
+            expected=f"NAME@METRES, the name one of {', '.join(MARGINS)}",
+        )  # fmt: skip
+    return kind, margin
+
+
+@lru_cache(maxsize=4)
+def _setting(experiment: Experiment) -> Setting:
+    case = load_case(experiment.case) if experiment.house is None else load_house_case(experiment.house)
+    task = believed(experiment.noise, case.task)
+    return Setting(experiment, case, task, make_body(task.robot, task.grid))
