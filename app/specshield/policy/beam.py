@@ -1,122 +1,274 @@
-"""A beam over the tables: several ways at once, where one alone comes too late or gets stuck."""
+"""A beam over the tables: several ways at once, where following the tables comes too late or gets stuck.
+
+One beam serves every first motion that is still open. Ways that meet go on as one, for all the motions they
+began with, and each motion has its share of the poses that are kept.
+"""
 
 from __future__ import annotations
+
+import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf
-from specshield.policy.progress import STACK, Rules, advance, read_predicates, value_count
-from specshield.policy.tables import SAFE, Tables, score, slack
-from specshield.robot.unicycle import Body, step
+from specshield.policy.progress import advance, read_predicates
+from specshield.policy.tables import SAFE, is_broken, score, slack
+from specshield.policy.walk import Guide, Work
+from specshield.robot.unicycle import step
+
+MAX_ROOTS = 62  # bits of a tag
+ROOM = 128  # poses kept at a step, at most
+EASY = 8.0  # [steps] of slack after a goal was settled: from there the tables can be followed again
+TWIN = 1e3  # [1/m, 1/rad] poses as near as a millimetre count as one
+
+
+class Poses(NamedTuple):
+    """Poses with their progress, slack, and the roots that lead to them, as bits."""
+
+    pose: NDArray[np.float64]
+    status: NDArray[np.int8]
+    run: NDArray[np.int64]
+    slack: NDArray[np.float64]
+    tag: NDArray[np.int64]
+
+
+class Edges(NamedTuple):
+    """What led to the poses kept at each step: [steps, edges]; made: how many of them; tag [steps, poses]: as in `Poses`."""
+
+    child: NDArray[np.int32]
+    parent: NDArray[np.int32]
+    motion: NDArray[np.int32]
+    made: NDArray[np.int64]
+    tag: NDArray[np.int64]
 
 
 @kernel
 def beam(
-    body: Body,
-    rules: Rules,
-    tables: Tables,
-    pose: NDArray[np.float64],
+    guide: Guide,
     t: int,
+    pose: NDArray[np.float64],
     status: NDArray[np.int8],
     run: NDArray[np.int64],
-    first: int,
-    wait: int,
-    width: int,
+    share: int,
     band: float,
     target: float,
+    work: Work,
     motions: NDArray[np.int64],
-) -> int:
-    """Keeps the `width` poses with the most slack at every step, until one has settled every goal or has a
-    latest
-    feasible time above `target`.
+    taken: NDArray[np.int64],
+) -> None:
+    """Keeps the poses with the most slack at every step until each root has a way, or none is left.
 
-    first: the first motion, -1 for any. band: poses with less slack than this are given up. Returns how
-    many of
-    motions (n,) it took, 0 where none was found.
+    pose (R, 3), status, run (R, K): the roots, at step t, R <= MAX_ROOTS. share: poses kept for each root.
+    band: poses with less slack than this are given up. A way ends where every goal is settled, where one
+    more is and EASY steps are to spare, or where the latest feasible time is above `target`. Writes motions
+    (R, n) and how many of them lead there, taken (R,), 0 where no way was found.
     """
-    k_count, m_count, steps = status.shape[0], body.translate.shape[0], motions.shape[0]
-    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(k_count)
-    here = np.empty((width, 3))
-    here_status, here_run = np.empty((width, k_count), np.int8), np.empty((width, k_count), np.int64)
-    here[0], here_status[0], here_run[0] = pose, status, run
-    count = 1
-    room = width * m_count
-    new = np.empty((room, 3))
-    new_status, new_run = np.empty((room, k_count), np.int8), np.empty((room, k_count), np.int64)
-    new_slack, new_from, new_motion = np.empty(room), np.empty(room, np.int64), np.empty(room, np.int64)
-    scores = np.empty(m_count)
-    parent = np.empty((steps, width), np.int32)
-    taken = np.empty((steps, width), np.int16)
+    roots, k_count = status.shape
+    steps = motions.shape[1]
+    width = max(min(share * roots, ROOM), share)
+    room = width * guide.body.translate.shape[0]
+    here, new = _poses(width, k_count), _poses(room, k_count)
+    edges = Edges(
+        np.empty((steps, room), np.int32), np.empty((steps, room), np.int32),
+        np.empty((steps, room), np.int32), np.zeros(steps, np.int64), np.zeros((steps, width), np.int64),
+    )  # fmt: skip
+    slots = 4
+    while slots < 2 * room:
+        slots *= 2
+    table, place, kept = np.empty(slots, np.int32), np.empty(room, np.int64), np.empty(roots, np.int64)
+    here.pose[:roots], here.status[:roots], here.run[:roots] = pose, status, run
+    here.tag[:roots] = 1 << np.arange(roots)
+    taken[:] = 0
+    open_roots, count = (1 << roots) - 1, roots
     for n in range(steps):
-        found = 0
-        for w in range(count):
-            if n > 0 or first < 0:
-                score(
-                    body,
-                    rules,
-                    tables,
-                    here[w, 0],
-                    here[w, 1],
-                    here[w, 2],
-                    t + n,
-                    here_status[w],
-                    here_run[w],
-                    wait,
-                    scores,
-                )
-            for m in range(m_count):
-                if m != first if n == 0 and first >= 0 else scores[m] - (t + n + 1) < band:
-                    continue
-                x, y, theta = step(body, here[w, 0], here[w, 1], here[w, 2], m)
-                read_predicates(rules, x, y, theta, values, stack, predicates)
-                new_status[found], new_run[found] = here_status[w], here_run[w]
-                advance(rules, t + n + 1, predicates, new_status[found], new_run[found])
-                ahead = slack(body, rules, tables, x, y, theta, t + n + 1, new_status[found], new_run[found])
-                if ahead < band:
-                    continue
-                new[found, 0], new[found, 1], new[found, 2] = x, y, theta
-                new_slack[found], new_from[found], new_motion[found] = ahead, w, m
-                found += 1
-                if ahead == SAFE or ahead + (t + n + 1) > target:
-                    motions[n] = m
-                    for back in range(n - 1, -1, -1):
-                        motions[back] = taken[back, w]
-                        w = parent[back, w]
-                    return n + 1
-        count = 0
-        order = np.argsort(-new_slack[:found], kind="mergesort")
-        for o in order:
-            if count == width:
-                break
-            if _is_twin(new, new_status, new_run, o, here, here_status, here_run, count):
-                continue
-            here[count], here_status[count], here_run[count] = new[o], new_status[o], new_run[o]
-            parent[n, count], taken[n, count] = new_from[o], new_motion[o]
-            count += 1
+        table[:] = -1
+        found = _expand(guide, t, n, count, open_roots, band, here, new, edges, table, work)
+        open_roots = _finish(t, n, found, open_roots, target, status, new, edges, motions, taken)
+        if open_roots == 0:
+            return
+        order = np.argsort(-new.slack[:found], kind="mergesort")
+        count = _select(order, n, open_roots, width, share, band, kept, place, here, new, edges)
         if count == 0:
-            return 0
-    return 0
+            return
+
+
+@kernel
+def _poses(n: int, k: int) -> Poses:
+    return Poses(
+        np.empty((n, 3)),
+        np.empty((n, k), np.int8),
+        np.empty((n, k), np.int64),
+        np.empty(n),
+        np.empty(n, np.int64),
+    )
 
 
 @leaf
-def _is_twin(
-    new: NDArray[np.float64],
-    new_status: NDArray[np.int8],
-    new_run: NDArray[np.int64],
-    o: int,
-    here: NDArray[np.float64],
-    here_status: NDArray[np.int8],
-    here_run: NDArray[np.int64],
+def _copy(from_: Poses, i: int, to: Poses, j: int) -> None:
+    for d in range(3):
+        to.pose[j, d] = from_.pose[i, d]
+    for k in range(from_.status.shape[1]):
+        to.status[j, k], to.run[j, k] = from_.status[i, k], from_.run[i, k]
+
+
+@leaf
+def _expand(
+    guide: Guide,
+    t: int,
+    n: int,
     count: int,
-) -> bool:
-    """Whether a pose as near as a millimetre, with the same progress, is kept already."""
+    open_roots: int,
+    band: float,
+    here: Poses,
+    new: Poses,
+    edges: Edges,
+    table: NDArray[np.int32],
+    work: Work,
+) -> int:
+    """Every motion from every pose kept, into `new`, twins once; returns how many."""
+    body, rules, tables, wait = guide
+    found, joined = 0, 0
     for w in range(count):
-        near = abs(new[o, 0] - here[w, 0]) < 1e-3 and abs(new[o, 1] - here[w, 1]) < 1e-3
-        if near and abs(new[o, 2] - here[w, 2]) < 1e-3:
-            same = True
-            for k in range(new_status.shape[1]):
-                same = same and new_status[o, k] == here_status[w, k] and new_run[o, k] == here_run[w, k]
-            if same:
-                return True
-    return False
+        edges.tag[n, w] = here.tag[w]
+        if here.tag[w] & open_roots == 0:
+            continue
+        x, y, theta = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
+        score(body, rules, tables, x, y, theta, t + n, here.status[w], here.run[w], wait, -1, work.scores)
+        for m in range(body.translate.shape[0]):
+            if work.scores[m] - (t + n + 1) < band:
+                continue
+            x, y, theta = step(body, here.pose[w, 0], here.pose[w, 1], here.pose[w, 2], m)
+            _copy(here, w, new, found)
+            new.pose[found, 0], new.pose[found, 1], new.pose[found, 2] = x, y, theta
+            read_predicates(rules, x, y, theta, work.values, work.stack, work.predicates)
+            advance(rules, t + n + 1, work.predicates, new.status[found], new.run[found])
+            at = _place(new, found, table)
+            if at == found:
+                new.slack[at] = slack(
+                    body, rules, tables, x, y, theta, t + n + 1, new.status[at], new.run[at]
+                )
+                new.tag[at] = 0
+                found += 1
+            if new.slack[at] >= band and not is_broken(new.status[at]):
+                new.tag[at] |= here.tag[w]
+                edges.child[n, joined], edges.parent[n, joined], edges.motion[n, joined] = at, w, m
+                joined += 1
+    edges.made[n] = joined
+    return found
+
+
+@leaf
+def _finish(
+    t: int,
+    n: int,
+    found: int,
+    open_roots: int,
+    target: float,
+    status: NDArray[np.int8],
+    new: Poses,
+    edges: Edges,
+    motions: NDArray[np.int64],
+    taken: NDArray[np.int64],
+) -> int:
+    """Notes the way of every root that has one now; returns the roots that are still open."""
+    for c in range(found):
+        arrived = new.tag[c] & open_roots
+        ahead = new.slack[c]
+        if arrived == 0 or ahead < min(EASY, target - (t + n + 1)):
+            continue
+        for r in range(status.shape[0]):
+            if arrived >> r & 1 == 0:
+                continue
+            gained = ahead == SAFE or ahead + (t + n + 1) > target
+            for k in range(status.shape[1]):
+                gained = gained or new.status[c, k] != status[r, k]
+            if gained:
+                _trace(n, c, r, edges, motions[r])
+                taken[r] = n + 1
+                open_roots &= ~(1 << r)
+    return open_roots
+
+
+@leaf
+def _select(
+    order: NDArray[np.int64],
+    n: int,
+    open_roots: int,
+    width: int,
+    share: int,
+    band: float,
+    kept: NDArray[np.int64],
+    place: NDArray[np.int64],
+    here: Poses,
+    new: Poses,
+    edges: Edges,
+) -> int:
+    """The poses of `new` to go on with, into `here`: the most slack first, until each root has its share."""
+    for r in range(kept.shape[0]):
+        kept[r] = 0
+    count, full = 0, 0  # full: the roots that have their share
+    for i in range(order.shape[0]):
+        o = order[i]
+        place[o] = -1
+        tag = new.tag[o] & open_roots
+        if count == width or new.slack[o] < band or tag & ~full == 0:
+            continue
+        for r in range(kept.shape[0]):
+            kept[r] += tag >> r & 1
+            if kept[r] >= share:
+                full |= 1 << r
+        _copy(new, o, here, count)
+        here.tag[count], place[o] = tag, count
+        count += 1
+    joined = 0
+    for e in range(edges.made[n]):
+        at = place[edges.child[n, e]]
+        if at >= 0:
+            edges.child[n, joined], edges.parent[n, joined] = at, edges.parent[n, e]
+            edges.motion[n, joined] = edges.motion[n, e]
+            joined += 1
+    edges.made[n] = joined
+    return count
+
+
+@leaf
+def _place(new: Poses, found: int, table: NDArray[np.int32]) -> int:
+    """The pose that `found` is a twin of, progress included; else `found` itself, noted in the table."""
+    x, y, theta = _rounded(new.pose, found)
+    key = x * 73856093 ^ y * 19349663 ^ theta * 83492791
+    for k in range(new.status.shape[1]):
+        key = key * 31 + 4 * new.run[found, k] + new.status[found, k]
+    slot = (key ^ key >> 15) & (table.shape[0] - 1)
+    while table[slot] >= 0:
+        other = table[slot]
+        a, b, c = _rounded(new.pose, other)
+        same = a == x and b == y and c == theta
+        for k in range(new.status.shape[1]):
+            same = same and new.status[found, k] == new.status[other, k]
+            same = same and new.run[found, k] == new.run[other, k]
+        if same:
+            return int(other)
+        slot = (slot + 1) & (table.shape[0] - 1)
+    table[slot] = found
+    return found
+
+
+@leaf
+def _rounded(poses: NDArray[np.float64], i: int) -> tuple[int, int, int]:
+    return (
+        math.floor(TWIN * poses[i, 0] + 0.5),
+        math.floor(TWIN * poses[i, 1] + 0.5),
+        math.floor(TWIN * poses[i, 2] + 0.5),
+    )
+
+
+@leaf
+def _trace(n: int, at: int, root: int, edges: Edges, motions: NDArray[np.int64]) -> None:
+    """The motions from `root` to pose `at` of step n, into motions[:n + 1]."""
+    for layer in range(n, -1, -1):
+        for e in range(edges.made[layer]):
+            if edges.child[layer, e] == at and edges.tag[layer, edges.parent[layer, e]] >> root & 1:
+                motions[layer], at = edges.motion[layer, e], edges.parent[layer, e]
+                break

@@ -19,24 +19,24 @@ from specshield.policy.policy import Card, Proposal, make_card, read_tensors, wa
 from specshield.policy.progress import (
     ALWAYS,
     Rules,
-    forgive,
     make_rules,
-    replay,
     signal_rows,
 )
 from specshield.policy.search import propose_all
 from specshield.policy.tables import INVALID, SCALE, Tables
+from specshield.policy.walk import Guide
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
 
 MAX_ENTRIES = 100_000_000  # 400 MB while the tables are made
-LATE = 20  # [steps] left: so near the end a wide beam costs little, and finds more
-BAND = -12.0  # [steps] of slack: how far the tables err, in tight rooms
+FINE_ENTRIES = 1_000_000  # a lattice three times finer that needs no more is used instead
 
 
 @dataclass(frozen=True)
 class Settings:
-    """pitch: of the lattice [m]. beam: how many poses the search near a deadline keeps."""
+    """pitch: of the lattice [m], a third of it where the map is small. beam: how many poses the search near a
+    deadline keeps for each motion.
+    """
 
     pitch: float = 0.1
     beam: int = 12
@@ -89,27 +89,12 @@ class ReachabilityPolicy:
         """A continuation after each first motion: greedy, or by a beam near a deadline."""
         body, rules = self._prepared
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
-        t = len(history) - 1
-        status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
-        replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
-        forgive(rules, t, status)
-        motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
+        motions = np.empty((len(body.translate), self.task.horizon + 1 - len(history)), np.int64)
         poses = np.empty((*motions.shape, 3))
-        wait = wait_motion(self.task.robot)
         preferred = propose_all(
-            body,
-            rules,
-            self.tables,
-            history[-1],
-            t,
-            status,
-            run,
-            wait,
-            self.settings.beam,
-            BAND,
-            motions,
-            poses,
-        )
+            Guide(body, rules, self.tables, wait_motion(self.task.robot)), self.settings.beam, history,
+            signal_rows(self.task, signals, len(history)), motions, poses,
+        )  # fmt: skip
         return Proposal(motions, poses, int(preferred))
 
     def weights(self) -> bytes:
@@ -126,11 +111,11 @@ def synthesise(
     began = time.perf_counter()
     settings = settings or Settings()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
-    goals = _goals(task, rules, settings)
-    lattice = make_lattice(body, settings.pitch)
+    goals, pitch = _goals(task, rules, settings)
+    lattice = make_lattice(body, pitch)
     masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
     latest, valid = latest_times(lattice, rules, holds_at(body, rules, lattice), goals, masks, phases)
-    tables = _pack(latest, valid, masks, phases, goals, len(rules.kind), settings.pitch)
+    tables = _pack(latest, valid, masks, phases, goals, len(rules.kind), pitch)
     start = latest[0, masks.index(0)][valid[0] == 1]
     metrics = {
         "feasible_start": round(float((start >= 0.0).mean()), 4) if len(start) else 0.0,
@@ -145,7 +130,7 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_settings(card.get("options", {}))
     rules = make_rules(task)
-    goals = _goals(task, rules, settings)
+    goals, pitch = _goals(task, rules, settings)
     tensors = read_tensors(weights)
     wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
     for name, (dtype, rank) in wanted.items():
@@ -157,7 +142,7 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
                 expected=f"{dtype.__name__}, rank {rank}",
             )  # fmt: skip
     cell, code, table = tensors["cell"], tensors["code"], tensors["table"]
-    shape, headings = _shape(task, settings)
+    shape, headings = _shape(task, pitch)
     phases = phases_of(rules, task.horizon)
     fits = (
         cell.shape == shape and code.shape[2] == headings and table.shape == (len(phases), 1 << len(goals))
@@ -172,7 +157,7 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
             f"table [{len(phases)}, {1 << len(goals)}]",
         )  # fmt: skip
     cell, code, table = (np.ascontiguousarray(array) for array in (cell, code, table))
-    tables = Tables(cell, code, table, *_times(phases), _bits(goals, len(rules.kind)), settings.pitch)
+    tables = Tables(cell, code, table, *_times(phases), _bits(goals, len(rules.kind)), pitch)
     return ReachabilityPolicy(task, card, settings, tables)
 
 
@@ -181,28 +166,29 @@ def check(task: Task, settings: Settings) -> None:
     _goals(task, make_rules(task), settings)
 
 
-def _goals(task: Task, rules: Rules, settings: Settings) -> NDArray[np.int64]:
-    """The obligations that are not `always`, where the tables cover task and settings."""
+def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[NDArray[np.int64], float]:
+    """The obligations that are not `always`, and the lattice's pitch, where the tables cover the task."""
     if wait_motion(task.robot) < 0:
         raise FragmentError(
             "reachability needs a robot that can wait", path="robot", got=list(task.robot.action_names),
             expected="an action with translate 0 and rotate 0; or method 'dqn'",
         )  # fmt: skip
     goals = np.flatnonzero(rules.kind != ALWAYS)
-    (ny, nx), headings = _shape(task, settings)
     tables = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
-    if ny * nx * headings * tables > MAX_ENTRIES:
-        raise PolicyError(
-            "the tables are too large", path="options.pitch",
-            got=f"{tables} tables of {ny} x {nx} x {headings} poses",
-            expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer windows that overlap",
-        )  # fmt: skip
-    return goals
+    for pitch, limit in ((settings.pitch / 3.0, FINE_ENTRIES), (settings.pitch, MAX_ENTRIES)):
+        (ny, nx), headings = _shape(task, pitch)
+        if ny * nx * headings * tables <= limit:
+            return goals, pitch
+    raise PolicyError(
+        "the tables are too large", path="options.pitch",
+        got=f"{tables} tables of {ny} x {nx} x {headings} poses",
+        expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer windows that overlap",
+    )  # fmt: skip
 
 
-def _shape(task: Task, settings: Settings) -> tuple[tuple[int, int], int]:
+def _shape(task: Task, pitch: float) -> tuple[tuple[int, int], int]:
     ny, nx = (
-        max(int(np.ceil(n * task.grid.resolution / settings.pitch - 1e-9)), 1)
+        max(int(np.ceil(n * task.grid.resolution / pitch - 1e-9)), 1)
         for n in (task.grid.height, task.grid.width)
     )
     return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])

@@ -1,228 +1,123 @@
-"""Continuations out of the tables of latest feasible times: greedily, and by a small beam where slack is
-small.
+"""A continuation after each first motion, out of the tables of latest feasible times.
 
-The tables propose, exact simulation decides: every pose here comes from f, every settled obligation from
-its predicate.
+The motion of most slack is walked out. For any other it is mostly enough to undo it and go the same way.
+Where that comes too late, or the walk gets stuck, a beam looks for a way.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf
-from specshield.policy.beam import beam
-from specshield.policy.progress import (
-    ALWAYS,
-    EVENTUALLY_ALWAYS,
-    PENDING,
-    STACK,
-    Rules,
-    advance,
-    read_predicates,
-    value_count,
-)
-from specshield.policy.tables import HOPELESS, Tables, goals_settled, is_broken, score, slack
-from specshield.robot.unicycle import Body, simulate, step
+from specshield.policy.beam import MAX_ROOTS, beam
+from specshield.policy.progress import forgive, replay
+from specshield.policy.tables import HOPELESS, slack
+from specshield.policy.walk import SETTLED_ALL, STUCK, Guide, Work, fill, make_work, observe, rejoin, walk
+from specshield.robot.unicycle import Body, step
 
-PATIENCE = 5  # steps without gain after which the greedy walk is taken to go round in a circle
 ESCAPE_GAIN = 2.0  # [steps] later than where it got stuck: what a way out has to reach
 ESCAPE_DEPTH = 24
 MAX_ESCAPES = 8
-NUDGE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
+BAND = -3.0  # [steps] of slack: how far the tables err
+SMALL = 30_000  # poses of a lattice on which nearly every way can be tried
+SMALL_SHARE = 512
+
+
+class Starts(NamedTuple):
+    """After each first motion [M]: the progress, the slack, what undoes it, whether a way was found."""
+
+    status: NDArray[np.int8]
+    run: NDArray[np.int64]
+    slack: NDArray[np.float64]
+    undo: NDArray[np.int64]
+    settled: NDArray[np.bool_]
 
 
 @kernel
-def greedy(
-    body: Body,
-    rules: Rules,
-    tables: Tables,
-    pose: NDArray[np.float64],
-    t: int,
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-    first: int,
-    wait: int,
+def propose_all(
+    guide: Guide,
     width: int,
+    history: NDArray[np.float64],
+    signals: NDArray[np.float64],
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
-) -> tuple[bool, float]:
-    """Follows the latest feasible time uphill from (x_t, t) to the horizon, after the motion `first`.
+) -> int:
+    """history (t + 1, 3), signals (t + 1, S); width: poses a beam keeps for each motion.
 
-    Where the tables lead it round in a circle, a beam of `width` looks for a way out. status, run (K,):
-    progress
-    after x_t, left as they are. Writes motions (T - t,), poses (T - t, 3). Returns whether every goal was
-    settled
-    and nothing broken, and the slack after the first motion.
+    Writes a continuation a first motion, motions (M, T - t) and poses (M, T - t, 3); returns the motion of
+    most slack. The rules' signals are left at the last row.
     """
-    k_count, steps = status.shape[0], motions.shape[0]
-    status, run = status.copy(), run.copy()
-    kept_status, kept_run = np.empty_like(status), np.empty_like(run)
-    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(k_count)
-    scores = np.empty(body.translate.shape[0])
-    x, y, theta = step(body, pose[0], pose[1], pose[2], first)
-    read_predicates(rules, x, y, theta, values, stack, predicates)
-    advance(rules, t + 1, predicates, status, run)
-    ahead = slack(body, rules, tables, x, y, theta, t + 1, status, run)
-    last_phase = len(tables.end) - 1
-    motions[0] = first
-    poses[0, 0], poses[0, 1], poses[0, 2] = x, y, theta
-    n = 1
-    high, high_n, escapes = ahead + t + 1, n, 0  # the latest time reached so far, and the state there
-    high_pose, high_status, high_run = poses[0].copy(), status.copy(), run.copy()
-    while n < steps and not (goals_settled(rules, status) and tables.phase[t + n] == last_phase):
-        if n > high_n:
-            value = slack(body, rules, tables, x, y, theta, t + n, status, run) + t + n
-            if value > high + 0.25 or np.any(status != high_status):
-                high, high_n = value, n
-                high_pose[0], high_pose[1], high_pose[2] = x, y, theta
-                high_status[:], high_run[:] = status, run
-            elif n - high_n >= PATIENCE:
-                if escapes == MAX_ESCAPES:
-                    break
-                escapes += 1
-                depth = min(steps - high_n, ESCAPE_DEPTH)
-                taken = beam(
-                    body, rules, tables, high_pose, t + high_n, high_status, high_run, -1, wait, width,
-                    0.5 * HOPELESS, high + ESCAPE_GAIN, motions[high_n : high_n + depth],
-                )  # fmt: skip
-                if taken == 0:
-                    break
-                x, y, theta = high_pose[0], high_pose[1], high_pose[2]
-                status[:], run[:] = high_status, high_run
-                for n in range(high_n, high_n + taken):
-                    x, y, theta = step(body, x, y, theta, motions[n])
-                    poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-                    read_predicates(rules, x, y, theta, values, stack, predicates)
-                    advance(rules, t + n + 1, predicates, status, run)
-                n = high_n + taken
-                continue
-        score(body, rules, tables, x, y, theta, t + n, status, run, wait, scores)
-        phase = tables.phase[t + n + 1]
-        waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - 0.1
-        if not waits_for_phase and not _pays_to_wait(rules, t + n, predicates, status):
-            scores[wait] = HOPELESS
-        last = motions[n - 1]
-        for m in range(scores.shape[0]):  # tables err by a little: never straight back
-            if body.translate[m] * body.translate[last] < 0.0 or body.rotate[m] * body.rotate[last] < 0.0:
-                scores[m] = HOPELESS
-        chosen = -1
-        while True:
-            best = wait  # waiting wins ties
-            for m in range(scores.shape[0]):
-                if scores[m] > scores[best]:
-                    best = m
-            if best == wait or scores[best] <= HOPELESS:
-                break
-            nx, ny, nth = step(body, x, y, theta, best)
-            if abs(nx - x) + abs(ny - y) > NUDGE or nth != theta:
-                kept_status[:], kept_run[:] = status, run
-                read_predicates(rules, nx, ny, nth, values, stack, predicates)
-                advance(rules, t + n + 1, predicates, status, run)
-                if not is_broken(status):
-                    chosen = best
-                    x, y, theta = nx, ny, nth
-                    break
-                status[:], run[:] = kept_status, kept_run
-            scores[best] = HOPELESS
-        if chosen >= 0:
-            motions[n] = chosen
-            poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-            n += 1
-            continue
-        # Waiting is best until something it brings about changes the progress.
-        kept_status[:] = status
-        read_predicates(rules, x, y, theta, values, stack, predicates)
-        while n < steps:
-            advance(rules, t + n + 1, predicates, status, run)
-            motions[n] = wait
-            poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-            n += 1
-            if np.any(status != kept_status) or n == steps or tables.phase[t + n + 1] != phase:
-                break
-        if is_broken(status):
-            break
-        high, high_n = -np.inf, n - 1  # waiting is no circle: what comes next counts anew
-    for rest in range(n, steps):
-        motions[rest] = wait
-        poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
-    return goals_settled(rules, status), ahead
+    count, t, k_count = motions.shape[0], history.shape[0] - 1, guide.rules.kind.shape[0]
+    status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
+    replay(guide.rules, history, signals, status, run)
+    forgive(guide.rules, t, status)
+    work = make_work(guide.rules, count)
+    starts = Starts(
+        np.empty((count, k_count), np.int8), np.empty((count, k_count), np.int64), np.empty(count),
+        np.empty(count, np.int64), np.zeros(count, np.bool_),
+    )  # fmt: skip
+    order = np.empty(count, np.int64)
+    _first_steps(guide, t, history[t], status, run, motions, poses, starts, work)
+    _by_slack(starts.slack, order)
+    base = -1
+    for m in order:
+        if base >= 0 and starts.undo[m] >= -1:
+            _resume(starts.status[m], starts.run[m], work)
+            starts.settled[m] = rejoin(guide, t, starts.undo[m], motions[base], motions[m], poses[m], work)
+        if not starts.settled[m] and (starts.slack[m] >= 0.0 or base < 0 or starts.undo[m] < -1):
+            _resume(starts.status[m], starts.run[m], work)
+            escapes = base < 0 and starts.slack[m] >= 0.0
+            starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
+        if starts.settled[m] and base < 0:
+            base = int(m)
+    _beam_out(guide, t, width, width, BAND, order, starts, motions, poses, work)
+    if guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL:
+        _beam_out(guide, t, SMALL_SHARE, width, 2.0 * HOPELESS, order, starts, motions, poses, work)
+    best = order[0]
+    return int(guide.wait if starts.slack[guide.wait] == starts.slack[best] else best)
 
 
 @leaf
-def _pays_to_wait(rules: Rules, t: int, predicates: NDArray[np.float64], status: NDArray[np.int8]) -> bool:
-    """Whether a goal that holds here is still to open, or a dwell to go on."""
-    for k in range(status.shape[0]):
-        useful = rules.kind[k] == EVENTUALLY_ALWAYS or (rules.kind[k] != ALWAYS and rules.a[k] > t)
-        if useful and status[k] == PENDING and predicates[k] > rules.margin:
-            return True
-    return False
-
-
-@kernel
-def retrace(
-    body: Body,
-    rules: Rules,
-    tables: Tables,
-    pose: NDArray[np.float64],
+def _first_steps(
+    guide: Guide,
     t: int,
+    pose: NDArray[np.float64],
     status: NDArray[np.int8],
     run: NDArray[np.int64],
-    first: int,
-    back: int,
-    wait: int,
-    base: NDArray[np.int64],
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
-) -> bool:
-    """Tries `first`, the motion `back` that undoes it (-1: none is needed), then `base`, a way from x_t to
-    every goal.
-
-    The steps lost are made up for where `base` (T - t,) waits. Other arguments and result as `greedy`.
-    """
-    steps, last_phase = motions.shape[0], len(tables.end) - 1
-    status, run = status.copy(), run.copy()
-    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(status.shape[0])
-    behind = 1 if back < 0 else 2
-    x, y, theta = pose[0], pose[1], pose[2]
-    n, at = 0, 0
-    while n < steps:
-        if n == 0:
-            motion = first
-        elif n == 1 and back >= 0:
-            motion = back
-        else:
-            while behind > 0 and at < steps and base[at] == wait:
-                at += 1
-                behind -= 1
-            motion = base[at] if at < steps else wait
-            at += 1
-        x, y, theta = step(body, x, y, theta, motion)
-        motions[n] = motion
-        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-        n += 1
-        read_predicates(rules, x, y, theta, values, stack, predicates)
-        advance(rules, t + n, predicates, status, run)
-        over = goals_settled(rules, status) and tables.phase[t + n] == last_phase
-        if over or is_broken(status):
-            break
-    motions[n:] = wait
-    for rest in range(n, steps):
-        poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
-    return goals_settled(rules, status)
+    starts: Starts,
+    work: Work,
+) -> None:
+    """Every motion from x_t. status, run: the progress there."""
+    body, rules, tables, _ = guide
+    for m in range(motions.shape[0]):
+        x, y, theta = step(body, pose[0], pose[1], pose[2], m)
+        motions[m, 0] = m
+        poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
+        starts.undo[m] = _undoing(body, pose, x, y, theta, m)
+        _resume(status, run, work)
+        observe(rules, t + 1, x, y, theta, work)
+        for k in range(status.shape[0]):
+            starts.status[m, k], starts.run[m, k] = work.status[k], work.run[k]
+        starts.slack[m] = slack(body, rules, tables, x, y, theta, t + 1, work.status, work.run)
 
 
 @leaf
-def _undoing(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]) -> int:
-    """The motion that leads from `reached` back to `pose`, -1 where it is the same, -2 where none does."""
-    if _same(pose[0], pose[1], pose[2], reached):
+def _undoing(body: Body, pose: NDArray[np.float64], x: float, y: float, theta: float, motion: int) -> int:
+    """The motion that leads from x, y, theta back to `pose`, -1 where it is the same, -2 where none does."""
+    if _same(x, y, theta, pose):
         return -1
+    if body.translate[motion] != 0.0 and body.rotate[motion] != 0.0:
+        return -2
     for m in range(body.translate.shape[0]):
-        x, y, theta = step(body, reached[0], reached[1], reached[2], m)
-        if _same(x, y, theta, pose):
-            return m
+        if body.translate[m] == -body.translate[motion] and body.rotate[m] == -body.rotate[motion]:
+            u, v, w = step(body, x, y, theta, m)
+            return m if _same(u, v, w, pose) else -2
     return -2
 
 
@@ -232,74 +127,108 @@ def _same(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
     return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)
 
 
+@leaf
+def _by_slack(slacks: NDArray[np.float64], order: NDArray[np.int64]) -> None:
+    """The motions by falling slack, the lowest index first on ties."""
+    for i in range(slacks.shape[0]):
+        j = i
+        while j > 0 and slacks[order[j - 1]] < slacks[i]:
+            order[j] = order[j - 1]
+            j -= 1
+        order[j] = i
+
+
+@leaf
+def _resume(status: NDArray[np.int8], run: NDArray[np.int64], work: Work) -> None:
+    for k in range(status.shape[0]):
+        work.status[k], work.run[k] = status[k], run[k]
+
+
 @kernel
-def propose_all(
-    body: Body,
-    rules: Rules,
-    tables: Tables,
-    pose: NDArray[np.float64],
-    t: int,
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-    wait: int,
+def _follow(
+    guide: Guide,
     width: int,
-    band: float,
+    t: int,
+    n: int,
+    escapes: bool,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
-) -> int:
-    """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); returns the motion of
-    most
-    slack.
+    work: Work,
+) -> bool:
+    """Walks on from motions[:n], where it gets stuck by a short beam, if that is allowed. Whether every goal
+    was settled."""
+    outcome, n = walk(guide, t, n, motions, poses, work)
+    for _ in range(MAX_ESCAPES if escapes else 0):
+        if outcome != STUCK:
+            break
+        status, run = work.high_status.copy(), work.high_run.copy()
+        x, y, theta = poses[n - 1]
+        high = t + n + slack(guide.body, guide.rules, guide.tables, x, y, theta, t + n, status, run)
+        way = np.empty((1, min(motions.shape[0] - n, ESCAPE_DEPTH)), np.int64)
+        taken = np.empty(1, np.int64)
+        beam(
+            guide, t + n, poses[n - 1 : n], status.reshape(1, -1), run.reshape(1, -1), width,
+            0.5 * HOPELESS, high + ESCAPE_GAIN, work, way, taken,
+        )  # fmt: skip
+        if taken[0] == 0:
+            break
+        _resume(status, run, work)
+        n = _take(guide, t, n, way[0, : taken[0]], motions, poses, work)
+        outcome, n = walk(guide, t, n, motions, poses, work)
+    if outcome == STUCK:
+        fill(n, guide.wait, poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2], motions, poses)
+    return outcome == SETTLED_ALL
 
-    The motion of most slack is walked out greedily. For any other it is enough to undo it and go the same
-    way; where
-    that comes too late it is walked out itself, and where the walk fails though the tables see at least
-    `band` steps
-    of slack (they err a little), a beam looks all the way.
-    """
-    count, steps = motions.shape
-    slacks, undo = np.empty(count), np.empty(count, np.int64)
-    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(status.shape[0])
-    for m in range(count):
-        x, y, theta = step(body, pose[0], pose[1], pose[2], m)
-        poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
-        undo[m] = _undoing(body, pose, poses[m, 0])
-        after_status, after_run = status.copy(), run.copy()
-        read_predicates(rules, x, y, theta, values, stack, predicates)
-        advance(rules, t + 1, predicates, after_status, after_run)
-        slacks[m] = slack(body, rules, tables, x, y, theta, t + 1, after_status, after_run)
-    preferred = wait if slacks[wait] == slacks.max() else int(np.argmax(slacks))
-    base, found = -1, np.empty(steps, np.int64)
-    for m in np.argsort(-slacks, kind="mergesort"):
-        settled = False
-        if base >= 0 and undo[m] >= -1:
-            settled = retrace(
-                body,
-                rules,
-                tables,
-                pose,
-                t,
-                status,
-                run,
-                m,
-                undo[m],
-                wait,
-                motions[base],
-                motions[m],
-                poses[m],
-            )
-        hopeful = slacks[m] >= band
-        if not settled and (hopeful or base < 0 or undo[m] < -1):
-            settled, _ = greedy(
-                body, rules, tables, pose, t, status, run, m, wait, width, motions[m], poses[m]
-            )
-        if not settled and hopeful:
-            taken = beam(body, rules, tables, pose, t, status, run, m, wait, width, band, np.inf, found)
-            if taken > 0:
-                settled = True
-                motions[m, :taken] = found[:taken]
-                motions[m, taken:] = wait
-                simulate(body, pose, motions[m], poses[m])
-        if settled and base < 0:
-            base = m
-    return preferred
+
+@leaf
+def _take(
+    guide: Guide,
+    t: int,
+    n: int,
+    way: NDArray[np.int64],
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    work: Work,
+) -> int:
+    """Appends `way` to motions[:n], which work's progress belongs to; returns how many there are then."""
+    x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
+    for i in range(way.shape[0]):
+        x, y, theta = step(guide.body, x, y, theta, way[i])
+        motions[n] = way[i]
+        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+        n += 1
+        observe(guide.rules, t + n, x, y, theta, work)
+    return n
+
+
+@kernel
+def _beam_out(
+    guide: Guide,
+    t: int,
+    share: int,
+    width: int,
+    band: float,
+    order: NDArray[np.int64],
+    starts: Starts,
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    work: Work,
+) -> None:
+    """Looks for a way for every first motion without one whose slack is at least `band`."""
+    steps = motions.shape[1] - 1
+    roots = np.array([m for m in order if not starts.settled[m] and starts.slack[m] >= band], dtype=np.int64)
+    if steps == 0:
+        return
+    for begin in range(0, roots.shape[0], MAX_ROOTS):
+        some = roots[begin : begin + MAX_ROOTS]
+        way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
+        beam(
+            guide, t + 1, poses[some, 0], starts.status[some], starts.run[some], share, band, np.inf, work,
+            way, taken,
+        )  # fmt: skip
+        for i in range(some.shape[0]):
+            m = some[i]
+            if taken[i] > 0:
+                _resume(starts.status[m], starts.run[m], work)
+                n = _take(guide, t, 1, way[i, : taken[i]], motions[m], poses[m], work)
+                starts.settled[m] = _follow(guide, width, t, n, True, motions[m], poses[m], work)

@@ -47,6 +47,7 @@ def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float
     headings = tables.code.shape[2]
     j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
     q, p, f = v - j, u - i, h - k
+    low, high = k % headings, (k + 1) % headings
     total, weights = 0.0, 0.0
     for dj in range(2):
         wj = q if dj else 1.0 - q
@@ -59,15 +60,17 @@ def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float
             row = tables.cell[j + dj, i + di]
             if row < 0:
                 continue
-            for dk in range(2):
-                w = wi * (f if dk else 1.0 - f)
-                if w < 1e-9:
-                    continue
-                code = tables.code[table, row, (k + dk) % headings]
-                if code != INVALID:
-                    total += w * (code - 1.0) / SCALE
-                    weights += w
-    return total / weights if weights > 1e-6 else HOPELESS
+            w = wi * (1.0 - f)
+            code = tables.code[table, row, low]
+            if w >= 1e-9 and code != INVALID:
+                total += w * (code - 1.0)
+                weights += w
+            w = wi * f
+            code = tables.code[table, row, high]
+            if w >= 1e-9 and code != INVALID:
+                total += w * (code - 1.0)
+                weights += w
+    return total / (SCALE * weights) if weights > 1e-6 else HOPELESS
 
 
 @leaf
@@ -144,11 +147,13 @@ def score(
     status: NDArray[np.int8],
     run: NDArray[np.int64],
     wait: int,
+    last: int,
     scores: NDArray[np.float64],
 ) -> None:
     """L after each motion (M,) from x_t, contact and the step's own progress left out: a cheap order to try
-    motions
-    in.
+    motions in.
+
+    last: the motion before, -1 for none. HOPELESS for what leads straight back: the tables err by a little.
     """
     mask, every = 0, 0
     for k in range(status.shape[0]):
@@ -163,12 +168,16 @@ def score(
     v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
     grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
     cos, sin = math.cos(grid_theta) / tables.pitch, math.sin(grid_theta) / tables.pitch
+    before, turn = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
     for m in range(scores.shape[0]):
         d = body.translate[m]
+        if table < 0 or d * before < 0.0 or body.rotate[m] * turn < 0.0:
+            scores[m] = HOPELESS
+            continue
         w = h + body.rotate[m] * headings / (2.0 * math.pi)
         if w < 0.0:
             w += headings
-        scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w) if table >= 0 else HOPELESS
+        scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w)
     for k in range(status.shape[0]):
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
             over = t + rules.b[k] - rules.c2[k] + 1 - run[k]

@@ -1,0 +1,282 @@
+"""Following the tables uphill, and following a way already found: one continuation, a motion at a time.
+
+The tables propose, exact simulation decides: every pose here comes from f, every settled obligation from
+its predicate. These run once a motion in every decision, so they allocate nothing: see `Work`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel, leaf
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
+from specshield.policy.tables import HOPELESS, Tables, goals_settled, is_broken, score
+from specshield.robot.unicycle import Body, step
+from specshield.stl.program import VALUE, evaluate_packed
+from specshield.world.regions import region_distance
+
+PATIENCE = 5  # steps without gain after which the walk is taken to go round in a circle
+NUDGE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
+FAILED, SETTLED_ALL, STUCK = 0, 1, 2
+
+
+class Guide(NamedTuple):
+    """What leads a robot: the world, the formula and its tables. wait: the motion that stands still."""
+
+    body: Body
+    rules: Rules
+    tables: Tables
+    wait: int
+
+
+class Work(NamedTuple):
+    """Scratch of a walk. status, run (K,): the progress at the newest pose; high_*: where the latest feasible
+    time was highest."""
+
+    values: NDArray[np.float64]
+    stack: NDArray[np.float64]
+    predicates: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    status: NDArray[np.int8]
+    run: NDArray[np.int64]
+    high_status: NDArray[np.int8]
+    high_run: NDArray[np.int64]
+
+
+@kernel
+def make_work(rules: Rules, motions: int) -> Work:
+    k = rules.kind.shape[0]
+    return Work(
+        np.empty(value_count(rules)), np.empty(STACK), np.empty(k), np.empty(motions), np.empty(k, np.int8),
+        np.empty(k, np.int64), np.empty(k, np.int8), np.empty(k, np.int64),
+    )  # fmt: skip
+
+
+@leaf
+def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, work: Work) -> float:
+    """The robustness of one obligation's predicate at a pose: only the regions that it names are measured."""
+    values = work.values
+    values[0], values[1], values[2] = x, y, theta
+    regions = rules.region_starts.shape[0] - 1
+    for i in range(rules.starts[k], rules.starts[k + 1]):
+        if rules.ops[i] == VALUE:
+            slot = int(rules.args[i])
+            if 3 <= slot < 3 + regions:
+                values[slot] = region_distance(
+                    slot - 3, rules.region_starts, rules.region_kinds, rules.region_offsets,
+                    rules.region_data, x, y,
+                )  # fmt: skip
+            elif slot >= 3:
+                values[slot] = rules.signals[slot - 3 - regions]
+    return float(evaluate_packed(k, rules.ops, rules.args, rules.starts, values, work.stack))
+
+
+@leaf
+def observe(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> None:
+    """Takes x_t into work's progress. Predicates that `advance` makes no use of are not read."""
+    for k in range(rules.kind.shape[0]):
+        opens = rules.a[k] + (rules.c2[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
+        if work.status[k] == PENDING and t >= opens:
+            work.predicates[k] = predicate_at(rules, k, x, y, theta, work)
+    advance(rules, t, work.predicates, work.status, work.run)
+
+
+@leaf
+def look(rules: Rules, x: float, y: float, theta: float, work: Work) -> None:
+    """Reads the predicates of everything that is pending, for a robot that will wait here."""
+    for k in range(rules.kind.shape[0]):
+        if work.status[k] == PENDING:
+            work.predicates[k] = predicate_at(rules, k, x, y, theta, work)
+
+
+@leaf
+def is_over(rules: Rules, tables: Tables, t: int, status: NDArray[np.int8]) -> bool:
+    """Whether every goal is settled at step t and no `always` is still to begin."""
+    return goals_settled(rules, status) and tables.phase[t] == len(tables.end) - 1
+
+
+@leaf
+def fill(
+    n: int,
+    wait: int,
+    x: float,
+    y: float,
+    theta: float,
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+) -> None:
+    """Waits from n to the end."""
+    for rest in range(n, motions.shape[0]):
+        motions[rest] = wait
+        poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
+
+
+@leaf
+def walk(
+    guide: Guide,
+    t: int,
+    n: int,
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    work: Work,
+) -> tuple[int, int]:
+    """Follows the latest feasible time uphill to the horizon, on from motions[:n], n >= 1.
+
+    motions (T - t,), poses (T - t, 3): written from n on. work.status, work.run: the progress at poses[n -
+    1], taken along. Returns SETTLED_ALL where every goal was settled and nothing broken, STUCK where the
+    tables led it round in a circle, and then how many steps there are to where the latest feasible time was
+    highest; else FAILED.
+    """
+    body, rules, tables, wait = guide
+    steps, last_phase, k_count = motions.shape[0], len(tables.end) - 1, rules.kind.shape[0]
+    status, run, scores = work.status, work.run, work.scores
+    x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
+    high, high_n = -np.inf, n
+    while n < steps and not is_over(rules, tables, t + n, status):
+        last = motions[n - 1]
+        score(body, rules, tables, x, y, theta, t + n, status, run, wait, last, scores)
+        gained = n == high_n or scores[wait] > high + 0.25
+        for k in range(k_count):
+            gained = gained or status[k] != work.high_status[k]
+        if gained:
+            high, high_n = scores[wait], n
+            _copy(status, run, work.high_status, work.high_run)
+        elif n - high_n >= PATIENCE:
+            return STUCK, high_n
+        phase = tables.phase[t + n + 1]
+        chosen = -1
+        while True:
+            best = wait  # waiting wins ties
+            for m in range(scores.shape[0]):
+                if scores[m] > scores[best]:
+                    best = m
+            if best == wait and scores[wait] > HOPELESS:
+                waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - 0.1
+                if waits_for_phase or _pays_to_wait(rules, t + n, x, y, theta, work):
+                    break
+                scores[wait] = HOPELESS
+                continue
+            if scores[best] <= HOPELESS:
+                break
+            nx, ny, nth = step(body, x, y, theta, best)
+            leads = abs(nx - x) + abs(ny - y) > NUDGE or nth != theta
+            if leads and _keeps(rules, t + n + 1, nx, ny, nth, work):
+                chosen = best
+                x, y, theta = nx, ny, nth
+                break
+            scores[best] = HOPELESS
+        if chosen >= 0:
+            advance(rules, t + n + 1, work.predicates, status, run)
+            motions[n] = chosen
+            poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+            n += 1
+            continue
+        # Waiting is best until something it brings about changes the progress.
+        pending = _pending(status)
+        look(rules, x, y, theta, work)
+        while n < steps:
+            advance(rules, t + n + 1, work.predicates, status, run)
+            motions[n] = wait
+            poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+            n += 1
+            if _pending(status) != pending or n == steps or tables.phase[t + n + 1] != phase:
+                break
+        if is_broken(status):
+            break
+        high_n = n  # waiting is no circle: what comes next counts anew
+    fill(n, wait, x, y, theta, motions, poses)
+    return (SETTLED_ALL if goals_settled(rules, status) else FAILED), n
+
+
+@leaf
+def _copy(
+    status: NDArray[np.int8], run: NDArray[np.int64], to_status: NDArray[np.int8], to_run: NDArray[np.int64]
+) -> None:
+    for k in range(status.shape[0]):
+        to_status[k], to_run[k] = status[k], run[k]
+
+
+@leaf
+def _pending(status: NDArray[np.int8]) -> int:
+    count = 0
+    for k in range(status.shape[0]):
+        count += status[k] == PENDING
+    return count
+
+
+@leaf
+def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> bool:
+    """Whether being at a pose at step t breaks nothing. Leaves its predicates in work, the progress alone."""
+    for k in range(rules.kind.shape[0]):
+        kind = rules.kind[k]
+        opens = rules.a[k] + (rules.c2[k] if kind == EVENTUALLY_ALWAYS else 0)
+        if work.status[k] != PENDING or t < opens:
+            continue
+        work.predicates[k] = predicate_at(rules, k, x, y, theta, work)
+        if work.predicates[k] > rules.margin:
+            continue
+        if kind == ALWAYS:
+            if t <= rules.b[k]:
+                return False
+        elif kind == EVENTUALLY_ALWAYS:
+            if t + 1 > rules.c1[k] + rules.c2[k]:
+                return False
+        elif t >= rules.b[k]:
+            return False
+    return True
+
+
+@leaf
+def _pays_to_wait(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> bool:
+    """Whether a goal that holds here is still to open, or a dwell to go on."""
+    for k in range(rules.kind.shape[0]):
+        useful = rules.kind[k] == EVENTUALLY_ALWAYS or (rules.kind[k] != ALWAYS and rules.a[k] > t)
+        if useful and work.status[k] == PENDING and predicate_at(rules, k, x, y, theta, work) > rules.margin:
+            return True
+    return False
+
+
+@leaf
+def rejoin(
+    guide: Guide,
+    t: int,
+    back: int,
+    base: NDArray[np.int64],
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    work: Work,
+) -> bool:
+    """Goes on from motions[:1] by the motion `back` that undoes it (-1: none is needed), then by `base`, a
+    way from x_t to every goal.
+
+    The steps lost are made up for where `base` (T - t,) waits. Other arguments as in `walk`.
+    """
+    body, rules, tables, wait = guide
+    steps = motions.shape[0]
+    behind = 1 if back < 0 else 2
+    x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
+    n, at = 1, 0
+    while n < steps and not is_over(rules, tables, t + n, work.status) and not is_broken(work.status):
+        if n == 1 and back >= 0:
+            motion = back
+        else:
+            while behind > 0 and at < steps and base[at] == wait:
+                at += 1
+                behind -= 1
+            motion = base[at] if at < steps else wait
+            at += 1
+        if motion != wait:
+            x, y, theta = step(body, x, y, theta, motion)
+            observe(rules, t + n + 1, x, y, theta, work)
+        else:
+            if motions[n - 1] != wait or n == 1:
+                look(rules, x, y, theta, work)
+            advance(rules, t + n + 1, work.predicates, work.status, work.run)
+        motions[n] = motion
+        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+        n += 1
+    fill(n, wait, x, y, theta, motions, poses)
+    return goals_settled(rules, work.status)
