@@ -27,11 +27,13 @@ class Config:
     """A session's settings. Raises InputError or Unsupported with the field's path.
 
     threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho
-    > margin [m]. max_steps: None is max(600, T + 1). seed: of the drawn actions.
+    > margin [m]. slack: J asks for every F this many steps early. Where either cannot be had, the most that
+    can. max_steps: None is max(600, T + 1). seed: of the drawn actions.
     """
 
     threshold: float = 1.0
     margin: float = 0.0
+    slack: int = 0
     evaluation: str = "feasibility"
     shaping: str = "projection"
     max_steps: int | None = None
@@ -63,6 +65,10 @@ class Config:
         if not (math.isfinite(self.margin) and self.margin >= 0.0):
             raise InputError(
                 "the margin is out of range", path="margin", got=self.margin, expected="0 or more metres"
+            )
+        if self.slack < 0:
+            raise InputError(
+                "the slack is out of range", path="slack", got=self.slack, expected="0 or more steps"
             )
 
 

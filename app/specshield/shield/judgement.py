@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from specshield.policy.view import view_of
 from specshield.shield import shaping
+from specshield.shield.aim import aim
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho
 from specshield.shield.residual import residuals
@@ -52,6 +53,8 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
             feasible, lowered = _kept(best, asked)
             if feasible.any():
                 break
+    elif shield.config.slack or lowered:
+        best, feasible, lowered = aim(shield, prefix, tried, whole)
     some, first = bool(feasible.any()), tried.preferred
     if tail and feasible[tail[0]]:
         first = tail[0]

@@ -1,0 +1,70 @@
+"""What J asks for beyond satisfaction, so that noise does not break the rule: a margin [m] and slack [steps].
+
+Both are about what is still open. Where they cannot be had, the most that can: of the slack first, then of
+the margin.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.policy.view import view_of
+from specshield.shield.decision import Shield
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, prefix_of, rho
+from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+
+def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[Best, Bools, bool]:
+    """(best futures, which motions keep what can be had, whether it is less than was asked for).
+
+    whole [N]: rho of the futures on the whole formula; what does not satisfy it keeps nothing.
+    """
+    motions, margin = len(shield.task.robot.motions), SATISFIED_ABOVE + shield.config.margin
+
+    def at(slack: int) -> Best:
+        formula = _open(prefix, slack)
+        part = prefix_of(prefix.task, formula, view_of(prefix.task, formula), prefix.poses, prefix.signals)
+        return best_of(tried, np.where(whole > SATISFIED_ABOVE, rho(part, tried), -np.inf), motions)
+
+    best = at(shield.config.slack)
+    if (best.robustness > margin).any():
+        return best, best.robustness > margin, False
+    low, high = 0, shield.config.slack  # slack `high` cannot be had
+    best = at(low)
+    if not (best.robustness > margin).any():
+        highest = max(best.robustness.max(), SATISFIED_ABOVE)
+        return best, (best.robustness >= highest) & (best.robustness > SATISFIED_ABOVE), True
+    while high - low > 1:
+        middle = (low + high) // 2
+        tighter = at(middle)
+        if (tighter.robustness > margin).any():
+            low, best = middle, tighter
+        else:
+            high = middle
+    return best, best.robustness > margin, True
+
+
+def _open(prefix: Prefix, slack: int) -> Formula:
+    """What of the formula the prefix leaves open: a G from t + 1 on, an F `slack` steps early.
+
+    A window keeps at least half its length. With nothing open, the formula itself.
+    """
+    kept: list[Formula] = []
+    for conjunct in conjuncts(prefix.formula):
+        view = view_of(prefix.task, conjunct)
+        if prefix_of(prefix.task, conjunct, view, prefix.poses, prefix.signals).low > SATISFIED_ABOVE:
+            continue
+        match conjunct:
+            case Always(a, b, child):
+                kept.append(Always(max(a, min(prefix.t + 1, b)), b, child))
+            case Eventually(a, b, child):
+                kept.append(Eventually(a, b - min(slack, (b - a) // 2), child))
+            case _:
+                kept.append(conjunct)
+    if not kept:
+        return prefix.formula
+    return kept[0] if len(kept) == 1 else And(tuple(kept))

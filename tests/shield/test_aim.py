@@ -1,0 +1,55 @@
+"""Margin and slack, worked out by hand on cells of 0.2 m (tests/shield/test_episode.py has the map)."""
+
+import numpy as np
+import pytest
+from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted
+
+from specshield.shield.episode import Config, decide, make_shield
+
+EVEN = np.zeros(5)
+SHORTEST = {WAIT: [FORWARD], LEFT: [RIGHT, FORWARD], RIGHT: [LEFT, FORWARD]}
+
+
+def decision(formula, *motions, **config):
+    cells = Cells(formula, None, {"A": (1, 0)} if "A" in formula else {})
+    history = [cells.pose(0, 0, 0)]
+    for motion in motions:
+        history.append(cells.pose(*cells.after(cells.state(history[-1]), motion)))
+    policy = Scripted(cells, lambda t, motion: SHORTEST.get(motion, []))
+    return decide(make_shield([policy], Config(**config)), history, EVEN)
+
+
+@pytest.mark.parametrize(
+    ("formula", "motions", "slack", "feasible", "lowered"),
+    [
+        ("F[0,4] A", [], 0, [1, 1, 1, 1], False),
+        ("F[0,4] A", [], 2, [1, 0, 0, 1], False),  # by step 2: at once, or after one wait
+        ("F[0,4] A", [], 9, [1, 0, 0, 1], False),  # a window keeps half its length
+        ("F[0,4] A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("F[0,4] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),  # step 3 is the earliest, then
+        ("F[0,4] A", [WAIT, WAIT], 0, [1, 0, 0, 1], False),
+        ("F[0,4] A and F[2,4] x > 0", [FORWARD], 2, [1, 1, 1, 1], False),  # A is done with
+        ("F[2,2] A", [], 5, [1, 0, 0, 1], False),
+    ],
+)
+def test_slack_asks_for_deadlines_early_and_for_the_most_that_can_be_had(
+    formula, motions, slack, feasible, lowered
+):
+    found = decision(formula, *motions, slack=slack)
+    assert list(found.j_values[:4]) == feasible
+    assert (found.reason == "margin_unattainable") == lowered
+    assert found.mode == "shaped"
+    assert all(rho > 0 for rho, ok in zip(found.robustness, feasible, strict=False) if ok)
+
+
+def test_slack_is_given_up_where_the_rule_itself_cannot_be_kept():
+    lost = decision("F[0,2] A", LEFT, slack=1)
+    assert (lost.mode, lost.reason, lost.feasible_mass) == ("fallback", "infeasible", 0.0)
+
+
+def test_a_margin_lost_to_what_was_driven_is_asked_of_what_is_to_come():
+    """At x_0 the rule is kept by 0.05 m alone; one cell on, by 0.25 m."""
+    found = decision("G[0,3] x > 0.05", margin=0.1)
+    assert (found.mode, found.reason) == ("shaped", None)
+    assert list(found.j_values[:4]) == [1, 0, 0, 0]
+    assert found.robustness[FORWARD] == pytest.approx(0.05)
