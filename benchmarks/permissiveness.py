@@ -12,7 +12,6 @@ Without --full a tenth of the work.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -26,14 +25,13 @@ from benchmarks.judge import Judge
 from benchmarks.worlds import KINDS, NEAR, SHAPES, explore, make_world, sample
 from specshield.errors import InfeasibleStart
 from specshield.policy.environment import free_poses
-from specshield.policy.load import load_policy
 from specshield.policy.policy import Proposer, wait_motion
 from specshield.policy.progress import STACK, advance, make_rules, read_predicates, replay, value_count
 from specshield.policy.reachability import ReachabilityPolicy, Settings, synthesise
-from specshield.policy.search import slack
+from specshield.policy.tables import slack
 from specshield.robot.unicycle import Body, in_collision, simulate, step
 from specshield.shield.episode import Config, Decision, Shield, decide, make_shield, start
-from specshield.sim.cases import MODELS, Case, case_names, load_case
+from specshield.sim.cases import Case, case_names, load_case, shipped
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 
@@ -161,12 +159,6 @@ class Model:
         return np.where(end, -9.0, noise + self.wants)
 
 
-def load_dqn(case: Case) -> Proposer:
-    folder = MODELS / case.name
-    card = json.loads((folder / "card.json").read_text())
-    return load_policy((folder / "policy.safetensors").read_bytes(), card, case.task)
-
-
 @dataclass
 class Outcome:
     """What came of one episode; pairs: (history, motion) that were judged, claims: those certified."""
@@ -287,7 +279,7 @@ def states_on_the_way(
 
 def against_reference(case: Case, n: int, seed: int) -> Iterator[str]:
     """Rows: the recall of each method against all that any of them or the reference certifies."""
-    ours, dqn, fine = synthesise(case.task), load_dqn(case), synthesise(case.task, REFERENCE)
+    ours, dqn, fine = synthesise(case.task), shipped(case, "dqn"), synthesise(case.task, REFERENCE)
     body = make_shield([ours]).body
     judge = Judge(str(case.task.formula), case.spec["regions"])
     fine_slack = Slack(fine, body)
@@ -343,7 +335,7 @@ def main() -> None:
         for case in cases:
             tables = synthesise(case.task)
             print(campaign(case, [tables], tables, int(1000 * share), seed), flush=True)
-            print(campaign(case, [load_dqn(case), tables], tables, int(100 * share), seed), flush=True)
+            print(campaign(case, [shipped(case, "dqn"), tables], tables, int(100 * share), seed), flush=True)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +9,9 @@ from numpy.typing import NDArray
 
 from specshield.errors import InfeasibleStart
 from specshield.policy.environment import free_poses
-from specshield.policy.policy import Policy, load_dqn
+from specshield.policy.policy import Policy
 from specshield.shield.episode import Carry, Shield, decide, start
-from specshield.sim.cases import MODELS, Case
+from specshield.sim.cases import Case, shipped
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 
@@ -33,9 +32,9 @@ class State:
 
 
 def shipped_dqn(case: Case) -> Policy:
-    folder = MODELS / case.name
-    card = json.loads((folder / "card.json").read_text())
-    return load_dqn((folder / "policy.safetensors").read_bytes(), card, case.task)
+    policy = shipped(case, "dqn")
+    assert isinstance(policy, Policy)
+    return policy
 
 
 def starts(shield: Shield, n: int, seed: int) -> list[State]:

@@ -122,11 +122,11 @@ def evaluate(
 
 def train(
     case: Annotated[str, typer.Option(help="A case of maps/.")],
-    method: Annotated[str, typer.Option(help="How the policy is made: dqn or reachability.")] = "dqn",
+    method: Annotated[str, typer.Option(help="How the policy is made: reachability or dqn.")] = "reachability",
     seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
     option: Annotated[list[str] | None, typer.Option(help="A setting, as units=128; repeatable.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: models/<case>]")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: in models/]")] = None,
     resume: Annotated[bool, typer.Option(help="Take up a run that was killed.")] = False,
 ) -> None:
     """Make a policy for a case. Learning shows how far it is and how often the rule is satisfied."""

@@ -41,7 +41,7 @@ def client(server):
 
 def ask(client, **fields):
     map_id = client.post("/v1/maps", json=grid_json()).json()["id"]
-    body = {"map_id": map_id, "robot": ROBOT, "spec": SPEC, "options": TINY, **fields}
+    body = {"map_id": map_id, "robot": ROBOT, "spec": SPEC, "method": "dqn", "options": TINY, **fields}
     response = client.post("/v1/policies", json=body)
     assert response.status_code == 202, response.text
     return response.json()

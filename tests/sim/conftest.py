@@ -1,11 +1,7 @@
-import json
-
 import pytest
 
-from specshield.policy.load import load_policy
-from specshield.policy.reachability import synthesise
 from specshield.shield.episode import make_shield
-from specshield.sim.cases import MODELS, case_names, load_case
+from specshield.sim.cases import case_names, load_case, shipped
 
 
 @pytest.fixture(scope="session", params=case_names())
@@ -15,9 +11,5 @@ def case(request):
 
 @pytest.fixture(scope="session", params=["dqn", "reachability"])
 def shield(case, request):
-    """The case's shield: with the policy that is shipped for it, or with one computed."""
-    if request.param == "reachability":
-        return make_shield([synthesise(case.task)])
-    folder = MODELS / case.name
-    card = json.loads((folder / "card.json").read_text())
-    return make_shield([load_policy((folder / "policy.safetensors").read_bytes(), card, case.task)])
+    """The case's shield: with the policy that came for it, computed or learned."""
+    return make_shield([shipped(case, request.param)])

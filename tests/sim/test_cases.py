@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from specshield import errors
-from specshield.sim.cases import MAPS, MODELS, load_case
+from specshield.sim.cases import MAPS, load_case, shipped
 from specshield.stl import parse
 
 
@@ -19,8 +19,10 @@ def test_a_case_is_what_its_files_say(case):
     assert np.all(np.isinf(case.distance) == case.task.grid.occupied)
 
 
-def test_the_policy_shipped_for_a_case_is_for_its_task_and_opens_95_percent_of_the_starts(case):
-    card = json.loads((MODELS / case.name / "card.json").read_text())
+@pytest.mark.parametrize("method", ["reachability", "dqn"])
+def test_the_policies_shipped_for_a_case_are_for_its_task_and_open_95_percent_of_the_starts(case, method):
+    card = shipped(case, method).card
+    assert card["method"] == method
     assert card["task_hash"] == case.task.content_hash
     assert card["map_id"] == case.task.grid.content_hash
     assert card["spec"] == case.spec

@@ -78,7 +78,19 @@ def test_a_command_that_is_stopped_leaves_nothing_running(how):
 def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
     pytest.importorskip("torch")
     case, out = load_case("case1"), tmp_path / "model"
-    arguments = ["train", "--case", "case1", "--seed", "3", "--updates", "400", "--out", str(out)]
+    arguments = [
+        "train",
+        "--case",
+        "case1",
+        "--method",
+        "dqn",
+        "--seed",
+        "3",
+        "--updates",
+        "400",
+        "--out",
+        str(out),
+    ]
     arguments += ["--option", "units=8", "--option", "evaluate_every=100", "--option", "evaluation_starts=50"]
     command = subprocess.Popen([*SPECSHIELD, *arguments], stderr=subprocess.DEVNULL)
     until((out / "checkpoint" / "state.safetensors").exists)
@@ -106,7 +118,7 @@ def test_train_computes_a_policy_too(tmp_path):
     ("arguments", "said"),
     [
         (["evaluate", "--case", "case9"], "one of case1, case2"),
-        (["train", "--case", "case1", "--option", "units=9000"], "from 4 to 128"),
+        (["train", "--case", "case1", "--method", "dqn", "--option", "units=9000"], "from 4 to 128"),
         (["train", "--case", "case1", "--method", "magic"], "'dqn' or 'reachability'"),
     ],
 )

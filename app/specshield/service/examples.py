@@ -45,7 +45,7 @@ POLICY: dict[str, Any] = {
         "formula": "F[0,60] Goal",
         "regions": {"Goal": {"type": "circle", "center": [2.0, 2.0], "radius": 0.6}},
     },
-    "method": "dqn",
+    "method": "reachability",
     "seed": 0,
 }
 

@@ -226,7 +226,7 @@ class PolicyRequest(Strict):
     robot: RobotChoice = Field("stretch", description="A preset (`stretch`) or a robot of your own.")
     spec: Spec
     method: Literal["dqn", "reachability"] = Field(
-        "dqn", description="How the policy is made: learned or computed."
+        "reachability", description="How the policy is made: computed in seconds, or learned in minutes."
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Of everything random in the training.")
     options: dict[str, bool | int | float | str | list[float]] = Field(

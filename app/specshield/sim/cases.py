@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import NotFound
+from specshield.policy.load import load_policy
+from specshield.policy.policy import Proposer
 from specshield.robot import STRETCH
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task, make_task
@@ -56,6 +58,23 @@ class Case:
 
 def case_names(folder: Path = MAPS) -> list[str]:
     return sorted(path.name.removesuffix(".regions.json") for path in folder.glob("*.regions.json"))
+
+
+def shipped(case: Case, method: str) -> Proposer:
+    """The policy that came for a case: `models/<case>` is computed, `models/<case>-dqn` is learned.
+
+    Raises NotFound where there is none.
+    """
+    folder = MODELS / (case.name if method == "reachability" else f"{case.name}-{method}")
+    if not (folder / "card.json").is_file():
+        raise NotFound(
+            f"no policy came for {case.name}",
+            path="method",
+            got=method,
+            expected=f"a folder {folder.name} in models/",
+        )
+    card = json.loads((folder / "card.json").read_text())
+    return load_policy((folder / "policy.safetensors").read_bytes(), card, case.task)
 
 
 def load_case(name: str, folder: Path = MAPS) -> Case:

@@ -29,7 +29,8 @@ def train(
     options: "name=value", of the method's settings. What a DQN has learned is saved to `out`/checkpoint at
     every evaluation; `resume` takes that up after a kill.
     """
-    loaded, out = load_case(case), out or MODELS / case
+    loaded = load_case(case)
+    out = out or MODELS / (case if method == "reachability" else f"{case}-{method}")
     if method == "dqn":
         weights, card = _learn(loaded, seed, updates, _options(options), out / "checkpoint", resume)
     elif method == "reachability":
