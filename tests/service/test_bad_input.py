@@ -280,6 +280,7 @@ def test_policies_trained_elsewhere(client, unchanged, files, path):
         ({"threshold": 0.0}, "invalid-input", "threshold"),
         ({"threshold": 1.5}, "invalid-input", "threshold"),
         ({"margin": -1.0}, "invalid-input", "margin"),
+        ({"slack": -1}, "invalid-input", "slack"),
         ({"evaluation": "guess"}, "invalid-input", "evaluation"),
         ({"shaping": "lookahead"}, "unsupported", "shaping"),
         ({"max_steps": 10**9}, "invalid-input", "max_steps"),

@@ -239,6 +239,7 @@ class Sessions:
         seed: int = 0,
         threshold: float = 1.0,
         margin: float = 0.0,
+        slack: int = 0,
         evaluation: Literal["feasibility", "robustness"] = "feasibility",
         shaping: Literal["projection", "lookahead"] = "projection",
         max_steps: int | None = None,
@@ -246,7 +247,8 @@ class Sessions:
     ) -> Session:
         """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
 
-        `threshold` is delta (only 1 carries the guarantee), `margin` the robustness asked for.
+        `threshold` is delta (only 1 carries the guarantee), `margin` and `slack` the robustness [m]
+        and the steps to keep in hand.
         InfeasibleStart where no action has a satisfying future, unless `allow_infeasible`.
         """
         flow = core.create_session(
@@ -257,6 +259,7 @@ class Sessions:
             seed=seed,
             threshold=threshold,
             margin=margin,
+            slack=slack,
             evaluation=evaluation,
             shaping=shaping,
             max_steps=max_steps,

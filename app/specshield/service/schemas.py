@@ -298,6 +298,12 @@ class SessionRequest(Strict):
     margin: float = Field(
         0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
     )
+    slack: int = Field(
+        0,
+        ge=0,
+        le=1000,
+        description="Steps to keep in hand: every F is met so much earlier, where it can be.",
+    )
     evaluation: Literal["feasibility", "robustness"] = Field(
         "feasibility", description="J is 1 or 0 (the rule can be kept or not), or the robustness itself."
     )
@@ -329,8 +335,9 @@ class SessionResponse(Answer):
     seed: int = Field(description="Of the draws of `action`.")
     threshold: float = Field(description="delta.")
     margin: float = Field(description="Robustness kept in hand [the unit of the formula, m].")
+    slack: int = Field(description="Steps kept in hand.")
     evaluation: str = Field(description="`feasibility` or `robustness`.")
-    shaping: str = Field(description="`projection`.")
+    shaping: str = Field(description="`projection` or `lookahead`.")
     max_steps: int = Field(description="The last step there can be.")
     next_t: int = Field(description="The step expected next.")
     feasible: bool = Field(description="Whether some action from x_0 had a satisfying future.")

@@ -43,7 +43,7 @@ from specshield.shield.decision import Carry, Config, Decision, Shield, make_shi
 
 R = TypeVar("R")
 RACES = 10  # writes lost to others before a caller is told so
-CONFIG = ("seed", "threshold", "margin", "evaluation", "shaping", "max_steps")
+CONFIG = ("seed", "threshold", "margin", "slack", "evaluation", "shaping", "max_steps")
 
 
 class Sessions:
@@ -143,7 +143,8 @@ class Sessions:
         self, session: Session, request: StepRequest, timing: dict[str, float]
     ) -> tuple[Session, Decision, bytes]:
         shield = self._shield(
-            session.config["policy_ids"], Config(**{name: session.config[name] for name in CONFIG})
+            session.config["policy_ids"],
+            Config(**{name: session.config[name] for name in CONFIG if name in session.config}),
         )
         shield.task.check_signals(request.signals or {})
         session = session.extended(request.t, np.array(request.poses), request.signals or {})
