@@ -20,6 +20,8 @@ NEEDS_SERVER = "This command needs the server's parts: pip install 'specshield[s
 
 NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
 
+NEEDS_FIGURES = "This command needs matplotlib: pip install 'specshield[figures]'"
+
 
 def main() -> None:
     """The console script."""
@@ -32,6 +34,8 @@ def main() -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in ("torch",):
             sys.exit(NEEDS_TORCH)
+        if (error.name or "").split(".")[0] == "matplotlib":
+            sys.exit(NEEDS_FIGURES)
         if (error.name or "").split(".")[0] in (
             "fastapi",
             "fastapi_offline",
@@ -50,7 +54,7 @@ def _commands() -> Any:
         no_args_is_help=True,
         pretty_exceptions_enable=False,
     )
-    for command in (serve, demo, train, evaluate, worker, openapi):
+    for command in (serve, demo, train, evaluate, report, worker, openapi):
         app.command()(command)
     return app
 
@@ -109,20 +113,61 @@ def demo(
 
 
 def evaluate(
-    case: Annotated[str, typer.Option(help="A case of maps/.")],
-    runs: Annotated[int, typer.Option(help="Episodes with and without the shield.", min=1)] = 100,
-    seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
-    json: Annotated[bool, typer.Option("--json", help="Print figures and episodes as JSON.")] = False,
+    case: Annotated[str, typer.Option(help="A case of maps/, as 1 or case1; or house.")],
+    runs: Annotated[int, typer.Option(help="Runs, each by every method.", min=1)] = 100,
+    seed: Annotated[int, typer.Option(help="Decides starts, model, draws and noise.", min=0)] = 0,
+    methods: Annotated[
+        str, typer.Option(help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps.")
+    ] = "",
+    noise: Annotated[
+        str, typer.Option(help="none, gaussian, slip, obstacle, shift, collider; or some.")
+    ] = "none",
+    model: Annotated[str, typer.Option(help="The model that is to be kept to the rule.")] = "goal-seeker",
+    house: Annotated[str | None, typer.Option(help="A ProcTHOR house, for the case house.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to keep results in and to take them up from.")
+    ] = None,
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+    redis: Annotated[
+        str | None,
+        typer.Option(help="Let the workers of this Redis do the runs instead.", envvar="REDIS_URL"),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print figures and records as JSON.")] = False,
 ) -> None:
-    """One case, measured over any number of runs."""
+    """Methods side by side on one case, over any number of runs."""
     from specshield.sim import commands
+    from specshield.sim.experiment import available, experiments
 
-    raise typer.Exit(commands.evaluate(case, runs, seed, json))
+    raise typer.Exit(
+        commands.evaluate(
+            experiments(case, house, model, noise, seed),
+            runs,
+            methods.split(",") if methods else available(case),
+            out,
+            processes or os.cpu_count() or 1,
+            redis,
+            json,
+        )
+    )
+
+
+def report(
+    results: Annotated[Path, typer.Argument(help="Folder that evaluate has kept results in.")],
+    out: Annotated[Path, typer.Option(help="The page to write; figures go into a folder beside it.")] = Path(
+        "docs/results.md"
+    ),
+) -> None:
+    """Write up what evaluate has measured. Needs matplotlib."""
+    from specshield.sim import writeup
+
+    writeup.write_up(results, out)
 
 
 def train(
     case: Annotated[str, typer.Option(help="A case of maps/.")],
-    method: Annotated[str, typer.Option(help="How the policy is made: reachability or dqn.")] = "reachability",
+    method: Annotated[
+        str, typer.Option(help="How the policy is made: reachability or dqn.")
+    ] = "reachability",
     seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
     option: Annotated[list[str] | None, typer.Option(help="A setting, as units=128; repeatable.")] = None,

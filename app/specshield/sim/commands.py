@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from specshield.client import ShieldClient
-from specshield.sim import picture, report
+from specshield.sim import evaluation, picture, report, results
+from specshield.sim.calibration import calibrated
 from specshield.sim.campaign import Campaign, run
 from specshield.sim.cases import Case, case_names, load_case
-from specshield.sim.progress import StatusLine, duration
+from specshield.sim.experiment import CERTIFYING, Experiment, split
+from specshield.sim.progress import StatusLine, bar, duration
 from specshield.sim.service import own_server
 
 PATIENCE = 10.0  # [s] for one decision: other work may share the machine
@@ -43,19 +46,58 @@ def demo(runs: int, seed: int, out: Path) -> int:
     return _exit_status(campaigns)
 
 
-def evaluate(case: str, runs: int, seed: int, as_json: bool) -> int:
-    """One case with any number of runs; the table, or with `as_json` the figures and every episode."""
-    status, loaded = StatusLine(), load_case(case)
-    with own_server() as url, ShieldClient(url, timeout=PATIENCE) as client:
-        campaign = _campaign(client, loaded, runs, seed, status)
-    status.clear()
-    figures = report.summary(campaign)
-    if as_json:
-        episodes = [episode.to_json() for episode in (*campaign.shielded, *campaign.unshielded)]
-        print(json.dumps({**figures, "episodes": episodes}))
-    else:
-        print(report.table([figures]))
-    return _exit_status([campaign])
+def evaluate(
+    experiments: Sequence[Experiment],
+    runs: int,
+    methods: Sequence[str],
+    out: Path | None,
+    processes: int,
+    redis_url: str | None,
+    as_json: bool,
+) -> int:
+    """Each experiment by each method: a table, or with `as_json` the figures and every record.
+
+    out: the folder of the results, one folder an experiment; what is there already is not done again. 1 if a
+    method that certifies its actions broke the rule in a world that was as told.
+    """
+    broken = False
+    for experiment in experiments:
+        began = time.monotonic()
+        folder = None if out is None else out / experiment.setting.case.name / experiment.noise
+        chosen = [calibrated(experiment, name, folder, processes) for name in methods]
+        progress = _Progress(f"{experiment.setting.case.name}, {experiment.noise}", runs)
+        records = evaluation.evaluate(experiment, runs, chosen, folder, processes, redis_url, progress.show)
+        progress.clear()
+        figures = results.results(experiment, records) if folder is None else results.write(folder)
+        if as_json:
+            print(json.dumps({**figures, "records": [record.to_json() for record in records]}))
+        else:
+            print(
+                f"{progress.title}, model {experiment.model}, seed {experiment.seed}: {figures['formula']}\n"
+            )
+            print(f"{results.table(figures)}\n")
+            print(f"{duration(time.monotonic() - began)}{'' if folder is None else f'; {folder}'}")
+        broken |= experiment.noise == "none" and any(
+            not record.satisfied and split(record.method)[0] in CERTIFYING for record in records
+        )
+    return 1 if broken else 0
+
+
+class _Progress(StatusLine):
+    """A bar with the time left."""
+
+    def __init__(self, title: str, runs: int) -> None:
+        super().__init__()
+        self.title, self._runs = title, runs
+        self._began, self._there = time.monotonic(), 0
+
+    def show(self, done: int) -> None:
+        """The first call says what was there already."""
+        self._there = self._there or done
+        made = done - self._there
+        left = (time.monotonic() - self._began) / made * (self._runs - done) if made else None
+        said = "" if left is None else f", {duration(left)} left"
+        self.say(f"{self.title}: [{bar(done, self._runs)}] {done} of {self._runs} runs{said}")
 
 
 def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: StatusLine) -> Campaign:

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
-from specshield.errors import InputError, NotFound
-from specshield.policy.load import load_policy
+from specshield.errors import InputError, NotFound, Unsupported
 from specshield.policy.policy import Policy, Proposer
 from specshield.policy.reachability import synthesise
 from specshield.robot.unicycle import Body, make_body
 from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
-from specshield.sim.cases import MODELS, Case, load_case
+from specshield.sim.cases import Case, load_case, shipped
 from specshield.sim.decoding import HardDecoding, RobustDecoding
 from specshield.sim.disturbance import believed, check
 from specshield.sim.houses import load_house_case
@@ -25,7 +23,8 @@ from specshield.sim.model import FoundationModel, make_model
 from specshield.task import Task
 
 METHODS = ("unmodified", "hcd", "rcd", "simplex", "paper", "ours", "lookahead")
-MARGINS = ("simplex", "ours", "lookahead")  # of these NAME@M asks for a margin of M metres
+CERTIFYING = ("simplex", "paper", "ours", "lookahead")
+CAREFUL = ("simplex", "ours", "lookahead")  # NAME@M/K asks for a margin of M metres and K steps of slack
 
 
 @dataclass(frozen=True)
@@ -73,14 +72,12 @@ class Setting:
 
     @cached_property
     def learned(self) -> Policy | None:
-        """The DQN shipped for the case; None where there is none."""
-        folder = MODELS / self.case.name
-        if not (folder / "card.json").is_file():
+        """The DQN that came for the case; None where there is none."""
+        try:
+            policy = shipped(self.case, "dqn")
+        except NotFound:
             return None
-        card = json.loads((folder / "card.json").read_text())
-        policy = load_policy((folder / "policy.safetensors").read_bytes(), card, self.case.task)
-        assert isinstance(policy, Policy)
-        return replace(policy, task=self.task)
+        return replace(policy, task=self.task) if isinstance(policy, Policy) else None
 
     @cached_property
     def policies(self) -> tuple[Proposer, ...]:
@@ -103,41 +100,60 @@ class Setting:
         return make_shield(self.policies)
 
     def method(self, name: str) -> Method:
-        """A method by its name, NAME@M with a margin of M metres. Raises NotFound, InputError."""
-        kind, margin = split(name)
+        """A method by its name, NAME@M/K with a margin of M metres and K steps of slack.
+
+        Raises NotFound, InputError; Unsupported for a shaping that is not there.
+        """
+        kind, margin, slack = split(name)
+        careful = Config(margin=margin, slack=slack)
         make: dict[str, Callable[[], Method]] = {
             "unmodified": lambda: Decoding(self.task),
             "hcd": lambda: Decoding(self.task, HardDecoding(self.task)),
             "rcd": lambda: Decoding(self.task, RobustDecoding(self.task)),
-            "simplex": lambda: Simplex(make_shield(self.policies, Config(margin=margin))),
+            "simplex": lambda: Simplex(make_shield(self.policies, careful)),
             "paper": lambda: Shielded(self.paper, carries=False),
-            "ours": lambda: Shielded(make_shield(self.policies, Config(margin=margin))),
-            "lookahead": lambda: Shielded(
-                make_shield(self.policies, Config(margin=margin, shaping="lookahead"))
-            ),
+            "ours": lambda: Shielded(make_shield(self.policies, careful)),
+            "lookahead": lambda: Shielded(make_shield(self.policies, replace(careful, shaping="lookahead"))),
         }
         return make[kind]()
 
 
-def split(method: str) -> tuple[str, float]:
-    """The kind of a method and its margin [m]. Raises NotFound or InputError."""
-    kind, at, text = method.partition("@")
+def experiments(case: str, house: str | None, model: str, noise: str, seed: int) -> list[Experiment]:
+    """One a noise, of those that `noise` joins by commas. case: a case's name, or its number."""
+    name = f"case{case}" if case.isdigit() else case
+    return [Experiment(name, house, model, each, seed) for each in noise.split(",")]
+
+
+def available(case: str) -> list[str]:
+    """The methods that can be had for a case without options."""
+    absent = {"paper"} if case == "house" else set()
+    try:
+        Config(shaping="lookahead")
+    except Unsupported:
+        absent.add("lookahead")
+    return [name for name in METHODS if name not in absent]
+
+
+def split(method: str) -> tuple[str, float, int]:
+    """The kind of a method, its margin [m] and its slack [steps]. Raises NotFound or InputError."""
+    kind, at, asked = method.partition("@")
     if kind not in METHODS:
         raise NotFound(
             f"there is no method {kind!r}", path="methods", got=method, expected=f"of {', '.join(METHODS)}"
         )
     if not at:
-        return kind, 0.0
+        return kind, 0.0, 0
+    metres, _, steps = asked.partition("/")
     try:
-        margin = float(text)
+        margin, slack = float(metres), int(steps or 0)
     except ValueError:
-        margin = math.nan
-    if kind not in MARGINS or not (math.isfinite(margin) and margin >= 0.0):
+        margin, slack = math.nan, 0
+    if kind not in CAREFUL or not math.isfinite(margin):
         raise InputError(
             "not a method with a margin", path="methods", got=method,
-            expected=f"NAME@METRES, the name one of {', '.join(MARGINS)}",
+            expected=f"NAME@METRES or NAME@METRES/STEPS, the name one of {', '.join(CAREFUL)}",
         )  # fmt: skip
-    return kind, margin
+    return kind, margin, slack
 
 
 @lru_cache(maxsize=4)

@@ -31,7 +31,7 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
     canvas = _Canvas(case)
     canvas.floor()
     for name, region in case.task.regions.items():
-        canvas.region(name, region, BAD if name in _avoided(case.task.formula) else GOOD)
+        canvas.region(name, region, BAD if name in avoided(case.task.formula) else GOOD)
     canvas.way(unshielded.poses, UNSHIELDED, 2.2)
     canvas.way(shielded.poses, SHIELDED, 3.0)
     for t, (x, y, _) in _kept_at(case, shielded.poses):
@@ -44,7 +44,7 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
     canvas.save(path)
 
 
-def _avoided(formula: Formula) -> set[str]:
+def avoided(formula: Formula) -> set[str]:
     """Names that the formula wants not to hold: those below an odd number of `not`s."""
     found: set[str] = set()
 
@@ -164,8 +164,8 @@ class _Canvas:
             self._write((left + 44 * FINE, v), f"{said}: {_outcome(episode)}", 14, INK, "lm")
         right = left + 560 * FINE
         v = top + 32 * FINE
-        avoided = _avoided(case.task.formula)
-        for color, said in ((GOOD, "to visit"), (BAD, "to avoid")) if avoided else ((GOOD, "to visit"),):
+        any_avoided = avoided(case.task.formula)
+        for color, said in ((GOOD, "to visit"), (BAD, "to avoid")) if any_avoided else ((GOOD, "to visit"),):
             box = (right, v - 7 * FINE, right + 20 * FINE, v + 7 * FINE)
             tint = tuple(round(0.84 * p + 0.16 * c) for p, c in zip(PAPER, color, strict=True))
             self._pen.rectangle(box, fill=tint, outline=color, width=2 * FINE)

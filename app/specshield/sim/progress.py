@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
+WIDTH = 30
 EVERY = 10.0  # [s] between lines where nobody looks on
 
 
@@ -25,6 +26,12 @@ class StatusLine:
     def clear(self) -> None:
         if self._terminal:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def bar(done: int, total: int) -> str:
+    """How much is done, WIDTH characters wide."""
+    filled = WIDTH * done // max(total, 1)
+    return "#" * filled + "." * (WIDTH - filled)
 
 
 def duration(seconds: float) -> str:

@@ -26,7 +26,7 @@ from specshield.sim.cases import Case
 from specshield.sim.experiment import Experiment, Setting
 from specshield.sim.methods import Answer, Method
 from specshield.sim.robot import Pose, SimulatedRobot
-from specshield.stl import SATISFIED_ABOVE, robustness
+from specshield.stl import SATISFIED_ABOVE, conjuncts, robustness
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +42,8 @@ class Record:
 
     seed: of this run. refused: starts drawn before `start` that were infeasible. satisfied, rho: of the
     states x_0 .. x_T, the robot standing still where it stopped earlier [m]. main_done: the model ended
-    within 1 m of its target before MAX_STEPS; ended_at: the step of its `end`. modes, reasons: decisions by
+    within 1 m of its target before MAX_STEPS; ended_at: the step of its `end`. broken: the conjuncts that
+    were not kept. modes, reasons: decisions by
     mode and by reason. kl: summed over the decisions made for the model, `asked` of them [nats]. residual:
     the largest surprise of a step (sim/conformal.py) [m]. decision_ms: p50, p99 and max. mass: pi_FM(S_t)
     step by step; certified: rho of the future that certified what was executed; None where there was none.
@@ -58,6 +59,7 @@ class Record:
     rho: float
     main_done: bool
     ended_at: int | None
+    broken: list[str]
     steps: int
     modes: dict[str, int]
     reasons: dict[str, int]
@@ -168,7 +170,8 @@ def _episode(experiment: Experiment, name: str, i: int, own: int, begun: _Beginn
         t += 1
     states = np.concatenate([poses[: t + 1], np.repeat(poses[t : t + 1], max(case.task.horizon - t, 0), 0)])
     samples = case.task.samples(states)
-    rho = float(robustness(case.task.formula, samples))
+    kept = {str(part): float(robustness(part, samples)) for part in conjuncts(case.task.formula)}
+    rho = min(kept.values())
     return Record(
         run=i,
         method=name,
@@ -179,6 +182,7 @@ def _episode(experiment: Experiment, name: str, i: int, own: int, begun: _Beginn
         rho=rho,
         main_done=main_done,
         ended_at=ended_at,
+        broken=[part for part, value in kept.items() if value <= SATISFIED_ABOVE],
         steps=t,
         modes=dict(tally.modes),
         reasons=dict(tally.reasons),

@@ -1,0 +1,76 @@
+"""What the records of an experiment come to, method by method."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from specshield.sim.runs import Record
+
+MODES = ("shaped", "switched", "completion", "prior", "fallback", "violated")  # of decisions
+CONFIDENCE = 0.95
+
+
+def clopper_pearson(k: int, n: int) -> tuple[float, float]:
+    """The exact interval of a share of which k of n were seen, at CONFIDENCE (Clopper and Pearson, 1934)."""
+    interval = binomtest(k, n).proportion_ci(CONFIDENCE, method="exact")
+    return float(interval.low), float(interval.high)
+
+
+def summary(method: str, records: Sequence[Record], unmodified: Sequence[Record]) -> dict[str, Any]:
+    """The figures of one method, as JSON.
+
+    unmodified: the records of the same runs without any method, empty where there are none. kl: mean over
+    the runs of the sum along a run [nats]. extra_steps: how much later the model ended than unmodified, over
+    the `both` runs that did the main task both times. broken: runs by the conjunct that was not kept.
+    never_ended, ended_elsewhere: why the main task was not done. feasible_mass: mean over decisions.
+    """
+    pairs = zip(records, unmodified, strict=True) if unmodified else ()
+    later = [
+        record.ended_at - plain.ended_at
+        for record, plain in pairs
+        if record.main_done and plain.main_done and record.ended_at is not None and plain.ended_at is not None
+    ]
+    masses = [mass for record in records for mass in record.mass if mass is not None]
+    return {
+        "method": method,
+        "runs": len(records),
+        "satisfied": _share(record.satisfied for record in records),
+        "main_done": _share(record.main_done for record in records),
+        "never_ended": sum(record.ended_at is None for record in records),
+        "ended_elsewhere": sum(record.ended_at is not None and not record.main_done for record in records),
+        "broken": dict(Counter(part for record in records for part in record.broken)),
+        "rho_median": _rounded(np.median([record.rho for record in records])),
+        "kl": _rounded(np.mean([record.kl for record in records])),
+        "extra_steps": {
+            "both": len(later),
+            "mean": _rounded(np.mean(later)) if later else None,
+            "median": _rounded(np.median(later)) if later else None,
+        },
+        "modes": _total(record.modes for record in records),
+        "reasons": _total(record.reasons for record in records),
+        "feasible_mass": _rounded(np.mean(masses)) if masses else None,
+        "residual": _rounded(max(record.residual for record in records)),
+        "decision_ms": {
+            name: _rounded(np.median([record.decision_ms[name] for record in records]))
+            for name in ("p50", "p99")
+        },
+    }
+
+
+def _share(outcomes: Iterable[bool]) -> dict[str, Any]:
+    seen = list(outcomes)
+    low, high = clopper_pearson(sum(seen), len(seen))
+    return {"count": sum(seen), "of": len(seen), "low": _rounded(low), "high": _rounded(high)}
+
+
+def _total(counts: Iterable[dict[str, int]]) -> dict[str, int]:
+    return dict(sum((Counter(each) for each in counts), Counter[str]()))
+
+
+def _rounded(value: Any) -> float:
+    return round(float(value), 4)

@@ -1,0 +1,204 @@
+"""docs/results.md and its figures, from what `specshield evaluate --out` has kept.
+
+Every figure in the page is read from a results.json; the words around them are here.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from specshield.errors import NotFound
+from specshield.sim import figures
+from specshield.sim.disturbance import DISTURBANCES
+from specshield.sim.evaluation import read
+from specshield.sim.experiment import CERTIFYING, Experiment, split
+from specshield.sim.results import markdown, share, table, write
+
+PAPER = {  # Table II: rule satisfied and main task done, in per cent of 200 runs
+    "case1": {"unmodified": (0.0, 93.5), "paper": (100.0, 92.5)},
+    "case2": {"unmodified": (0.0, 99.0), "paper": (100.0, 82.5)},
+}
+METHODS = """\
+- **unmodified**: the model's own draws; after its `end` the robot stands still.
+- **hcd**: next-step masking, SafeDec's hard constrained decoding: minus infinity where the states so far and
+  the next one leave some conjunct no chance, whatever follows.
+- **rcd**: SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)), rho of the
+  predicates that are asked for at the next step, alpha = {alpha:g} per metre, beta = {beta:g}.
+- **simplex**: the model's draw where it is feasible, else the certified continuation.
+- **paper**: the paper's: a DQN as pi_phi, rolled out literally after every action; hard projection.
+- **ours**: reachability and the DQN together, witnesses carried on; hard projection.
+- **lookahead**: ours, weighted inside S_t by how likely the model itself is to keep the rule from there.
+- NAME@M/K: with a margin of M metres and deadlines aimed at K steps early."""
+NOISES = {
+    "none": "as told",
+    "gaussian": "every motion ends off by sigma 0.01 m along x and y, and 0.5 degrees",
+    "slip": "5 % of the motions do nothing",
+    "obstacle": "0.3 m wide, on no map, on the way that was certified at the start",
+    "shift": "walls and furniture 0.05 m off along x or y",
+    "collider": "the Stretch's off-centre footprint, told as a centred one",
+}
+
+Results = dict[str, Any]
+
+
+def write_up(folder: Path, page: Path) -> None:
+    """Writes the page, and the figures of each experiment in the world as told beside it.
+
+    folder: as `specshield evaluate --out` was given. Raises NotFound where it holds no results.
+    """
+    found = {about.parent: write(about.parent) for about in sorted(folder.glob("*/*/experiment.json"))}
+    if not found:
+        raise NotFound(
+            "there are no results", path="results", got=str(folder),
+            expected="a folder that `specshield evaluate --out` has written",
+        )  # fmt: skip
+    beside = page.with_suffix("")
+    drawn = {
+        kept: figures.draw(_case(results), list(read(kept)), beside / results["case"])
+        for kept, results in found.items()
+        if results["experiment"]["noise"] == "none"
+    }
+    page.write_text("\n\n".join(_sections(found, drawn, page)) + "\n")
+
+
+def _case(results: Results) -> Any:
+    return Experiment.from_json(results["experiment"]).setting.case
+
+
+def _sections(found: dict[Path, Results], drawn: dict[Path, list[Path]], page: Path) -> Iterator[str]:
+    from specshield.sim.decoding import ALPHA, BETA
+
+    told = {kept: r for kept, r in found.items() if r["experiment"]["noise"] == "none"}
+    cases = {r["case"]: r for r in told.values() if r["experiment"]["house"] is None}
+    yield "# Results"
+    yield (
+        "Written by `specshield report`; every figure is from a campaign's `results.json`. Shares carry their "
+        "95 % Clopper-Pearson intervals. All methods share starts, model seeds, draws and disturbances, run by "
+        "run. The main task is done when the model says `end` within 1 m of its target before 600 steps."
+    )
+    yield METHODS.format(alpha=ALPHA, beta=BETA)
+    yield "## Beside the paper's Table II"
+    yield _beside(cases.values())
+    for kept, results in told.items():
+        yield f"## {results['case']}: method by method"
+        yield _about(results)
+        yield table(results)
+        yield _short(results)
+        for path in drawn[kept]:
+            yield f"![{path.stem} of {results['case']}]({path.relative_to(page.parent)})"
+    disturbed = [r for r in found.values() if r["experiment"]["noise"] != "none"]
+    if disturbed:
+        yield "## Noise and mismatch"
+        yield "\n".join(f"- **{name}**: {NOISES[name]}." for name in DISTURBANCES[1:])
+        for case in dict.fromkeys(r["case"] for r in disturbed):
+            yield f"### {case}"
+            yield _noise_table([r for r in found.values() if r["case"] == case])
+        yield from _calibrations(found)
+    yield "## How it was run"
+    yield "```sh\n" + "\n".join(_commands(found.values())) + "\n```"
+
+
+def _about(results: Results) -> str:
+    about = results["experiment"]
+    return (
+        f'`{results["formula"]}`, model {about["model"]} ("{results["instruction"]}"), '
+        f"{results['runs']} runs, seed {about['seed']}; {results['refused_starts']} starts drawn before them "
+        "would not do."
+    )
+
+
+def _beside(cases: Iterable[Results]) -> str:
+    rows = []
+    for results in cases:
+        for one in results["methods"]:
+            theirs = PAPER.get(results["case"], {}).get(one["method"])
+            said = ("-", "-") if theirs is None else (f"{theirs[0]:g} %", f"{theirs[1]:g} %")
+            of = one["runs"]
+            kept, done = one["satisfied"]["count"], one["main_done"]["count"]
+            rows.append(
+                (results["case"], one["method"], *said, f"{100 * kept / of:g} %", f"{100 * done / of:g} %")
+            )
+    heads = ("case", "method", "the paper: rule", "the paper: main task", "here: rule", "here: main task")
+    return markdown(heads, rows)
+
+
+def _short(results: Results) -> str:
+    """What each method did not keep, and why main tasks were not done."""
+    lines = []
+    plain = next((one for one in results["methods"] if one["method"] == "unmodified"), None)
+    for one in results["methods"]:
+        parts = []
+        if one["broken"]:
+            broken = (f"`{part}` {n}" for part, n in sorted(one["broken"].items()))
+            parts.append(f"broken in runs: {', '.join(broken)}")
+        missed = one["runs"] - one["main_done"]["count"]
+        if missed:
+            parts.append(
+                f"main task not done in {missed}: never ended {one['never_ended']}, ended elsewhere "
+                f"{one['ended_elsewhere']}"
+            )
+        if plain is not None and split(one["method"])[0] in CERTIFYING:
+            points = 100 * (plain["main_done"]["count"] - one["main_done"]["count"]) / one["runs"]
+            parts.append(f"main task {points:+.1f} points below unmodified")
+        if parts:
+            lines.append(f"- {one['method']}: {'; '.join(parts)}.")
+    return "\n".join(lines)
+
+
+def _noise_table(experiments: Sequence[Results]) -> str:
+    """A row a disturbance and method: rule and main task."""
+    ranked = sorted(experiments, key=lambda r: DISTURBANCES.index(r["experiment"]["noise"]))
+    rows = [
+        (
+            results["experiment"]["noise"],
+            one["method"],
+            share(one["satisfied"]),
+            share(one["main_done"]),
+            f"{one['kl']:.1f}",
+            f"{one['modes'].get('fallback', 0) + one['modes'].get('violated', 0)} of "
+            f"{sum(one['modes'].values())}",
+            f"{one['residual']:.3f}",
+        )
+        for results in ranked
+        for one in results["methods"]
+        if results["experiment"]["noise"] != "none" or split(one["method"])[0] in CERTIFYING
+    ]
+    heads = (
+        "world", "method", "rule satisfied", "main task done", "KL a run [nats]", "fallback or violated",
+        "largest surprise [m]",
+    )  # fmt: skip
+    return markdown(heads, rows)
+
+
+def _calibrations(found: dict[Path, Results]) -> Iterator[str]:
+    lines = []
+    for kept, results in found.items():
+        if (kept / "calibration.json").exists():
+            made = json.loads((kept / "calibration.json").read_text())
+            runs = [record for record in read(kept) if record.method == made["method"]]
+            covered = sum(record.residual <= made["margin"] for record in runs)
+            lines.append(
+                f"- {results['case']}, {results['experiment']['noise']}: {made['margin']:.4f} m from "
+                f"{made['runs']} other runs; it covered every step of {covered} of {len(runs)} runs."
+            )
+    if lines:
+        yield (
+            "The margins above come from calibration campaigns (split conformal prediction, alpha 0.05, a "
+            "run's largest surprise as its score):"
+        )
+        yield "\n".join(lines)
+
+
+def _commands(found: Iterable[Results]) -> Iterator[str]:
+    for results in found:
+        about = results["experiment"]
+        case = f"house --house {about['house']}" if about["house"] else results["case"]
+        methods = ",".join(one["method"] for one in results["methods"])
+        yield (
+            f"specshield evaluate --case {case} --runs {results['runs']} --seed {about['seed']} "
+            f"--model {about['model']} --noise {about['noise']} --methods {methods} --out out/results"
+        )
+    yield "specshield report out/results"
