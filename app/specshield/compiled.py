@@ -24,8 +24,19 @@ def leaf(function: F) -> F:
     a rollout's time. What allocates nothing needs no counting. The option is not in numba's manual; where it
     is gone, the kernels are slower and the same.
     """
+    return _leaf(function)
+
+
+def inlined(function: F) -> F:
+    """A leaf that becomes part of its callers: a call copies a struct's hundred words, in an inner loop most
+    of its time.
+    """
+    return _leaf(function, forceinline=True)
+
+
+def _leaf(function: F, **options: bool) -> F:
     try:
-        compiled: F = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function)
+        compiled: F = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, **options)(function)
     except (KeyError, TypeError):
-        compiled = njit(cache=True, nogil=True, error_model="numpy")(function)
+        compiled = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     return compiled

@@ -35,7 +35,9 @@ class Poses(NamedTuple):
 
 
 class Edges(NamedTuple):
-    """What led to the poses kept at each step: [steps, edges]; made: how many of them; tag [steps, poses]: as in `Poses`."""
+    """What led to the poses kept at each step: [steps, edges], made [steps] of them; tag [steps, poses] as in
+    `Poses`.
+    """
 
     child: NDArray[np.int32]
     parent: NDArray[np.int32]

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.progress import STACK, Rules, read_predicates, value_count
 from specshield.robot.unicycle import TOUCH, Body, free_distance, in_collision, step, wrap
 from specshield.stl.program import VALUE
@@ -87,7 +87,7 @@ def pose_of(
     return x, y, theta if theta <= math.pi else theta - 2.0 * math.pi
 
 
-@leaf
+@inlined
 def coordinates(
     body: Body, pitch: float, headings: int, x: float, y: float, theta: float
 ) -> tuple[float, float, float]:

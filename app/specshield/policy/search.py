@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf
-from specshield.policy.beam import MAX_ROOTS, beam
+from specshield.policy.beam import EASY, MAX_ROOTS, beam
 from specshield.policy.progress import forgive, replay
 from specshield.policy.tables import HOPELESS, slack
 from specshield.policy.walk import SETTLED_ALL, STUCK, Guide, Work, fill, make_work, observe, rejoin, walk
 from specshield.robot.unicycle import Body, step
 
 ESCAPE_GAIN = 2.0  # [steps] later than where it got stuck: what a way out has to reach
+ESCAPE_LOSS = 6.0  # [steps] of slack that it may cost on the way
 ESCAPE_DEPTH = 24
 MAX_ESCAPES = 8
 BAND = -3.0  # [steps] of slack: how far the tables err
@@ -28,12 +29,16 @@ SMALL_SHARE = 512
 
 
 class Starts(NamedTuple):
-    """After each first motion [M]: the progress, the slack, what undoes it, whether a way was found."""
+    """After each first motion [M]: the progress, the slack, whether a way was found.
+
+    turn, move: the motions that undo it, nearly; -1 where none is needed, -2 where there is none.
+    """
 
     status: NDArray[np.int8]
     run: NDArray[np.int64]
     slack: NDArray[np.float64]
-    undo: NDArray[np.int64]
+    turn: NDArray[np.int64]
+    move: NDArray[np.int64]
     settled: NDArray[np.bool_]
 
 
@@ -58,19 +63,20 @@ def propose_all(
     work = make_work(guide.rules, count)
     starts = Starts(
         np.empty((count, k_count), np.int8), np.empty((count, k_count), np.int64), np.empty(count),
-        np.empty(count, np.int64), np.zeros(count, np.bool_),
+        np.empty(count, np.int64), np.empty(count, np.int64), np.zeros(count, np.bool_),
     )  # fmt: skip
     order = np.empty(count, np.int64)
     _first_steps(guide, t, history[t], status, run, motions, poses, starts, work)
     _by_slack(starts.slack, order)
     base = -1
     for m in order:
-        if base >= 0 and starts.undo[m] >= -1:
+        turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
+        if base >= 0 and turn > -2 and move > -2:
             _resume(starts.status[m], starts.run[m], work)
-            starts.settled[m] = rejoin(guide, t, starts.undo[m], motions[base], motions[m], poses[m], work)
-        if not starts.settled[m] and (starts.slack[m] >= 0.0 or base < 0 or starts.undo[m] < -1):
+            starts.settled[m] = rejoin(guide, t, turn, move, motions[base], motions[m], poses[m], work)
+        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == -2 or move == -2):
             _resume(starts.status[m], starts.run[m], work)
-            escapes = base < 0 and starts.slack[m] >= 0.0
+            escapes = ahead >= (0.0 if base < 0 else EASY)
             starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
         if starts.settled[m] and base < 0:
             base = int(m)
@@ -99,7 +105,8 @@ def _first_steps(
         x, y, theta = step(body, pose[0], pose[1], pose[2], m)
         motions[m, 0] = m
         poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
-        starts.undo[m] = _undoing(body, pose, x, y, theta, m)
+        starts.turn[m] = _turning_back(body, m) if theta != pose[2] else -1
+        starts.move[m] = _moving_back(body, m, math.hypot(x - pose[0], y - pose[1]))
         _resume(status, run, work)
         observe(rules, t + 1, x, y, theta, work)
         for k in range(status.shape[0]):
@@ -108,23 +115,25 @@ def _first_steps(
 
 
 @leaf
-def _undoing(body: Body, pose: NDArray[np.float64], x: float, y: float, theta: float, motion: int) -> int:
-    """The motion that leads from x, y, theta back to `pose`, -1 where it is the same, -2 where none does."""
-    if _same(x, y, theta, pose):
-        return -1
-    if body.translate[motion] != 0.0 and body.rotate[motion] != 0.0:
-        return -2
-    for m in range(body.translate.shape[0]):
-        if body.translate[m] == -body.translate[motion] and body.rotate[m] == -body.rotate[motion]:
-            u, v, w = step(body, x, y, theta, m)
-            return m if _same(u, v, w, pose) else -2
-    return -2
+def _turning_back(body: Body, motion: int) -> int:
+    """The turn that undoes a motion's, -1 where it turns nothing, -2 where there is none."""
+    return _motion_by(body, 0.0, -body.rotate[motion]) if body.rotate[motion] != 0.0 else -1
 
 
 @leaf
-def _same(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
-    turn = abs(theta - pose[2])
-    return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)
+def _moving_back(body: Body, motion: int, moved: float) -> int:
+    """The move that brings the robot nearer to where it was, having moved so far; -1, -2 as above."""
+    if moved <= 0.5 * abs(body.translate[motion]):
+        return -1
+    return _motion_by(body, -body.translate[motion], 0.0)
+
+
+@leaf
+def _motion_by(body: Body, translate: float, rotate: float) -> int:
+    for m in range(body.translate.shape[0]):
+        if body.translate[m] == translate and body.rotate[m] == rotate:
+            return m
+    return -2
 
 
 @leaf
@@ -168,7 +177,7 @@ def _follow(
         taken = np.empty(1, np.int64)
         beam(
             guide, t + n, poses[n - 1 : n], status.reshape(1, -1), run.reshape(1, -1), width,
-            0.5 * HOPELESS, high + ESCAPE_GAIN, work, way, taken,
+            high - (t + n) - ESCAPE_LOSS, high + ESCAPE_GAIN, work, way, taken,
         )  # fmt: skip
         if taken[0] == 0:
             break

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import leaf
+from specshield.compiled import inlined, leaf
 from specshield.policy.lattice import coordinates
 from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 from specshield.robot.unicycle import Body
@@ -38,7 +38,7 @@ class Tables(NamedTuple):
     pitch: float
 
 
-@leaf
+@inlined
 def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float:
     """L at lattice coordinates: linear in x, y and heading over the corners that are valid; HOPELESS where
     none is.
@@ -110,7 +110,7 @@ def slack(
     return best
 
 
-@leaf
+@inlined
 def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: float, h: float) -> float:
     """The slack once a dwell is over, at step t and where it was begun."""
     if mask == every and tables.phase[t] == len(tables.end) - 1:
@@ -119,7 +119,7 @@ def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: flo
     return latest_at(tables, table, v, u, h) - t if table >= 0 else HOPELESS
 
 
-@leaf
+@inlined
 def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
     for k in range(status.shape[0]):
         if status[k] == BROKEN or (rules.kind[k] != ALWAYS and status[k] == PENDING):
@@ -127,7 +127,7 @@ def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
     return True
 
 
-@leaf
+@inlined
 def is_broken(status: NDArray[np.int8]) -> bool:
     broken = False
     for k in range(status.shape[0]):
@@ -135,7 +135,7 @@ def is_broken(status: NDArray[np.int8]) -> bool:
     return broken
 
 
-@leaf
+@inlined
 def score(
     body: Body,
     rules: Rules,

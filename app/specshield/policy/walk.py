@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
 from specshield.policy.tables import HOPELESS, Tables, goals_settled, is_broken, score
 from specshield.robot.unicycle import Body, step
@@ -55,7 +55,7 @@ def make_work(rules: Rules, motions: int) -> Work:
     )  # fmt: skip
 
 
-@leaf
+@inlined
 def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, work: Work) -> float:
     """The robustness of one obligation's predicate at a pose: only the regions that it names are measured."""
     values = work.values
@@ -74,7 +74,7 @@ def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, work: W
     return float(evaluate_packed(k, rules.ops, rules.args, rules.starts, values, work.stack))
 
 
-@leaf
+@inlined
 def observe(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> None:
     """Takes x_t into work's progress. Predicates that `advance` makes no use of are not read."""
     for k in range(rules.kind.shape[0]):
@@ -84,7 +84,7 @@ def observe(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) 
     advance(rules, t, work.predicates, work.status, work.run)
 
 
-@leaf
+@inlined
 def look(rules: Rules, x: float, y: float, theta: float, work: Work) -> None:
     """Reads the predicates of everything that is pending, for a robot that will wait here."""
     for k in range(rules.kind.shape[0]):
@@ -92,13 +92,13 @@ def look(rules: Rules, x: float, y: float, theta: float, work: Work) -> None:
             work.predicates[k] = predicate_at(rules, k, x, y, theta, work)
 
 
-@leaf
+@inlined
 def is_over(rules: Rules, tables: Tables, t: int, status: NDArray[np.int8]) -> bool:
     """Whether every goal is settled at step t and no `always` is still to begin."""
     return goals_settled(rules, status) and tables.phase[t] == len(tables.end) - 1
 
 
-@leaf
+@inlined
 def fill(
     n: int,
     wait: int,
@@ -191,7 +191,7 @@ def walk(
     return (SETTLED_ALL if goals_settled(rules, status) else FAILED), n
 
 
-@leaf
+@inlined
 def _copy(
     status: NDArray[np.int8], run: NDArray[np.int64], to_status: NDArray[np.int8], to_run: NDArray[np.int64]
 ) -> None:
@@ -199,7 +199,7 @@ def _copy(
         to_status[k], to_run[k] = status[k], run[k]
 
 
-@leaf
+@inlined
 def _pending(status: NDArray[np.int8]) -> int:
     count = 0
     for k in range(status.shape[0]):
@@ -207,7 +207,7 @@ def _pending(status: NDArray[np.int8]) -> int:
     return count
 
 
-@leaf
+@inlined
 def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> bool:
     """Whether being at a pose at step t breaks nothing. Leaves its predicates in work, the progress alone."""
     for k in range(rules.kind.shape[0]):
@@ -229,7 +229,7 @@ def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -
     return True
 
 
-@leaf
+@inlined
 def _pays_to_wait(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> bool:
     """Whether a goal that holds here is still to open, or a dwell to go on."""
     for k in range(rules.kind.shape[0]):
@@ -243,25 +243,29 @@ def _pays_to_wait(rules: Rules, t: int, x: float, y: float, theta: float, work: 
 def rejoin(
     guide: Guide,
     t: int,
-    back: int,
+    turn: int,
+    move: int,
     base: NDArray[np.int64],
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
     work: Work,
 ) -> bool:
-    """Goes on from motions[:1] by the motion `back` that undoes it (-1: none is needed), then by `base`, a
-    way from x_t to every goal.
+    """Goes on from motions[:1] by the motions `turn` and `move` that undo it (-1: none is needed), then by
+    `base`, a way from x_t to every goal.
 
-    The steps lost are made up for where `base` (T - t,) waits. Other arguments as in `walk`.
+    The steps lost are made up for where `base` (T - t,) waits. What is undone only nearly may still do: the
+    result says whether every goal was settled. Other arguments as in `walk`.
     """
     body, rules, tables, wait = guide
     steps = motions.shape[0]
-    behind = 1 if back < 0 else 2
+    behind = 1 + (turn >= 0) + (move >= 0)
     x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
-    n, at = 1, 0
+    n, at, looked = 1, 0, False
     while n < steps and not is_over(rules, tables, t + n, work.status) and not is_broken(work.status):
-        if n == 1 and back >= 0:
-            motion = back
+        if turn >= 0:
+            motion, turn = turn, -1
+        elif move >= 0:
+            motion, move = move, -1
         else:
             while behind > 0 and at < steps and base[at] == wait:
                 at += 1
@@ -271,9 +275,11 @@ def rejoin(
         if motion != wait:
             x, y, theta = step(body, x, y, theta, motion)
             observe(rules, t + n + 1, x, y, theta, work)
+            looked = False
         else:
-            if motions[n - 1] != wait or n == 1:
+            if not looked:
                 look(rules, x, y, theta, work)
+            looked = True
             advance(rules, t + n + 1, work.predicates, work.status, work.run)
         motions[n] = motion
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
