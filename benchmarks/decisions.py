@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +32,7 @@ def compare(
 ) -> dict[str, Any]:
     """Times of all four at t = 0 and along episodes, where they disagree, where (c) and (d) spend time."""
     case = load_case(case_name)
+    literal = make_shield([replace(shipped_dqn(case), literal=True)])
     shields = {"c": make_shield([shipped_dqn(case)]), "d": make_shield([reachability.synthesise(case.task)])}
     plain = Plain(shipped_dqn(case))
     result: dict[str, Any] = {}
@@ -45,12 +46,12 @@ def compare(
             here["parts"][key] = parts(shield, states[:60], repeats)
             if key == "c":
                 chosen = spread(states, plain_states)
-        result[place] = here | beside(plain, shields, chosen, repeats)
+        result[place] = here | beside(plain, shields, literal, chosen, repeats)
     return result
 
 
 def beside(
-    plain: Plain, shields: Mapping[str, Shield], states: Sequence[State], repeats: int
+    plain: Plain, shields: Mapping[str, Shield], literal: Shield, states: Sequence[State], repeats: int
 ) -> dict[str, Any]:
     """(a) and (b) on a few states, how many times longer they take than (c) and (d), whether J agrees."""
     times: dict[str, list[float]] = {key: [] for key in "abcd"}
@@ -60,7 +61,7 @@ def beside(
             times[key].append(ask(shield, state, repeats))
         for key, values_of in (("a", plain.one_by_one), ("b", plain.batched)):
             times[key].append(quietest(lambda s=state, v=values_of: plainly(v, s), repeats))
-            found.add(shields["c"], state, values_of(state.history))
+            found.add(literal, shields["c"], state, values_of(state.history))
     ratios = {
         f"{plain_key}/{ours}": float(np.median(np.array(times[plain_key]) / times[ours]))
         for plain_key in "ab"
@@ -77,29 +78,37 @@ def plainly(values_of: Callable[[Floats], Floats], state: State) -> Floats | Non
 
 @dataclass
 class Agreement:
-    """J of (a) and (b) against that of (c), over pairs of state and action.
+    """J of (a) and (b) against that of (c) with `literal` rollouts, over pairs of state and action.
 
-    satisfied: pairs with J = 1. rho: the largest difference in robustness [m]. A witness carried would only
-    add to S_t, so (c) decides without one here. float32 sums may be ordered in another way, so a rollout may
-    in principle part from ours where two Q-values are as good as equal: `parted`; elsewhere J has to agree.
+    satisfied: pairs with J = 1. more: pairs with J = 1 in (c) as it is, which may undo a motion and go on,
+    and 0 with `literal` rollouts; never the reverse. rho: the largest difference in robustness [m]. A witness
+    carried would only add to S_t, so (c) decides without one here. float32 sums may be ordered in another
+    way, so a rollout may in principle part from ours where two Q-values are as good as equal: `parted`;
+    elsewhere J has to agree.
     """
 
     pairs: int = 0
     satisfied: int = 0
+    more: int = 0
     parted: int = 0
     differ: int = 0
     rho: float = 0.0
 
-    def add(self, ours: Shield, state: State, values: Floats) -> None:
+    def add(self, literal: Shield, ours: Shield, state: State, values: Floats) -> None:
         """values: rho of each action, [A]. Raises AssertionError where J differs without a reason."""
         going = ~ours.task.robot.terminal
-        decision = decide(ours, state.history, np.zeros(len(going)))
+        logits = np.zeros(len(going))
+        decision = decide(literal, state.history, logits)
         mine, theirs = np.array(decision.robustness, dtype=np.float64)[going], values[going]
+        shipped = np.array(decide(ours, state.history, logits).robustness, dtype=np.float64)[going]
+        lost = (mine > SATISFIED_ABOVE) & ~(shipped > SATISFIED_ABOVE)
+        assert not lost.any(), f"J = 1 with literal rollouts alone at t = {state.t}: {mine} and {shipped}"
         parted = np.abs(mine - theirs) > ROUNDING
         differ = (mine > SATISFIED_ABOVE) != (theirs > SATISFIED_ABOVE)
         assert not np.any(differ & ~parted), f"J differs at t = {state.t}: {mine} and {theirs}"
         self.pairs += len(mine)
         self.satisfied += int((mine > SATISFIED_ABOVE).sum())
+        self.more += int(((shipped > SATISFIED_ABOVE) & ~(mine > SATISFIED_ABOVE)).sum())
         self.parted += int(parted.sum())
         self.differ += int(differ.sum())
         self.rho = max(self.rho, float(np.abs(mine - theirs)[~parted].max(initial=0.0)))

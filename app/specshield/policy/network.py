@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import leaf
+from specshield.compiled import inlined, leaf
 from specshield.errors import PolicyError
 
 NAMES = ("w1", "b1", "w2", "b2", "w3", "b3")
@@ -57,17 +57,31 @@ def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, output
     return Network(*(np.ascontiguousarray(weights[name]) for name in NAMES))
 
 
-@leaf
+@inlined
 def _layer(
     x: NDArray[np.float32], w: NDArray[np.float32], b: NDArray[np.float32], out: NDArray[np.float32]
 ) -> None:
+    """out = b + x w, each sum in the inputs' order; eight inputs a pass, so that sums stay in registers."""
     for j in range(out.shape[0]):
         out[j] = b[j]
-    for i in range(x.shape[0]):
-        xi = x[i]
-        if xi != np.float32(0.0):
-            for j in range(out.shape[0]):
-                out[j] += xi * w[i, j]
+    whole = x.shape[0] - x.shape[0] % 8
+    for i in range(0, whole, 8):
+        x0, x1, x2, x3, x4, x5, x6, x7 = (
+            x[i],
+            x[i + 1],
+            x[i + 2],
+            x[i + 3],
+            x[i + 4],
+            x[i + 5],
+            x[i + 6],
+            x[i + 7],
+        )
+        for j in range(out.shape[0]):
+            total = out[j] + x0 * w[i, j] + x1 * w[i + 1, j] + x2 * w[i + 2, j] + x3 * w[i + 3, j]
+            out[j] = total + x4 * w[i + 4, j] + x5 * w[i + 5, j] + x6 * w[i + 6, j] + x7 * w[i + 7, j]
+    for i in range(whole, x.shape[0]):
+        for j in range(out.shape[0]):
+            out[j] += x[i] * w[i, j]
 
 
 @leaf

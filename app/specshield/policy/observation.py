@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.progress import (
     ALWAYS,
     BROKEN,
@@ -22,8 +22,10 @@ from specshield.policy.progress import (
     value_count,
 )
 from specshield.robot.unicycle import Body
+from specshield.stl.program import VALUE, evaluate_packed
 from specshield.task import Task
 from specshield.world.geodesic import geodesic_distance
+from specshield.world.regions import region_distance
 
 GLOBAL, PER_GOAL, PER_ALWAYS, PER_MOTION = 5, 10, 2, 3
 FAR = 2.0  # distances are given in units of 5 m, up to this
@@ -41,6 +43,8 @@ class Sight(NamedTuple):
     half_y: float
     horizon: int
     stride: float  # the longest move [m]
+    guards: NDArray[np.int64]  # the regions that an `always` reads
+    turns_matter: bool  # whether one reads the heading
 
 
 def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
@@ -63,6 +67,8 @@ def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
         goal = predicates[k] > rules.margin
         reachable = allowed & goal
         fields.append(_fill(geodesic_distance(allowed, reachable, grid.resolution), grid.resolution))
+    owner = np.repeat(rules.kind, np.diff(rules.starts))
+    read = set(rules.args[(rules.ops == VALUE) & (owner == ALWAYS)].astype(int).tolist())
     xmin, ymin, xmax, ymax = grid.bounds
     distance = np.stack(fields) if fields else np.zeros((0, grid.height, grid.width))
     return Sight(
@@ -74,6 +80,8 @@ def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
         half_y=0.5 * (ymax - ymin),
         horizon=task.horizon,
         stride=float(max(np.max(np.abs(body.translate)), 0.05)),
+        guards=np.array([i for i in range(len(rules.region_starts) - 1) if 3 + i in read], dtype=np.int64),
+        turns_matter=2 in read,
     )
 
 
@@ -104,24 +112,34 @@ def _predicate_maps(rules: Rules, points: NDArray[np.float64]) -> NDArray[np.flo
     return out
 
 
-@leaf
-def field_at(body: Body, field: NDArray[np.float64], x: float, y: float) -> float:
-    """A field [height, width] of cell centres, bilinear at a point of the map frame, held beyond its edge."""
+@inlined
+def _between(body: Body, height: int, width: int, x: float, y: float) -> tuple[int, int, float, float]:
+    """The cell centres that a point of the map frame lies between: the lower row and column, how far past."""
     dx, dy = x - body.origin_x, y - body.origin_y
     u = (body.cos_yaw * dx + body.sin_yaw * dy) / body.resolution - 0.5
     v = (body.cos_yaw * dy - body.sin_yaw * dx) / body.resolution - 0.5
-    u = min(max(u, 0.0), field.shape[1] - 1.0)
-    v = min(max(v, 0.0), field.shape[0] - 1.0)
-    i, j = min(int(u), field.shape[1] - 2), min(int(v), field.shape[0] - 2)
-    if i < 0 or j < 0:  # a grid one cell wide
-        return float(field[int(v), int(u)])
-    p, q = u - i, v - j
-    low = field[j, i] * (1.0 - p) + field[j, i + 1] * p
-    high = field[j + 1, i] * (1.0 - p) + field[j + 1, i + 1] * p
-    return float(low * (1.0 - q) + high * q)
+    u = min(max(u, 0.0), width - 1.0)
+    v = min(max(v, 0.0), height - 1.0)
+    i, j = max(min(int(u), width - 2), 0), max(min(int(v), height - 2), 0)
+    return j, i, v - j, u - i
 
 
-@leaf
+@inlined
+def _blend(field: NDArray[np.float64], row: int, column: int, up: float, along: float) -> float:
+    above, beside = min(row + 1, field.shape[0] - 1), min(column + 1, field.shape[1] - 1)
+    low = field[row, column] * (1.0 - along) + field[row, beside] * along
+    high = field[above, column] * (1.0 - along) + field[above, beside] * along
+    return float(low * (1.0 - up) + high * up)
+
+
+@inlined
+def field_at(body: Body, field: NDArray[np.float64], x: float, y: float) -> float:
+    """A field [height, width] of cell centres, bilinear at a point of the map frame, held beyond its edge."""
+    row, column, up, along = _between(body, field.shape[0], field.shape[1], x, y)
+    return _blend(field, row, column, up, along)
+
+
+@inlined
 def current_goal(rules: Rules, status: NDArray[np.int8]) -> int:
     """The pending goal with the earliest deadline, -1 where none is left."""
     best = -1
@@ -146,7 +164,7 @@ def outcome(status: NDArray[np.int8]) -> int:
     return SETTLED if settled else PENDING
 
 
-@leaf
+@inlined
 def observe(
     body: Body,
     rules: Rules,
@@ -164,28 +182,34 @@ def observe(
 ) -> None:
     """Writes the observation at (x_t, t, progress) into `out`, shape (observation_size,).
 
-    predicates (K,) at x_t, nexts (M, 3): the pose after each motion; values, stack, after (K,): scratch.
+    predicates (K,) at x_t, nexts (M, 3): the pose after each motion; values, stack, after (K,): scratch, the
+    first as `read_predicates` left it at x_t.
     """
     x, y, theta = pose[0], pose[1], pose[2]
+    height, width = sight.distance.shape[1], sight.distance.shape[2]
     cos, sin = math.cos(theta), math.sin(theta)
     out[0] = t / sight.horizon
     out[1], out[2] = cos, sin
     out[3], out[4] = (x - sight.centre_x) / sight.half_x, (y - sight.centre_y) / sight.half_y
     at = GLOBAL
     target = current_goal(rules, status)
-    here = 0.0
+    here, guarded = 0.0, False
+    middle = _between(body, height, width, x, y)
+    west, east = _between(body, height, width, x - 0.1, y), _between(body, height, width, x + 0.1, y)
+    south, north = _between(body, height, width, x, y - 0.1), _between(body, height, width, x, y + 0.1)
     for k in range(rules.kind.shape[0]):
         if rules.kind[k] == ALWAYS:
+            guarded = guarded or rules.a[k] <= t + 1 <= rules.b[k]
             out[at] = min(max(predicates[k] / NEAR_ALWAYS, -1.0), 1.0)
             out[at + 1] = 1.0 if rules.a[k] <= t <= rules.b[k] else 0.0
             at += PER_ALWAYS
             continue
         field = sight.distance[sight.goal[k]]
-        d = field_at(body, field, x, y)
+        d = _blend(field, *middle)
         if k == target:
             here = d
-        gx = field_at(body, field, x - 0.1, y) - field_at(body, field, x + 0.1, y)
-        gy = field_at(body, field, x, y - 0.1) - field_at(body, field, x, y + 0.1)
+        gx = _blend(field, *west) - _blend(field, *east)
+        gy = _blend(field, *south) - _blend(field, *north)
         norm = max(math.hypot(gx, gy), 1e-6)
         opens = rules.a[k] + (rules.c2[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
         out[at] = 1.0 if status[k] == SETTLED else 0.0
@@ -199,26 +223,55 @@ def observe(
         out[at + 8] = min(max(((rules.last[k] - t) * sight.stride - d) / 5.0, -1.0), 1.0)
         out[at + 9] = run[k] / (rules.b[k] - rules.c2[k] + 1.0) if rules.kind[k] == EVENTUALLY_ALWAYS else 0.0
         at += PER_GOAL
-    guarded = False
-    for k in range(rules.kind.shape[0]):
-        guarded = guarded or (rules.kind[k] == ALWAYS and rules.a[k] <= t + 1 <= rules.b[k])
+    still = _safety(rules, t + 1, predicates)
+    moved, gain, safe, last_x, last_y = 0.0, 0.0, still, x, y
     for m in range(body.translate.shape[0]):
         nx, ny, nth = nexts[m, 0], nexts[m, 1], nexts[m, 2]
-        moved = math.hypot(nx - x, ny - y)
+        elsewhere = nx != last_x or ny != last_y  # motions that end at one place share what is known of it
+        if elsewhere:
+            last_x, last_y = nx, ny
+            moved, gain, safe = math.hypot(nx - x, ny - y), 0.0, still
+            if target >= 0 and moved > 0.0:
+                ahead = here - field_at(body, sight.distance[sight.goal[target]], nx, ny)
+                gain = min(max(ahead / sight.stride, -1.5), 1.5)
+        if guarded and (elsewhere or sight.turns_matter):
+            safe = _safety_at(rules, sight, t + 1, nx, ny, nth, values, stack, after)
         full = moved >= abs(body.translate[m]) - 1e-6 and (body.rotate[m] == 0.0 or nth != theta)
         out[at] = 1.0 if full else 0.0
-        out[at + 1] = 0.0
-        if target >= 0 and moved > 0.0:
-            gain = here - field_at(body, sight.distance[sight.goal[target]], nx, ny)
-            out[at + 1] = min(max(gain / sight.stride, -1.5), 1.5)
-        out[at + 2] = 1.0
-        if guarded:  # by an `always` that holds at the next step
-            if moved > 0.0 or body.rotate[m] != 0.0:
-                read_predicates(rules, nx, ny, nth, values, stack, after)
-            else:
-                for k in range(after.shape[0]):
-                    after[k] = predicates[k]
-            for k in range(rules.kind.shape[0]):
-                if rules.kind[k] == ALWAYS and rules.a[k] <= t + 1 <= rules.b[k]:
-                    out[at + 2] = min(out[at + 2], np.float32(max(after[k] / NEAR_ALWAYS, -1.0)))
+        out[at + 1] = gain
+        out[at + 2] = safe
         at += PER_MOTION
+
+
+@inlined
+def _safety(rules: Rules, t: int, predicates: NDArray[np.float64]) -> np.float32:
+    """How far every `always` that holds at step t is from being broken, of NEAR_ALWAYS; in [-1, 1]."""
+    safe = np.float32(1.0)
+    for k in range(rules.kind.shape[0]):
+        if rules.kind[k] == ALWAYS and rules.a[k] <= t <= rules.b[k]:
+            safe = min(safe, np.float32(max(predicates[k] / NEAR_ALWAYS, -1.0)))
+    return safe
+
+
+@inlined
+def _safety_at(
+    rules: Rules,
+    sight: Sight,
+    t: int,
+    x: float,
+    y: float,
+    theta: float,
+    values: NDArray[np.float64],
+    stack: NDArray[np.float64],
+    predicates: NDArray[np.float64],
+) -> np.float32:
+    """_safety at a pose; values, stack, predicates (K,): scratch."""
+    values[0], values[1], values[2] = x, y, theta
+    for i in sight.guards:
+        values[3 + i] = region_distance(
+            i, rules.region_starts, rules.region_kinds, rules.region_offsets, rules.region_data, x, y
+        )
+    for k in range(rules.kind.shape[0]):
+        if rules.kind[k] == ALWAYS:
+            predicates[k] = evaluate_packed(k, rules.ops, rules.args, rules.starts, values, stack)
+    return _safety(rules, t, predicates)

@@ -19,8 +19,8 @@ from safetensors.numpy import save as save_tensors
 from specshield.errors import PolicyError
 from specshield.policy.network import Network, make_network
 from specshield.policy.observation import Sight, make_sight, observation_size
-from specshield.policy.progress import Rules, make_rules, replay, signal_rows
-from specshield.policy.rollout import rollout, rollout_all
+from specshield.policy.progress import Rules, make_rules, signal_rows
+from specshield.policy.rollout import propose_all
 from specshield.robot import Robot, robot_to_json
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
@@ -32,7 +32,7 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Proposal:
-    """What pi_phi would do: a continuation to the horizon after each first motion.
+    """A continuation to the horizon after each first motion.
 
     motions [M, T - t]: row m begins with motion m; indices into `Robot.motions`. poses [M, T - t, 3]: after
     each. preferred: the motion pi_phi itself takes at x_t.
@@ -63,11 +63,16 @@ class Proposer(Protocol):
 class Policy:
     """A DQN's greedy policy pi_phi(x, t) = argmax_a Q(x, a, t), with the formula's progress in its
     observation.
+
+    After the motion it prefers it proposes its own rollout; after another, to undo it and go the same way if
+    that satisfies the formula, else its own rollout too. literal: its own rollout after every motion, as in
+    the paper: slower, and J is less often 1.
     """
 
     task: Task
     card: Card
     network: Network
+    literal: bool = False
 
     @property
     def id(self) -> str:
@@ -78,21 +83,23 @@ class Policy:
         body, rules = make_body(self.task.robot, self.task.grid), make_rules(self.task)
         return body, rules, make_sight(self.task, rules, body)
 
+    @cached_property
+    def _undoing(self) -> NDArray[np.int64]:
+        return undoing_motions(self.task.robot)
+
     def propose(
         self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
     ) -> Proposal:
         body, rules, sight = self._prepared
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
-        t, wait = len(history) - 1, wait_motion(self.task.robot)
-        status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
-        replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
+        t = len(history) - 1
         motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
         poses = np.empty((*motions.shape, 3))
-        args = (body, rules, sight, self.network, history[-1], t, status, run)
-        rollout_all(*args, wait, motions, poses)
-        one = np.empty(1, np.int64)
-        rollout(*args, -1, wait, one, np.empty((1, 3)))
-        return Proposal(motions, poses, int(one[0]))
+        preferred = propose_all(
+            body, rules, sight, self.network, history, signal_rows(self.task, signals, t + 1),
+            wait_motion(self.task.robot), self._undoing, self.literal, motions, poses,
+        )  # fmt: skip
+        return Proposal(motions, poses, preferred)
 
     def weights(self) -> bytes:
         """The safetensors file."""
@@ -102,6 +109,24 @@ class Policy:
 def wait_motion(robot: Robot) -> int:
     """The motion that leaves the pose as it is, -1 where the robot cannot stand still."""
     return robot.motions.index((0.0, 0.0)) if (0.0, 0.0) in robot.motions else -1
+
+
+def undoing_motions(robot: Robot) -> NDArray[np.int64]:
+    """The motions that undo each of the robot's, in free space: (M, 2), one after the other, -1: no more is
+    needed; -2 where two do not.
+    """
+
+    def find(translate: float, rotate: float) -> int:
+        if translate == rotate == 0.0:
+            return -1
+        gaps = [max(abs(d - translate), abs(a - rotate)) for d, a in robot.motions]
+        return int(np.argmin(gaps)) if min(gaps) < 1e-9 else -2
+
+    rows = []
+    for translate, rotate in robot.motions:  # which goes, then turns
+        back = [m for m in (find(0.0, -rotate), find(-translate, 0.0)) if m != -1]
+        rows.append((*back, -1, -1)[:2] if -2 not in back else (-2, -2))
+    return np.array(rows, np.int64).reshape(-1, 2)
 
 
 def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:

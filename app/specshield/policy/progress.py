@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import FragmentError
 from specshield.stl import Obligation, obligations
 from specshield.stl.program import STACK_SIZE, compile_predicate, evaluate_packed, pack
@@ -97,7 +97,7 @@ def value_count(rules: Rules) -> int:
     return int(3 + rules.region_starts.shape[0] - 1 + rules.signals.shape[0])
 
 
-@leaf
+@inlined
 def read_values(rules: Rules, x: float, y: float, theta: float, values: NDArray[np.float64]) -> None:
     """What the predicates read at a pose, into `values`, shape (value_count,)."""
     values[0], values[1], values[2] = x, y, theta

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import leaf
+from specshield.compiled import inlined, leaf
 from specshield.robot.actions import Robot
 from specshield.world.occupancy import OccupancyGrid
 
@@ -66,7 +66,7 @@ def make_body(robot: Robot, grid: OccupancyGrid) -> Body:
     )
 
 
-@leaf
+@inlined
 def wrap(theta: float) -> float:
     """The angle in (-pi, pi]."""
     if -math.pi < theta <= math.pi:
@@ -76,7 +76,7 @@ def wrap(theta: float) -> float:
     return theta if -math.pi < theta <= math.pi else math.pi
 
 
-@leaf
+@inlined
 def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
     """The footprint's centre in grid metres: along the grid's columns and rows from its lower-left corner."""
     c, s = math.cos(theta), math.sin(theta)
@@ -85,42 +85,47 @@ def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
     return body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
 
 
-@leaf
+@inlined
 def _is_occupied(body: Body, row: int, col: int) -> bool:
     if row < 0 or col < 0 or row >= body.occupied.shape[0] or col >= body.occupied.shape[1]:
         return True
     return bool(body.occupied[row, col] != 0)
 
 
-@leaf
+@inlined
 def _cell(body: Body, u: float, v: float) -> tuple[int, int]:
     """Row and column of a point (grid metres), held to the ring: one far off fits no integer."""
     h, (height, width) = body.resolution, body.occupied.shape
     return math.floor(min(max(v / h, -1.0), height)), math.floor(min(max(u / h, -1.0), width))
 
 
-@leaf
+@inlined
 def _rows(body: Body, low: float, high: float) -> tuple[int, int]:
     """The range of rows between two heights (grid metres), with the ring that stands for the outside."""
     h = body.resolution
     return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[0]) + 1
 
 
-@leaf
+@inlined
 def _columns(body: Body, low: float, high: float) -> tuple[int, int]:
     h = body.resolution
     return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[1]) + 1
 
 
-@leaf
-def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
-    """Whether the clearance field alone shows no obstacle within `distance` [m] of a point (grid metres)."""
+@inlined
+def _room(body: Body, u: float, v: float) -> float:
+    """How far around a point (grid metres) the clearance field alone shows it free [m]; -inf in an obstacle."""
     h = body.resolution
     row, col = _cell(body, u, v)
     if _is_occupied(body, row, col):
-        return False
-    off_centre = math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h)
-    return bool(body.clearance[row, col] - off_centre >= distance)
+        return -np.inf
+    return float(body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h))
+
+
+@inlined
+def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
+    """Whether the clearance field alone shows no obstacle within `distance` [m] of a point (grid metres)."""
+    return _room(body, u, v) >= distance
 
 
 @leaf
@@ -214,10 +219,14 @@ def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length:
             return np.inf
     eu, ev = u + length * du, v + length * dv
     left, right = _columns(body, min(u, eu) - r, max(u, eu) + r)
-    first = np.inf
+    first, reach = np.inf, r + 0.7072 * h  # to the centre of a square that the disc may touch
     for j in range(*_rows(body, min(v, ev) - r, max(v, ev) + r)):
         for i in range(left, right):
             if not _is_occupied(body, j, i):
+                continue
+            su, sv = (i + 0.5) * h - u, (j + 0.5) * h - v  # most are out of reach: the exact test is dear
+            nearest = min(max(su * du + sv * dv, 0.0), length)
+            if (su - nearest * du) ** 2 + (sv - nearest * dv) ** 2 > reach * reach:
                 continue
             u0, u1, v0, v1 = i * h, (i + 1) * h, j * h, (j + 1) * h
             # A disc meets a square where its centre meets the square grown by r: two boxes and four discs.
@@ -293,10 +302,39 @@ def _can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> boo
 @leaf
 def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[float, float, float]:
     """f: the pose after one motion (an index into `Robot.motions`). theta in and out in (-pi, pi]."""
+    if _reach(body, motion) <= _room(body, *centre(body, x, y, theta)):
+        return _unhindered(body, x, y, theta, math.cos(theta), math.sin(theta), motion)
+    distance = body.translate[motion]
+    moved = _move(body, x, y, theta, distance) if distance != 0.0 else 0.0
+    return _end(body, x, y, theta, motion, moved)
+
+
+@inlined
+def _reach(body: Body, motion: int) -> float:
+    """How far around the footprint's centre [m] a motion can reach, with room to spare for rounding."""
+    # A turn takes the centre no farther than its offset times the angle, or twice its offset.
+    swing = math.sqrt(body.offset_x**2 + body.offset_y**2) * min(abs(body.rotate[motion]), 2.0)
+    return float(body.radius + abs(body.translate[motion]) + swing + TOUCH)
+
+
+@inlined
+def _unhindered(
+    body: Body, x: float, y: float, theta: float, cos: float, sin: float, motion: int
+) -> tuple[float, float, float]:
+    """The pose after a motion that meets nothing."""
+    distance, angle = body.translate[motion], body.rotate[motion]
+    nx, ny = (x + distance * cos, y + distance * sin) if distance != 0.0 else (x, y)
+    return nx, ny, wrap(theta + angle) if angle != 0.0 else theta
+
+
+@leaf
+def _end(
+    body: Body, x: float, y: float, theta: float, motion: int, moved: float
+) -> tuple[float, float, float]:
+    """The pose after a motion whose way is free for `moved` of its distance."""
     distance, angle = body.translate[motion], body.rotate[motion]
     nx, ny = x, y
     if distance != 0.0:
-        moved = _move(body, x, y, theta, distance)
         if moved != distance and not body.stop:
             return x, y, theta
         nx, ny = x + moved * math.cos(theta), y + moved * math.sin(theta)
@@ -320,12 +358,22 @@ def simulate(
         out[k, 0], out[k, 1], out[k, 2] = x, y, theta
 
 
-@leaf
+@inlined
 def successors(body: Body, pose: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """The pose after each motion. pose (3,), out (M, 3)."""
+    """The pose after each motion: `step`, with what the motions share done once. pose (3,), out (M, 3)."""
+    x, y, theta = pose[0], pose[1], pose[2]
+    cos, sin = math.cos(theta), math.sin(theta)
+    room = _room(body, *centre(body, x, y, theta))
+    last, moved = 0.0, 0.0
     for motion in range(body.translate.shape[0]):
-        x, y, theta = step(body, pose[0], pose[1], pose[2], motion)
-        out[motion, 0], out[motion, 1], out[motion, 2] = x, y, theta
+        if _reach(body, motion) <= room:
+            nx, ny, nth = _unhindered(body, x, y, theta, cos, sin, motion)
+        else:
+            distance = body.translate[motion]
+            if distance != 0.0 and distance != last:
+                last, moved = distance, _move(body, x, y, theta, distance)
+            nx, ny, nth = _end(body, x, y, theta, motion, moved)
+        out[motion, 0], out[motion, 1], out[motion, 2] = nx, ny, nth
 
 
 @leaf

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel
 from specshield.errors import FormulaError, FragmentError
 from specshield.stl.formula import (
     Abs,
@@ -110,7 +110,7 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
             raise FragmentError(problem, got=str(node), expected=expected)
 
 
-@leaf
+@inlined
 def _run(
     ops: NDArray[np.int64],
     args: NDArray[np.float64],
@@ -161,7 +161,7 @@ def evaluate(ops: NDArray[np.int64], args: NDArray[np.float64], values: NDArray[
     return _run(ops, args, 0, len(ops), values, np.empty(STACK_SIZE))
 
 
-@leaf
+@inlined
 def evaluate_packed(
     k: int,
     ops: NDArray[np.int64],

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import MapError
 from specshield.world import checks
 from specshield.world.simple import crossing_edges
@@ -140,7 +140,7 @@ def pack_regions(regions: Sequence[Region]) -> PackedRegions:
     )
 
 
-@leaf
+@inlined
 def region_distance(
     i: int,
     starts: NDArray[np.int64],
