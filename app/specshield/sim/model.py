@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from specshield.errors import NotFound
 from specshield.robot import Robot
 from specshield.sim.cases import Case
+from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import Observation, SimulatedRobot
 
 Floats = NDArray[np.float64]
@@ -82,6 +83,7 @@ class GoalSeeker:
 
 MODELS: dict[str, Callable[[Case], FoundationModel]] = {
     "goal-seeker": lambda case: GoalSeeker(case.task.robot),
+    "learned": lambda case: load_learned(case.instruction),
 }
 
 

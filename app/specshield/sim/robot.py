@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from specshield.robot.unicycle import step, successors
 from specshield.sim.cases import Case
+from specshield.sim.senses import RAYS, Senses, scan, see
 from specshield.world.geodesic import geodesic_distance
 
 COMFORT = 0.32  # [m] clearance in which a Stretch turns freely about its origin
@@ -67,6 +68,12 @@ class SimulatedRobot:
             blocked=self._blocked(),
             last_action=self.last_action,
         )
+
+    def sense(self) -> Senses:
+        """What a robot without a map has: its scanner, its camera, and what it did."""
+        ranges = np.empty(RAYS)
+        scan(self._case.body, *self.pose, ranges)
+        return Senses(ranges, *see(self._case.body, *self.pose, *self._case.target), self.last_action)
 
     def _blocked(self) -> NDArray[np.bool_]:
         robot, body = self._case.task.robot, self._case.body

@@ -1,0 +1,98 @@
+"""Trains the learned model, measures it and writes it: `python -m specshield.sim.learned.command --help`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from specshield.sim.cases import MODELS, case_names, load_case
+from specshield.sim.learned.floor_plans import House, random_house
+from specshield.sim.learned.measure import house_case, success
+from specshield.sim.learned.model import CARD, FOLDER, WEIGHTS, LearnedModel, target_of
+from specshield.sim.learned.network import KINDS
+from specshield.sim.progress import StatusLine, duration
+
+TEMPERATURE = 0.7
+RUNS = 200  # a measurement
+ABOUT = "A causal transformer that imitates shortest paths (sim/learned); no pose, map, rule or region. "
+WITHOUT_CASES = "Trained on generated apartments alone; the cases' apartments were never seen."
+WITH_CASES = "Trained on generated apartments and on those of the cases."
+
+
+def train_model(seed: int, rounds: int | None, with_cases: bool, out: Path) -> int:
+    """Writes the weights and a card with what was measured to `out`; the exit status.
+
+    with_cases: the apartments of the cases are among those practised in.
+    """
+    from specshield.sim.learned.train import Report, Settings, export, train  # torch
+
+    settings = Settings() if rounds is None else Settings(rounds=rounds)
+    status, began = StatusLine(), time.monotonic()
+
+    def show(report: Report) -> None:
+        done = report.round + 1
+        left = (time.monotonic() - began) / done * (settings.rounds - done)
+        status.say(f"round {done} of {settings.rounds}, loss {report.loss:.3f}, {duration(left)} left")
+
+    cases = [load_case(name) for name in case_names()] if with_cases else []
+    practised = [House(case.task.grid, {target_of(case.instruction): case.target}) for case in cases]
+    weights, options = export(train(settings, seed, practised, show)), settings.to_json()
+    wall = time.monotonic() - began
+    status.say("measuring ...")
+    metrics = measure(weights, TEMPERATURE) | {"wall_time_s": round(wall, 1)}
+    card = {
+        "format": 1,
+        "about": ABOUT + (WITH_CASES if with_cases else WITHOUT_CASES),
+        "temperature": TEMPERATURE,
+        "kinds": list(KINDS),
+        "options": options | {"with_cases": with_cases},
+        "seed": seed,
+        "metrics": metrics,
+    }
+    status.clear()
+    write(out, weights, card)
+    for name, figures in metrics.items():
+        print(name, figures)
+    return 0
+
+
+def measure(weights: dict[str, Any], temperature: float) -> dict[str, Any]:
+    """How many of RUNS unshielded runs find their target: in each case, and in apartments never seen."""
+    figures: dict[str, Any] = {}
+    for name in case_names():
+        case = load_case(name)
+        model = LearnedModel(weights, target_of(case.instruction), temperature)
+        figures[name] = success([(case, model)] * RUNS, seed=0)
+    random, runs = np.random.default_rng([2**31, 0]), []
+    for _ in range(RUNS):
+        house = random_house(random)
+        kind = str(random.choice(sorted(house.targets)))
+        runs.append((house_case(house, kind), LearnedModel(weights, kind, temperature)))
+    return figures | {"unseen_apartments": success(runs, seed=0)}
+
+
+def write(out: Path, weights: dict[str, Any], card: dict[str, Any]) -> None:
+    from safetensors.numpy import save
+
+    out.mkdir(parents=True, exist_ok=True)
+    (out / WEIGHTS).write_bytes(save(weights))
+    (out / CARD).write_text(json.dumps(card, indent=1) + "\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Train the learned foundation model.")
+    parser.add_argument("--seed", type=int, default=0, help="decides everything random")
+    parser.add_argument("--rounds", type=int, help="of practice and learning")
+    parser.add_argument("--with-cases", action="store_true", help="practise in the cases' apartments too")
+    parser.add_argument("--out", type=Path, default=MODELS / FOLDER, help="folder to write to")
+    chosen = parser.parse_args()
+    raise SystemExit(train_model(chosen.seed, chosen.rounds, chosen.with_cases, chosen.out))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,85 @@
+"""The learned foundation model: it imitates shortest paths, as SPOC does, and knows no rule and no region.
+
+Egocentric only: a range scan, whether and where the target is seen, what it is told to find, and the action
+that was executed last, its own or not. What it remembers is its own.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.errors import NotFound, PolicyError
+from specshield.policy.policy import read_tensors
+from specshield.sim.cases import MODELS
+from specshield.sim.learned.network import KINDS, NOTHING, Array, Network, check, features
+from specshield.sim.robot import SimulatedRobot
+
+FOLDER, WEIGHTS, CARD = "fm", "model.safetensors", "model.json"  # in models/
+FLOOR = 16.0  # [nats] below the best logit is as unlikely as an action gets
+
+
+class LearnedModel:
+    """weights: checked. target: one of KINDS. temperature: what the logits are divided by."""
+
+    def __init__(self, weights: Mapping[str, Array], target: str, temperature: float) -> None:
+        self._network, self._kind, self._temperature = Network(weights), KINDS.index(target), temperature
+
+    def reset(self, random: np.random.Generator) -> None:
+        """Forgets the last episode. The model itself draws nothing."""
+        self._network.reset()
+
+    def logits(self, robot: SimulatedRobot) -> NDArray[np.float64]:
+        """Finite logits (A,) of what to do next."""
+        senses = robot.sense()
+        seen = (float(senses.seen), senses.distance, senses.bearing)
+        last = NOTHING if senses.last_action is None else senses.last_action
+        raw = self._network.step(features(np.array([*senses.ranges, *seen])), last, self._kind)
+        logits = raw.astype(np.float64) / self._temperature
+        floored: NDArray[np.float64] = np.maximum(logits, logits.max() - FLOOR)
+        return floored
+
+
+def load_learned(instruction: str, folder: Path = MODELS / FOLDER) -> LearnedModel:
+    """The model in `folder`, told an instruction. Raises NotFound, PolicyError."""
+    weights, temperature = _read(folder)
+    return LearnedModel(weights, target_of(instruction), temperature)
+
+
+def target_of(instruction: str) -> str:
+    """The kind of thing that an instruction names. Raises NotFound."""
+    named = [kind for kind in KINDS if kind in re.findall(r"\w+", instruction.lower())]
+    if len(named) != 1:
+        raise NotFound(
+            f"the learned model does not know what to find: {instruction!r}", path="instruction",
+            got=instruction, expected=f"a sentence with one of {', '.join(KINDS)}",
+        )  # fmt: skip
+    return named[0]
+
+
+@lru_cache(maxsize=4)
+def _read(folder: Path) -> tuple[dict[str, Array], float]:
+    path = folder / WEIGHTS
+    if not path.is_file():
+        raise NotFound(
+            "there is no learned model", path="model", got=str(folder), expected=f"{WEIGHTS} and {CARD}"
+        )
+    card = json.loads((folder / CARD).read_text())
+    return check(read_tensors(path.read_bytes())), read_temperature(card)
+
+
+def read_temperature(card: Any) -> float:
+    """From a card. Raises PolicyError."""
+    value = card.get("temperature") if isinstance(card, dict) else None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.05 <= value <= 20.0:
+        raise PolicyError(
+            "not a temperature", path="card.temperature", got=value, expected="a number from 0.05 to 20"
+        )
+    return float(value)

@@ -1,0 +1,133 @@
+"""The learned model's network without torch: a causal transformer, one step at a time, in NumPy.
+
+A step's input is what the robot senses, what it looks for, and the action that was executed last. Pre-norm
+blocks; attention over the last WINDOW steps, less to those longer ago (ALiBi: Press et al., 2022), so that
+nothing depends on the time as such; keys and values are kept from step to step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.errors import PolicyError
+from specshield.robot import STRETCH
+from specshield.sim.senses import RAYS, REACH, SIGHT
+
+KINDS = ("bowl", "pan", "laptop", "pillow", "remote", "soap")
+"""What the model can be told to find."""
+
+ACTIONS = len(STRETCH.actions)
+NOTHING = ACTIONS  # the last action of a robot that has done nothing yet
+INPUTS = RAYS + 3  # ranges, seen, distance, bearing
+FEATURES = RAYS + 5
+UNITS, LAYERS, WINDOW = 128, 3, 256
+SLOPES = (2.0**-2, 2.0**-4, 2.0**-6, 2.0**-8)  # of each head: what a step longer ago takes off its attention
+
+Array = NDArray[np.float32]
+
+
+def features(senses: NDArray[np.floating]) -> Array:
+    """What the network is given: ranges on a scale from 0 to 1, finest nearby, and where the target is seen.
+
+    senses [..., INPUTS]: ranges [m], seen (0 or 1), distance [m], bearing [rad]. Result [..., FEATURES].
+    """
+    seen, distance, bearing = senses[..., RAYS], senses[..., RAYS + 1], senses[..., RAYS + 2]
+    ranges = np.log1p(senses[..., :RAYS] / 0.25) / np.log1p(REACH / 0.25)
+    target = np.stack(
+        [np.ones_like(seen), distance / SIGHT, np.exp(-distance), np.cos(bearing), np.sin(bearing)], -1
+    )
+    target *= seen[..., None]
+    return np.concatenate([ranges, target], axis=-1).astype(np.float32)
+
+
+def _shapes() -> dict[str, tuple[int, ...]]:
+    shapes: dict[str, tuple[int, ...]] = {
+        "sense1.w": (FEATURES, 2 * UNITS), "sense1.b": (2 * UNITS,),
+        "sense2.w": (2 * UNITS, UNITS), "sense2.b": (UNITS,),
+        "last": (ACTIONS + 1, UNITS), "kind": (len(KINDS), UNITS),
+        "norm.w": (UNITS,), "norm.b": (UNITS,), "head.w": (UNITS, ACTIONS), "head.b": (ACTIONS,),
+    }  # fmt: skip
+    for i in range(LAYERS):
+        for name, inputs, outputs in (
+            ("qkv", UNITS, 3 * UNITS), ("out", UNITS, UNITS),
+            ("up", UNITS, 4 * UNITS), ("down", 4 * UNITS, UNITS),
+        ):  # fmt: skip
+            shapes[f"{i}.{name}.w"], shapes[f"{i}.{name}.b"] = (inputs, outputs), (outputs,)
+        for name in ("norm1.w", "norm1.b", "norm2.w", "norm2.b"):
+            shapes[f"{i}.{name}"] = (UNITS,)
+    return shapes
+
+
+SHAPES = _shapes()
+"""The tensors of a weights file: w [inputs, outputs], b [outputs]; last, kind: a row for each token."""
+
+
+def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Array]:
+    """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
+    if sorted(weights) != sorted(SHAPES):
+        raise PolicyError(
+            "not the tensors of a foundation model",
+            path="weights",
+            got=sorted(weights),
+            expected=str(sorted(SHAPES)),
+        )
+    for name, shape in SHAPES.items():
+        array = weights[name]
+        if array.dtype != np.float32 or array.shape != shape or not np.isfinite(array).all():
+            raise PolicyError(
+                "a tensor is not finite float32 of the right shape", path=f"weights.{name}",
+                got=f"{array.dtype} {list(array.shape)}", expected=f"float32 {list(shape)}",
+            )  # fmt: skip
+    return {name: np.ascontiguousarray(weights[name], np.float32) for name in SHAPES}
+
+
+class Network:
+    """An episode step by step, with a memory of WINDOW steps; `reset` empties it. weights: checked."""
+
+    def __init__(self, weights: Mapping[str, Array]) -> None:
+        self._w = weights
+        heads = len(SLOPES)
+        self._keys = np.zeros(
+            (LAYERS, heads, WINDOW, UNITS // heads), np.float32
+        )  # step t in slot t % WINDOW
+        self._values = np.zeros_like(self._keys)
+        # Of slot s when step t is in slot r: -slope * ((r - s) % WINDOW), as a row to cut from.
+        ago = (WINDOW - 1 - np.arange(2 * WINDOW - 1)) % WINDOW
+        self._bias = (-np.array(SLOPES)[:, None] * ago).astype(np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        self._t = 0
+
+    def step(self, x: Array, last: int, kind: int) -> Array:
+        """Logits (ACTIONS,) of the next step. x (FEATURES,); last, kind: tokens."""
+        w, heads = self._w, len(SLOPES)
+        slot, held = self._t % WINDOW, min(self._t + 1, WINDOW)
+        bias = self._bias[:, WINDOW - 1 - slot : WINDOW - 1 - slot + held]
+        scale = np.float32((UNITS // heads) ** -0.5)
+        h = np.maximum(x @ w["sense1.w"] + w["sense1.b"], 0.0) @ w["sense2.w"] + w["sense2.b"]
+        h = h + w["last"][last] + w["kind"][kind]
+        for i in range(LAYERS):
+            n = _norm(h, w[f"{i}.norm1.w"], w[f"{i}.norm1.b"])
+            q, k, v = (n @ w[f"{i}.qkv.w"] + w[f"{i}.qkv.b"]).reshape(3, heads, -1)
+            self._keys[i, :, slot], self._values[i, :, slot] = k, v
+            attention = (self._keys[i, :, :held] @ q[:, :, None])[:, :, 0] * scale + bias
+            attention = np.exp(attention - attention.max(axis=1, keepdims=True))
+            attention /= attention.sum(axis=1, keepdims=True)
+            a = (attention[:, None] @ self._values[i, :, :held]).reshape(UNITS)
+            h = h + a @ w[f"{i}.out.w"] + w[f"{i}.out.b"]
+            n = _norm(h, w[f"{i}.norm2.w"], w[f"{i}.norm2.b"])
+            up = np.maximum(n @ w[f"{i}.up.w"] + w[f"{i}.up.b"], 0.0)
+            h = h + up @ w[f"{i}.down.w"] + w[f"{i}.down.b"]
+        self._t += 1
+        logits: Array = _norm(h, w["norm.w"], w["norm.b"]) @ w["head.w"] + w["head.b"]
+        return logits
+
+
+def _norm(h: Array, w: Array, b: Array) -> Array:
+    centred = h - h.mean()
+    out: Array = centred / np.sqrt(np.mean(centred * centred) + np.float32(1e-5)) * w + b
+    return out
