@@ -119,9 +119,9 @@ def _decisions(here: Figures) -> Iterator[str]:
     found = here["agreement"]
     yield ""
     yield (
-        f"J of (a) and (b) against (c) with pi_phi's own rollout after every motion: {found['pairs']} pairs of "
-        f"state and action, {found['satisfied']} with J = 1; {found['differ']} differ; {found['parted']} "
-        f"rollouts parted; rho elsewhere within {found['rho']:.0e} m. As timed, (c) finds {found['more']} more."
+        f"J of (a) and (b) against (c) with pi_phi's own rollout after every motion: {found['pairs']} pairs "
+        f"of state and action, {found['satisfied']} with J = 1; {found['differ']} differ; {found['parted']} "
+        f"rollouts parted; rho elsewhere within {found['rho']:.0e} m. (c) as timed has {found['more']} more."
     )
 
 

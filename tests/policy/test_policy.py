@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,11 +15,20 @@ from specshield.policy.dqn import _QNetwork
 from specshield.policy.environment import Environment, free_poses
 from specshield.policy.load import load_policy
 from specshield.policy.network import greedy, make_network
-from specshield.policy.policy import policy_id, wait_motion
-from specshield.policy.progress import BROKEN, SETTLED, make_rules, replay
+from specshield.policy.observation import PER_MOTION, observation_size, observe
+from specshield.policy.policy import policy_id, undoing_motions, wait_motion
+from specshield.policy.progress import (
+    BROKEN,
+    SETTLED,
+    STACK,
+    make_rules,
+    read_predicates,
+    replay,
+    value_count,
+)
 from specshield.policy.rollout import rollout
-from specshield.robot import STRETCH
-from specshield.robot.unicycle import in_collision, make_body, simulate, step
+from specshield.robot import STRETCH, Action, Robot
+from specshield.robot.unicycle import in_collision, make_body, simulate, step, successors
 from specshield.stl import robustness
 
 BOTH = pytest.mark.parametrize("robot", [STRETCH, CUSTOM], ids=["stretch", "custom"])
@@ -193,6 +205,73 @@ def test_proposals_are_exact_simulations_and_never_differ(robot):
         onward = policy.propose(history, {}, 0.0)
         assert onward.preferred == following[1]
         assert (onward.motions[onward.preferred] == following[1:]).all()
+
+
+def test_what_undoes_a_motion():
+    assert [m for m, _ in undoing_motions(STRETCH)] == [3, 2, 1, 0, -1, 6, 5]
+    assert undoing_motions(CUSTOM).tolist() == [[-2, -2]] * 3  # it never goes back
+    moves = [(0.0, 0.0), (0.1, 0.4), (-0.1, 0.0), (0.0, -0.4), (0.0, math.pi)]
+    robot = Robot(
+        "arc", 0.1, (0.0, 0.0), "stop", tuple(Action(f"a{m}", *move) for m, move in enumerate(moves))
+    )
+    assert undoing_motions(robot).tolist() == [[-1, -1], [3, 2], [-2, -2], [-2, -2], [-2, -2]]
+
+
+def test_to_undo_a_motion_and_go_on_certifies_no_less_than_the_policy_itself():
+    task = flat("F[1,12] West and G[0,12] not Hole")
+    body, retraced, more = make_body(STRETCH, task.grid), 0, 0
+    starts = free_poses(task, body, 400, np.random.default_rng(0))
+    for i, pose in enumerate(starts[task.samples(starts)["West"] > -0.2]):
+        policy = random_policy(task, i)
+        literal = replace(policy, literal=True).propose(pose[None], {}, 0.0)
+        proposal = policy.propose(pose[None], {}, 0.0)
+        own = (proposal.motions == literal.motions).all(axis=1)
+        assert proposal.preferred == literal.preferred
+        assert own[proposal.preferred]
+        rho = [
+            robustness(task.formula, task.samples(np.insert(poses, 0, pose, axis=1)))
+            for poses in (literal.poses, proposal.poses)
+        ]
+        assert (rho[1][~own] > 0.0).all()  # what is not the policy's own rollout satisfies
+        assert (rho[1][own] == rho[0][own]).all()
+        retraced, more = retraced + (~own).sum(), more + (rho[0][~own] <= 0.0).sum()
+        for motions, poses in zip(proposal.motions, proposal.poses, strict=True):
+            exact = np.empty_like(poses)
+            simulate(body, pose, motions, exact)
+            assert (poses == exact).all()
+    assert retraced > 50
+    assert more > 10
+
+
+@BOTH
+def test_what_is_seen_of_one_motion_does_not_depend_on_the_others(robot):
+    """Motions share work where they can: each alone, on the same states, looks the same bit for bit."""
+    task = flat("F[0,30] West and G[0,40] not Hole and G[5,40] theta < 3", robot=robot)
+    body, rules, sight = random_policy(task)._prepared
+    kinds, values, stack = len(rules.kind), np.empty(value_count(rules)), np.empty(STACK)
+    status, run, predicates, after = (
+        np.zeros(kinds, np.int8),
+        np.zeros(kinds, np.int64),
+        *np.empty((2, kinds)),
+    )
+
+    def seen(part, t, pose):
+        nexts = np.empty((len(part.translate), 3))
+        out = np.full(observation_size(rules, part), np.nan, np.float32)
+        successors(part, pose, nexts)
+        read_predicates(rules, *pose, values, stack, predicates)
+        observe(part, rules, sight, t, pose, status, run, predicates, nexts, values, stack, after, out)
+        return out
+
+    for t, pose in enumerate(free_poses(task, body, 40, np.random.default_rng(3))):
+        together = seen(body, t, pose)
+        assert together.min() < 0.0
+        common = len(together) - PER_MOTION * len(body.translate)
+        for m in range(len(body.translate)):
+            part = body._replace(translate=body.translate[m : m + 1], rotate=body.rotate[m : m + 1])
+            alone = seen(part, t, pose)
+            at = common + PER_MOTION * m
+            assert (alone == np.delete(together, np.r_[common:at, at + PER_MOTION : len(together)])).all()
 
 
 def test_a_rollout_reports_what_the_robustness_says():

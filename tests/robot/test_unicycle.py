@@ -10,6 +10,7 @@ from tests.oracles.disc import DiscWorld
 
 from specshield.robot import STRETCH, Action, Robot
 from specshield.robot.unicycle import in_collision, make_body, overlap, simulate, step, successors, wrap
+from specshield.sim.cases import case_names, load_case
 from specshield.world.occupancy import OccupancyGrid
 
 TOUCH = 2e-6
@@ -288,6 +289,34 @@ def test_from_inside_an_obstacle_it_gets_out_and_never_deeper():
                 slack = 0.25 * grid.resolution  # looked at every quarter cell
                 assert turned > before - 1e-6
                 assert robot.motions[motion][1] != 0.0 or straight.min() > before - slack
+
+
+def test_every_shortcut_is_the_search_for_contact_bit_for_bit():
+    """Without its clearance field a body searches for contact always; what motions share is no other pose."""
+    free = held = 0
+    cases = [(case.task.grid, STRETCH) for case in map(load_case, case_names())]
+    worlds = [(grid, robot) for _, grid, robot, _ in random_worlds(seed=6, count=25)]
+    random = np.random.default_rng(7)
+    for grid, robot in worlds + 12 * cases:
+        body = make_body(robot, grid)
+        searching = body._replace(clearance=np.zeros_like(body.clearance))
+        nexts, searched = np.empty((2, len(robot.motions), 3))
+        for pose in poses_in(random, grid, 40):
+            successors(body, pose, nexts)
+            successors(searching, pose, searched)
+            steps = [step(body, *pose, m) for m in range(len(robot.motions))]
+            alone = [step(searching, *pose, m) for m in range(len(robot.motions))]
+            assert (
+                nexts.tobytes()
+                == searched.tobytes()
+                == np.array(steps).tobytes()
+                == np.array(alone).tobytes()
+            )
+            for (translate, rotate), (x, y, theta) in zip(robot.motions, nexts, strict=True):
+                moved = math.hypot(x - pose[0], y - pose[1]) > abs(translate) - 1e-9
+                whole = moved and (rotate == 0.0 or theta != pose[2])
+                free, held = free + whole, held + (not whole)
+    assert min(free, held) > 1000
 
 
 def test_simulate_is_step_after_step():

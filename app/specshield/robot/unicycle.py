@@ -114,7 +114,7 @@ def _columns(body: Body, low: float, high: float) -> tuple[int, int]:
 
 @inlined
 def _room(body: Body, u: float, v: float) -> float:
-    """How far around a point (grid metres) the clearance field alone shows it free [m]; -inf in an obstacle."""
+    """How far around a point (grid metres) the clearance field alone shows it free [m]; -inf inside one."""
     h = body.resolution
     row, col = _cell(body, u, v)
     if _is_occupied(body, row, col):
