@@ -54,25 +54,67 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     assert "starting the service" in done.stderr
 
 
+def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path):
+    arguments = ["evaluate", "--case", "1", "--runs", "2", "--methods", "unmodified,ours"]
+    arguments += ["--processes", "1", "--out", str(tmp_path)]
+    done = specshield(*arguments)
+    assert "case1, none, model " in done.stdout
+    (row,) = (line for line in done.stdout.splitlines() if line.startswith("| ours |"))
+    assert "2 of 2 (15.8 to 100.0 %)" in row
+    folder = tmp_path / "case1" / "none"
+    names = ["experiment.json", "results.json", "runs.jsonl", "table.md"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    kept = (folder / "runs.jsonl").read_text()
+    figures = json.loads(specshield(*arguments, "--json").stdout)
+    assert (folder / "runs.jsonl").read_text() == kept
+    assert [one["satisfied"]["count"] for one in figures["methods"]] == [0, 2]
+    assert [record["run"] for record in figures["records"]] == [0, 0, 1, 1]
+
+
+def test_report_writes_a_page_and_its_pictures(tmp_path):
+    pytest.importorskip("matplotlib")
+    arguments = ["--runs", "2", "--processes", "1", "--out", str(tmp_path / "results")]
+    specshield("evaluate", "--case", "2", "--methods", "unmodified,simplex", *arguments)
+    specshield("evaluate", "--case", "2", "--methods", "ours@conformal/4", "--noise", "gaussian", *arguments)
+    page = tmp_path / "page.md"
+    specshield("report", str(tmp_path / "results"), "--out", str(page))
+    text = page.read_text()
+    assert "| case2 | unmodified | 0 % | 99 % | 0 % | 100 % |" in text
+    assert "| gaussian | ours@0.0" in text
+    assert "it covered every step of" in text
+    for name in ("ways", "robustness", "mass", "modes"):
+        assert f"![{name} of case2](page/case2/{name}.png)" in text
+        assert (tmp_path / "page" / "case2" / f"{name}.png").stat().st_size > 10_000
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_command_that_is_stopped_leaves_nothing_running(how):
-    command = subprocess.Popen(
-        [*SPECSHIELD, "evaluate", "--case", "case1", "--runs", "500", "--json"],
+@pytest.mark.parametrize("command", ["demo", "evaluate"])
+def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path):
+    arguments = {
+        "demo": ["demo", "--out", str(tmp_path)],
+        "evaluate": ["evaluate", "--case", "case1", "--methods", "ours", "--processes", "2"],
+    }[command]
+    running = subprocess.Popen(
+        [*SPECSHIELD, *arguments, "--runs", "500"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
     try:
-        until(lambda: children(command.pid))
-        (server,) = children(command.pid)
-        until(lambda: children(server))  # the store's keeper
-        (keeper,) = children(server)
-        os.kill(command.pid, how)
-        assert command.wait(60) != 0
-        until(lambda: gone(server) and gone(keeper), 30.0)
+        if command == "demo":
+            until(lambda: children(running.pid))
+            (server,) = children(running.pid)
+            until(lambda: children(server))  # the store's keeper
+            started = [server, *children(server)]
+        else:
+            until(lambda: len(children(running.pid)) >= 3)  # two workers and what tracks their semaphores
+            started = children(running.pid)
+        os.kill(running.pid, how)
+        assert running.wait(60) != 0
+        until(lambda: all(map(gone, started)), 30.0)
     finally:
-        command.kill()
+        running.kill()
 
 
 def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
@@ -13,7 +14,6 @@ from specshield.errors import InputError
 from specshield.sim import jobs
 from specshield.sim.experiment import Experiment
 from specshield.sim.runs import Record, run
-from specshield.sim.service import follow_parent
 
 Missing = Mapping[int, Sequence[str]]  # {run: methods}
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -55,7 +55,7 @@ def _over_processes(experiment: Experiment, missing: Missing, processes: int) ->
     """Each run in one of `processes` fresh processes, which end with this one, however it goes."""
     for name in THREADS:  # one thread each: the processes share the cores out
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), follow_parent)
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
     try:
         under_way: set[Future[list[Record]]] = {
             pool.submit(run, experiment, i, list(names)) for i, names in missing.items()
@@ -66,6 +66,18 @@ def _over_processes(experiment: Experiment, missing: Missing, processes: int) ->
                 yield future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A process that nobody waits for any more ends, whatever it is at."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]:

@@ -108,8 +108,7 @@ class Shielded:
     def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
         decision = decide(self._shield, history, logits, logits is None, carry=self._carry)
         self._carry = decision.carry if self._carries else None
-        distribution, mode = self._distribution(decision, logits, draw)
-        action = drawn(distribution, draw)
+        distribution, action, mode = self._chosen(decision, logits, draw)
         moves = decision.completion_action if self._shield.task.robot.terminal[action] else action
         return Answer(
             distribution=distribution,
@@ -124,24 +123,26 @@ class Shielded:
             robustness=None if moves is None else decision.robustness[moves],
         )
 
-    def _distribution(self, decision: Decision, logits: Floats | None, draw: float) -> tuple[Floats, str]:
-        return decision.distribution, decision.mode
+    def _chosen(self, decision: Decision, logits: Floats | None, draw: float) -> tuple[Floats, int, str]:
+        """The distribution, the action drawn and the mode."""
+        return decision.distribution, drawn(decision.distribution, draw), decision.mode
 
 
 class Simplex(Shielded):
     """The model's own action wherever that is feasible; all other mass on the certified continuation."""
 
-    def _distribution(self, decision: Decision, logits: Floats | None, draw: float) -> tuple[Floats, str]:
+    def _chosen(self, decision: Decision, logits: Floats | None, draw: float) -> tuple[Floats, int, str]:
         if logits is None or decision.completion_action is None:
-            return decision.distribution, decision.mode
+            return super()._chosen(decision, logits, draw)
         prior = np.exp(shaping.log_softmax(logits))
         kept = (np.array(decision.j_values) == 1.0) | self._shield.task.robot.terminal
         distribution = np.where(kept, prior, 0.0)
         distribution[decision.completion_action] += prior[~kept].sum()
-        own = bool(kept[drawn(prior, draw)])
-        if decision.mode != "shaped":
-            return distribution, decision.mode
-        return distribution, "shaped" if own else "switched"
+        own = drawn(prior, draw)
+        if kept[own]:
+            return distribution, own, decision.mode
+        mode = "switched" if decision.mode == "shaped" else decision.mode
+        return distribution, decision.completion_action, mode
 
 
 def drawn(distribution: Floats, draw: float) -> int:

@@ -75,9 +75,10 @@ def _sections(found: dict[Path, Results], drawn: dict[Path, list[Path]], page: P
     cases = {r["case"]: r for r in told.values() if r["experiment"]["house"] is None}
     yield "# Results"
     yield (
-        "Written by `specshield report`; every figure is from a campaign's `results.json`. Shares carry their "
-        "95 % Clopper-Pearson intervals. All methods share starts, model seeds, draws and disturbances, run by "
-        "run. The main task is done when the model says `end` within 1 m of its target before 600 steps."
+        "Written by `specshield report`; every figure is from a campaign's `results.json`. Shares carry "
+        "their 95 % Clopper-Pearson intervals. All methods share starts, model seeds, draws and "
+        "disturbances, run by run. The main task is done when the model says `end` within 1 m of its target "
+        "before 600 steps."
     )
     yield METHODS.format(alpha=ALPHA, beta=BETA)
     yield "## Beside the paper's Table II"

@@ -1,0 +1,156 @@
+"""Campaigns: the same records whichever process made them, and whether at once or in two goes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from redis import Redis
+from rq import Queue, Worker
+from rq.serializers import JSONSerializer
+from tests.oracles.judge import margin
+from tests.serving import wait_for
+
+from specshield.errors import InputError, NotFound, StoreError
+from specshield.service.embedded import EmbeddedStore
+from specshield.sim.cases import load_case
+from specshield.sim.evaluation import evaluate
+from specshield.sim.experiment import Experiment
+from specshield.sim.houses import HOUSES, RULE
+from specshield.sim.jobs import QUEUE
+from specshield.sim.runs import run
+
+EXPERIMENT = Experiment("case1", noise="gaussian", seed=5)
+METHODS = ["unmodified", "ours@0.03/8"]
+RUNS = 3
+
+
+def same(records):
+    """What has to be equal: all but the times."""
+    return [{name: v for name, v in r.to_json().items() if name != "decision_ms"} for r in records]
+
+
+@pytest.fixture(scope="module")
+def serial():
+    return evaluate(EXPERIMENT, RUNS, METHODS)
+
+
+def test_runs_share_all_but_the_method(serial):
+    assert [(r.run, r.method) for r in serial] == [(i, name) for i in range(RUNS) for name in METHODS]
+    for plain, shielded in zip(serial[::2], serial[1::2], strict=True):
+        assert (plain.seed, plain.start, plain.refused) == (shielded.seed, shielded.start, shielded.refused)
+        assert (plain.satisfied, shielded.satisfied) == (False, True)
+        assert plain.modes == {"prior": plain.steps + 1}
+        assert plain.kl == pytest.approx(0.0, abs=1e-9)
+    assert max(record.kl for record in serial[1::2]) > 1.0
+    assert len({record.seed for record in serial}) == RUNS
+
+
+def test_a_record_says_what_its_poses_say(serial):
+    case = load_case("case1")
+    for record in serial:
+        still = [record.poses[-1]] * (case.task.horizon + 1 - len(record.poses))
+        assert record.rho == pytest.approx(margin(case.spec, record.poses + still), abs=1e-3)
+        assert len(record.poses) == record.steps + 1
+        assert record.poses[0] == pytest.approx(record.start, abs=1e-4)
+        assert bool(record.broken) is not record.satisfied
+        assert len(record.mass) == len(record.certified) == sum(record.modes.values())
+        assert 0.01 < record.residual < 0.1
+        assert record.main_done
+        x, y, _ = record.poses[record.ended_at]
+        assert np.hypot(x - case.target[0], y - case.target[1]) < 1.0
+
+
+def test_processes_and_a_second_go_make_the_same_records(serial, tmp_path):
+    first = evaluate(EXPERIMENT, 1, METHODS[:1], tmp_path)
+    assert same(first) == same(serial[:1])
+    path = tmp_path / "runs.jsonl"
+    path.write_bytes(path.read_bytes() + b'{"run": 1, "method"')  # killed while it wrote
+    seen = []
+    again = evaluate(EXPERIMENT, RUNS, METHODS, tmp_path, processes=2, on_progress=seen.append)
+    assert same(again) == same(serial)
+    assert again[0].decision_ms == first[0].decision_ms  # kept, not made again
+    assert seen == [0, 1, 2, 3]
+    assert len(path.read_text().splitlines()) == RUNS * len(METHODS)
+    assert same(evaluate(EXPERIMENT, 2, METHODS, tmp_path)) == same(serial[:4])
+    with pytest.raises(InputError):
+        evaluate(Experiment("case1", seed=6), 1, METHODS, tmp_path)
+
+
+@pytest.fixture
+def redis(tmp_path):
+    store = EmbeddedStore(tmp_path)
+    store.join()
+    yield store.url
+    store.leave()
+
+
+def listening(url):
+    return Worker.all(queue=Queue(QUEUE, connection=Redis.from_url(url), serializer=JSONSerializer))
+
+
+def worker(url, folder):
+    return subprocess.Popen(
+        [sys.executable, "-m", "specshield.cli", "worker"],
+        env={**os.environ, "REDIS_URL": url, "SPECSHIELD_DATA_DIR": str(folder)},
+    )
+
+
+def test_workers_make_the_same_records_though_one_is_killed(serial, redis, tmp_path):
+    with pytest.raises(StoreError) as caught:
+        evaluate(EXPERIMENT, 1, METHODS, redis_url=redis)
+    assert "specshield worker" in caught.value.expected
+    process = worker(redis, tmp_path)
+    try:
+        with ThreadPoolExecutor() as threads:
+            wait_for(lambda: listening(redis), 60.0)
+            result = threads.submit(evaluate, EXPERIMENT, RUNS, METHODS, redis_url=redis)
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+            while not children.read_text().split():
+                assert process.poll() is None
+                assert not result.done(), result.exception()
+                time.sleep(0.01)
+            os.kill(int(children.read_text().split()[0]), signal.SIGKILL)
+            assert same(result.result(120.0)) == same(serial)
+    finally:
+        process.terminate()
+        process.wait(15.0)
+
+
+@pytest.mark.skipif(not HOUSES.is_dir(), reason=f"no houses in {HOUSES}")
+def test_a_house_is_a_case_like_another():
+    (record,) = run(Experiment("house", "house_14", seed=1), 0, ["ours"])
+    assert (record.satisfied, record.main_done) == (True, True)
+    case = Experiment("house", str(HOUSES / "house_14.json")).setting.case
+    assert (case.name, str(case.task.formula)) == ("house_14", RULE)
+    assert not case.task.grid.occupied[case.cell(case.target)]
+
+
+@pytest.mark.parametrize(
+    ("make", "path"),
+    [
+        (lambda: Experiment("house"), "house"),
+        (lambda: Experiment("case1", "house_0"), "house"),
+        (lambda: Experiment("case1", noise="fog"), "noise"),
+        (lambda: Experiment("house", "nowhere").setting, "house"),
+        (lambda: EXPERIMENT.setting.method("magic"), "methods"),
+        (lambda: EXPERIMENT.setting.method("ours@much"), "methods"),
+        (lambda: EXPERIMENT.setting.method("paper@0.1"), "methods"),
+        (lambda: EXPERIMENT.setting.method("ours@-1"), "margin"),
+    ],
+)
+def test_what_there_is_not_is_told(make, path):
+    with pytest.raises((InputError, NotFound)) as caught:
+        make()
+    assert caught.value.path == path
+    assert caught.value.expected
+
+
+def test_an_experiment_survives_json():
+    assert Experiment.from_json(json.loads(json.dumps(EXPERIMENT.to_json()))) == EXPERIMENT

@@ -1,0 +1,52 @@
+import pytest
+
+from specshield.sim.runs import Record
+from specshield.sim.statistics import clopper_pearson, summary
+
+
+@pytest.mark.parametrize(
+    ("k", "n", "low", "high"),
+    [
+        (0, 10, 0.0, 1 - 0.025 ** (1 / 10)),
+        (10, 10, 0.025 ** (1 / 10), 1.0),
+        (200, 200, 0.025 ** (1 / 200), 1.0),
+        (5, 10, 0.18708603, 0.81291397),
+        (1, 20, 0.00126509, 0.24873275),
+    ],
+)
+def test_intervals_are_clopper_and_pearsons(k, n, low, high):
+    assert clopper_pearson(k, n) == pytest.approx((low, high), abs=1e-7)
+
+
+def record(run, method="ours", **fields):
+    usual = {
+        "run": run, "method": method, "seed": run, "start": (0.0, 0.0, 0.0), "refused": 0, "satisfied": True,
+        "rho": 0.1, "main_done": True, "ended_at": 10, "broken": [], "steps": 10, "modes": {"shaped": 10},
+        "reasons": {}, "kl": 2.0, "asked": 10, "residual": 0.0, "mass": [1.0, None, 0.5],
+        "decision_ms": {"p50": 1.0, "p99": 2.0, "max": 3.0}, "certified": [], "poses": [],
+    }  # fmt: skip
+    return Record(**(usual | fields))
+
+
+def test_a_summary_pairs_the_runs_with_the_unmodified_ones():
+    plain = [
+        record(i, "unmodified", ended_at=e, main_done=d) for i, (e, d) in enumerate([(5, 1), (9, 1), (3, 0)])
+    ]
+    ours = [
+        record(0, ended_at=12, modes={"shaped": 3, "fallback": 1}, reasons={"infeasible": 1}),
+        record(1, ended_at=None, main_done=False, satisfied=False, broken=["F[0,3] A"], kl=5.0),
+        record(2, ended_at=4, residual=0.04),
+    ]
+    figures = summary("ours", ours, plain)
+    assert figures["satisfied"]["count"] == figures["main_done"]["count"] == 2
+    assert (figures["satisfied"]["low"], figures["satisfied"]["high"]) == pytest.approx(
+        (0.0943, 0.9916), abs=1e-4
+    )
+    assert figures["extra_steps"] == {"both": 1, "mean": 7.0, "median": 7.0}
+    assert (figures["never_ended"], figures["ended_elsewhere"]) == (1, 0)
+    assert figures["broken"] == {"F[0,3] A": 1}
+    assert figures["modes"] == {"shaped": 23, "fallback": 1}
+    assert figures["reasons"] == {"infeasible": 1}
+    assert (figures["kl"], figures["feasible_mass"], figures["residual"]) == (3.0, 0.75, 0.04)
+    assert summary("ours", ours, [])["extra_steps"]["mean"] is None
+    assert Record.from_json(ours[1].to_json()) == ours[1]
