@@ -93,7 +93,7 @@ class Setting:
                 f"there is no learned policy for {self.case.name}", path="methods", got="paper",
                 expected="a case with a folder in models/, or other methods",
             )  # fmt: skip
-        return make_shield([self.learned])
+        return make_shield([replace(self.learned, literal=True)])
 
     @cached_property
     def ours(self) -> Shield:
