@@ -102,6 +102,16 @@ def test_a_policy_comes_back_from_its_files_as_it_was():
         load_policy(policy.weights()[:-9], policy.card, task)
 
 
+def test_a_visit_is_no_graze_where_there_is_time():
+    """In an empty room, to a circle of 0.5 m: a deadline far away buys depth, a near one is kept as it is."""
+    regions = {"A": {"type": "circle", "center": [3.0, 1.5], "radius": 0.5}}
+    grid, pose = OccupancyGrid(np.zeros((30, 40), bool), 0.1), np.array([[0.5, 1.5, 0.0]])
+    for deadline, depth in ((40, 0.2), (15, 0.0)):
+        task = make_task(grid, STRETCH, f"F[0,{deadline}] A", regions)
+        found = synthesise(task).propose(pose, {}, 0.0)
+        assert task.samples(found.poses)["A"].max(axis=1).min() > depth
+
+
 def test_what_the_tables_do_not_cover_is_refused():
     regions = {"A": {"type": "circle", "center": [0.5, 0.5], "radius": 0.2}}
     grid = OccupancyGrid(np.zeros((20, 20), bool), 0.1)

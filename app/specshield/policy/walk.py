@@ -12,14 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel, leaf
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
-from specshield.policy.tables import HOPELESS, Tables, goals_settled, is_broken, score
+from specshield.policy.progress import (
+    ALWAYS,
+    EVENTUALLY,
+    EVENTUALLY_ALWAYS,
+    PENDING,
+    SETTLED,
+    STACK,
+    Rules,
+    advance,
+    value_count,
+)
+from specshield.policy.tables import HOPELESS, Tables, goals_settled, is_broken, score, slack
 from specshield.robot.unicycle import Body, step
 from specshield.stl.program import VALUE, evaluate_packed
 from specshield.world.regions import region_distance
 
 PATIENCE = 5  # steps without gain after which the walk is taken to go round in a circle
 NUDGE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
+DEEP = 0.2  # [m] inside a goal, robust enough
+SPARE = 10.0  # [steps] of slack from which on a few are spent on going deeper
+DEEP = 0.2  # [m] inside a goal: robust enough
+DEEPER = 0.01  # [m] by which a step has to lead deeper
+SPARE = 10.0  # [steps] of slack above which some are spent on going deeper
 FAILED, SETTLED_ALL, STUCK = 0, 1, 2
 
 
@@ -147,7 +162,7 @@ def walk(
         elif n - high_n >= PATIENCE:
             return STUCK, high_n
         phase = tables.phase[t + n + 1]
-        chosen = -1
+        chosen, goal = -1, -1
         while True:
             best = wait  # waiting wins ties
             for m in range(scores.shape[0]):
@@ -155,7 +170,8 @@ def walk(
                     best = m
             if best == wait and scores[wait] > HOPELESS:
                 waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - 0.1
-                if waits_for_phase or _pays_to_wait(rules, t + n, x, y, theta, work):
+                goal = _pays_to_wait(rules, t + n, x, y, theta, work)
+                if waits_for_phase or goal >= 0:
                     break
                 scores[wait] = HOPELESS
                 continue
@@ -169,11 +185,21 @@ def walk(
                 break
             scores[best] = HOPELESS
         if chosen >= 0:
-            advance(rules, t + n + 1, work.predicates, status, run)
+            goal = _advance(rules, t + n + 1, work)
             motions[n] = chosen
             poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
             n += 1
+            if goal >= 0:  # settled: where there is time, by more than a little
+                spare = slack(body, rules, tables, x, y, theta, t + n, status, run) - SPARE
+                n = _deepen(guide, t, n, goal, min(rules.b[goal], t + n + spare), motions, poses, work)
+                x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
             continue
+        if goal >= 0 and rules.kind[goal] == EVENTUALLY:
+            before = n
+            n = _deepen(guide, t, n, goal, rules.a[goal], motions, poses, work)
+            if n > before:
+                x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
+                continue
         # Waiting is best until something it brings about changes the progress.
         pending = _pending(status)
         look(rules, x, y, theta, work)
@@ -230,13 +256,55 @@ def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -
 
 
 @inlined
-def _pays_to_wait(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> bool:
-    """Whether a goal that holds here is still to open, or a dwell to go on."""
+def _pays_to_wait(rules: Rules, t: int, x: float, y: float, theta: float, work: Work) -> int:
+    """A goal that holds here and is still to open, or a dwell to go on; -1 if none."""
     for k in range(rules.kind.shape[0]):
         useful = rules.kind[k] == EVENTUALLY_ALWAYS or (rules.kind[k] != ALWAYS and rules.a[k] > t)
         if useful and work.status[k] == PENDING and predicate_at(rules, k, x, y, theta, work) > rules.margin:
-            return True
-    return False
+            return k
+    return -1
+
+
+@inlined
+def _advance(rules: Rules, t: int, work: Work) -> int:
+    """`advance` with work's predicates; returns an F that it settles, -1 if none."""
+    pending = 0
+    for k in range(rules.kind.shape[0]):
+        if rules.kind[k] == EVENTUALLY and work.status[k] == PENDING:
+            pending |= 1 << k
+    advance(rules, t, work.predicates, work.status, work.run)
+    for k in range(rules.kind.shape[0]):
+        if pending >> k & 1 and work.status[k] == SETTLED:
+            return k
+    return -1
+
+
+@leaf
+def _deepen(
+    guide: Guide,
+    t: int,
+    n: int,
+    goal: int,
+    until: float,
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    work: Work,
+) -> int:
+    """Repeats the last of motions[:n] for as long as it leads deeper into a goal, to DEEP and to step `until`
+    at most; returns how many motions there are then."""
+    body, rules, _, _ = guide
+    x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
+    depth = predicate_at(rules, goal, x, y, theta, work)
+    while n < motions.shape[0] and t + n < until and depth < DEEP:
+        x, y, theta = step(body, x, y, theta, motions[n - 1])
+        deeper = predicate_at(rules, goal, x, y, theta, work)
+        if deeper < depth + DEEPER or not _keeps(rules, t + n + 1, x, y, theta, work):
+            break
+        advance(rules, t + n + 1, work.predicates, work.status, work.run)
+        motions[n], depth = motions[n - 1], deeper
+        poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
+        n += 1
+    return n
 
 
 @leaf
