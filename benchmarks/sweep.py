@@ -14,7 +14,7 @@ from benchmarks.timing import summary
 from specshield.policy import reachability
 from specshield.policy.environment import free_poses
 from specshield.policy.network import NAMES, make_network
-from specshield.policy.observation import observation_size
+from specshield.policy.observation import PER_MOTION, observation_size
 from specshield.policy.policy import Policy, make_card
 from specshield.policy.progress import make_rules
 from specshield.robot import STRETCH, Robot
@@ -46,23 +46,39 @@ def by_horizon(horizons: tuple[int, ...], n: int, repeats: int, seed: int) -> li
 
 
 def by_actions(counts: tuple[int, ...], n: int, repeats: int, seed: int) -> list[dict[str, Any]]:
-    """Case 2 for robots with so many distinct motions; a DQN of the shipped one's width, random weights."""
+    """Case 2 for robots with so many distinct motions: the shipped DQN, which uses its own seven; and `lost`,
+    one of random weights, which satisfies nothing: each motion is then followed by a rollout of its own, and
+    each step of it looks at each motion.
+    """
     case, rows = load_case("case2"), []
     for count in counts:
         task = make_task(case.task.grid, made_robot(count), case.spec["formula"], case.spec["regions"])
-        rows.append({"actions": count, **_row(task, random_dqn(task, seed), n, repeats, seed)})
+        row = {"actions": count, **_row(task, widened(shipped_dqn(case), task), n, repeats, seed)}
+        lost = random_dqn(task, seed)
+        row["lost"] = summary([ask(make_shield([lost]), state, repeats) for state in _states(task, n, seed)])
+        rows.append(row)
     return rows
 
 
 def made_robot(count: int) -> Robot:
-    """The first `count` of: wait, ahead, back, then turns and arcs to either side by 6 degrees more each."""
-    moves = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0)]
-    for k in range(1, count):
-        angle = math.radians(6.0 * (1 + (k - 1) % 15))
-        ahead = (0.0, 0.1, 0.2)[(k - 1) // 15 % 3]
-        moves += [(ahead, angle), (ahead, -angle)]
+    """`count` motions: the Stretch's seven, then turns and arcs to either side by 6 degrees more each."""
+    moves = list(STRETCH.motions)
+    for ahead in (0.0, 0.1, 0.2):
+        for angle in (math.radians(6.0 * k) for k in range(2, 16) if k != 5):
+            moves += [(ahead, angle), (ahead, -angle)]
     actions = tuple(Action(f"a{i}", *move) for i, move in enumerate(moves[:count]))
     return Robot(f"made{count}", STRETCH.radius, STRETCH.offset, STRETCH.on_contact, actions)
+
+
+def widened(dqn: Policy, task: Task) -> Policy:
+    """A DQN for a robot that has more motions after the ones it was trained with: it never prefers those."""
+    arrays = dqn.network._asdict()
+    more = len(task.robot.motions) - len(dqn.task.robot.motions)
+    arrays["w1"] = np.pad(arrays["w1"], ((0, PER_MOTION * more), (0, 0)))
+    arrays["w3"] = np.pad(arrays["w3"], ((0, 0), (0, more)))
+    arrays["b3"] = np.pad(arrays["b3"], (0, more), constant_values=np.float32(-1e6))
+    network = make_network(arrays, len(arrays["w1"]), len(arrays["b3"]))
+    return Policy(task, make_card(task, "dqn", {}, 0, {}), network)
 
 
 def random_dqn(task: Task, seed: int) -> Policy:
@@ -81,9 +97,7 @@ def random_dqn(task: Task, seed: int) -> Policy:
 def _row(task: Task, dqn: Policy, n: int, repeats: int, seed: int) -> dict[str, Any]:
     """Quantiles of (c) and (d) from the same starts, feasible or not, and the seconds synthesis took."""
     reach = reachability.synthesise(task)
-    random = np.random.default_rng([seed, 20])
-    poses = free_poses(task, make_body(task.robot, task.grid), n, random)
-    states = [State(pose[None], np.zeros(len(task.robot.actions)), None) for pose in poses]
+    states = _states(task, n, seed)
     row: dict[str, Any] = {"synthesis_s": reach.card["metrics"]["wall_time_s"]}
     for key, policy in (("c", dqn), ("d", reach)):
         shield = make_shield([policy])
@@ -92,3 +106,8 @@ def _row(task: Task, dqn: Policy, n: int, repeats: int, seed: int) -> dict[str, 
         answers = [decide(shield, state.history, state.logits) for state in states]
         row[key]["feasible"] = float(np.mean([answer.feasible_mass > 0.0 for answer in answers]))
     return row
+
+
+def _states(task: Task, n: int, seed: int) -> list[State]:
+    poses = free_poses(task, make_body(task.robot, task.grid), n, np.random.default_rng([seed, 20]))
+    return [State(pose[None], np.zeros(len(task.robot.actions)), None) for pose in poses]

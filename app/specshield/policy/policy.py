@@ -112,21 +112,15 @@ def wait_motion(robot: Robot) -> int:
 
 
 def undoing_motions(robot: Robot) -> NDArray[np.int64]:
-    """The motions that undo each of the robot's, in free space: (M, 2), one after the other, -1: no more is
-    needed; -2 where two do not.
-    """
+    """The motions that undo each of the robot's, as nearly as two can: (M, 2), in order, -1: no more."""
+    turns = [(0.0, -1), *((a, m) for m, (d, a) in enumerate(robot.motions) if d == 0.0)]
+    moves = [(0.0, -1), *((d, m) for m, (d, a) in enumerate(robot.motions) if a == 0.0)]
 
-    def find(translate: float, rotate: float) -> int:
-        if translate == rotate == 0.0:
-            return -1
-        gaps = [max(abs(d - translate), abs(a - rotate)) for d, a in robot.motions]
-        return int(np.argmin(gaps)) if min(gaps) < 1e-9 else -2
+    def back(amount: float, choices: list[tuple[float, int]]) -> int:
+        return min(choices, key=lambda choice: abs(amount + choice[0]))[1]
 
-    rows = []
-    for translate, rotate in robot.motions:  # which goes, then turns
-        back = [m for m in (find(0.0, -rotate), find(-translate, 0.0)) if m != -1]
-        rows.append((*back, -1, -1)[:2] if -2 not in back else (-2, -2))
-    return np.array(rows, np.int64).reshape(-1, 2)
+    both = [(back(rotate, turns), back(translate, moves)) for translate, rotate in robot.motions]
+    return np.array([(a, b) if a >= 0 else (b, a) for a, b in both], np.int64).reshape(-1, 2)
 
 
 def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:

@@ -226,7 +226,7 @@ def propose_all(
     """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); returns pi_phi's own.
 
     history (t + 1, 3), signals (t + 1, S); rules.signals is left at the last row. undoing (M, 2): the motions
-    that undo each, -1: no more is needed, first -2: none do. Where `literal`, every row is pi_phi's own
+    that undo each, -1: no more is needed. Where `literal`, every row is pi_phi's own
     rollout. Else, once one row settles everything, it is enough for another motion to undo it and go that
     way; where that fails it is pi_phi's own rollout too.
     """
@@ -242,7 +242,7 @@ def propose_all(
         if i == preferred:
             continue
         reached = PENDING
-        if base >= 0 and undoing[m, 0] >= -1 and not literal:
+        if base >= 0 and not literal:
             _begin(rules, history[t], status, run, state)
             reached = _retrace(
                 body, rules, t, m, undoing[m], wait, motions[base], state, motions[m], poses[m]
