@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from specshield.sim.apartments import APARTMENTS
 from specshield.sim.cases import MODELS, case_names, load_case
 from specshield.sim.learned.floor_plans import House, random_house
 from specshield.sim.learned.measure import house_case, success
@@ -40,7 +41,14 @@ def train_model(seed: int, rounds: int | None, with_cases: bool, out: Path) -> i
         status.say(f"round {done} of {settings.rounds}, loss {report.loss:.3f}, {duration(left)} left")
 
     cases = [load_case(name) for name in case_names()] if with_cases else []
-    practised = [House(case.task.grid, {target_of(case.instruction): case.target}) for case in cases]
+    practised = [
+        House(
+            case.task.grid,
+            tuple(APARTMENTS[case.name].rooms.values()),
+            {target_of(case.instruction): case.target},
+        )
+        for case in cases
+    ]
     weights, options = export(train(settings, seed, practised, show)), settings.to_json()
     wall = time.monotonic() - began
     status.say("measuring ...")

@@ -129,15 +129,19 @@ def advise(
     y: float,
     theta: float,
     at_target: bool,
+    look_around: bool,
     out: NDArray[np.float32],
 ) -> None:
     """Writes the expert's distribution over all tokens, shape (A,).
 
-    representative (M,): the token of each motion. at_target: near enough to `end`, and the target in view.
+    representative (M,): the token of each motion. at_target: near enough to `end`, and the
+    target in view. look_around: turn, to the left.
     """
     bearing = bearing_of_way(body, to_go, x, y, theta)
     first = -1
-    if _metres(body, to_go, x, y) >= OFF:
+    if look_around:
+        bearing = math.radians(60.0)
+    elif _metres(body, to_go, x, y) >= OFF:
         first = way_off_the_wall(body, representative, to_go, x, y, theta)
     turn, stride = math.radians(30.0), 0.2
     for a in range(out.shape[0]):

@@ -63,9 +63,10 @@ IN_THE_MIDDLE = {
 
 @dataclass(frozen=True)
 class House:
-    """A floor plan, and where in it each kind of target is, (x, y) [m]."""
+    """A floor plan, its rooms, and where in it each kind of target is, (x, y) [m]."""
 
     grid: OccupancyGrid
+    rooms: tuple[Box, ...]
     targets: dict[str, tuple[float, float]]
 
 
@@ -114,7 +115,7 @@ def _furnished(random: np.random.Generator) -> House | None:
             if point is None:
                 return None
             targets[name] = point
-    return House(grid, targets) if "bowl" in targets else None
+    return House(grid, tuple(boxes), targets) if "bowl" in targets else None
 
 
 def _cells(length: float) -> int:

@@ -34,7 +34,7 @@ from specshield.sim.learned.network import (
     Array,
     features,
 )
-from specshield.sim.learned.practice import Apartments, Practice, sample
+from specshield.sim.learned.practice import Practice, make_apartments, sample
 
 CHANCES = (0.25, 0.25, *([0.125] * (len(KINDS) - 2)))  # of each kind: two of them are kept in kitchens
 
@@ -209,7 +209,7 @@ def train(
     random = np.random.default_rng(seed)
     torch.manual_seed(seed)
     houses = houses + [random_house(random) for _ in range(settings.houses)]
-    practice = Practice(Apartments(houses), settings.robots, random.spawn(1)[0])
+    practice = Practice(make_apartments(houses), settings.robots, random.spawn(1)[0])
     network, actor = Transformer(), Transformer()
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=0.01)
     rounds: list[Episodes] = []
