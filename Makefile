@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A clone shares no compiled kernels with another, and keeps its own between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
 
-.PHONY: install demo run test lint bench openapi clean
+.PHONY: install demo run test lint bench results openapi clean
 
 install: .venv/.dev
 
@@ -45,6 +45,21 @@ lint: .venv/.dev
 
 bench: .venv-bench/.done
 	.venv-bench/bin/python -m benchmarks $(ARGS)
+
+# docs/results.md. What is in RESULTS already is not done again.
+RESULTS ?= out/results
+MODEL ?= learned
+EVALUATE = $(BIN)/specshield evaluate --runs 200 --model $(MODEL) --out $(RESULTS)
+results: .venv/.dev
+	$(EVALUATE) --case 1
+	$(EVALUATE) --case 2
+	for case in 1 2; do \
+	  $(EVALUATE) --case $$case --noise gaussian \
+	    --methods unmodified,paper,ours,ours@0/8,ours@conformal,ours@conformal/8 || exit 1; \
+	  $(EVALUATE) --case $$case --noise slip,obstacle,shift,collider --methods paper,ours,ours@0.04/8 || exit 1; \
+	done
+	for house in house_0 house_2; do $(EVALUATE) --case house --house $$house || exit 1; done
+	$(BIN)/specshield report $(RESULTS)
 
 openapi: .venv/.server
 	$(BIN)/specshield openapi > openapi.json

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,14 +26,19 @@ def calibrated(experiment: Experiment, method: str, folder: Path | None, process
     if kind == method:
         return method
     path = None if folder is None else folder / "calibration.json"
-    if path is not None and path.exists():
-        return str(json.loads(path.read_text())["method"])
-    others = replace(experiment, seed=experiment.seed + OTHER_SEED)
-    scores = [r.residual for r in evaluate(others, RUNS, [f"{kind}@0{asked}"], None, processes)]
-    margin = conformal_margin(scores, ALPHA)
-    chosen = f"{kind}@{margin + 5e-4:.3f}{asked}"
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        found = {"method": chosen, "margin": margin, "alpha": ALPHA, "runs": RUNS, "seed": others.seed}
-        path.write_text(json.dumps(found, indent=1) + "\n")
-    return chosen
+    found = json.loads(path.read_text()) if path is not None and path.exists() else {}
+    if method not in found:
+        others = replace(experiment, seed=experiment.seed + OTHER_SEED)
+        scores = [r.residual for r in evaluate(others, RUNS, [f"{kind}@0{asked}"], None, processes)]
+        margin = conformal_margin(scores, ALPHA)
+        found[method] = {
+            "method": f"{kind}@{math.ceil(1e3 * margin) / 1e3:g}{asked}",
+            "margin": margin,
+            "alpha": ALPHA,
+            "runs": RUNS,
+            "seed": others.seed,
+        }
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(found, indent=1) + "\n")
+    return str(found[method]["method"])
