@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from tests.oracles.cells import MOTIONS, Cells
+from safetensors.numpy import save
+from tests.oracles.cells import MOTIONS, ROBOT, WAIT, Cells
 
 from specshield.errors import FragmentError, PolicyError
 from specshield.policy.load import load_policy
 from specshield.policy.reachability import Settings, read_settings, synthesise
-from specshield.robot import STRETCH, robot_from_json
+from specshield.robot import STRETCH
 from specshield.shield.episode import decide, make_shield
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -61,6 +64,8 @@ WORLDS = {
     ),
 }
 
+RESTLESS = replace(ROBOT, name="restless", actions=ROBOT.actions[:WAIT])
+
 
 @pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
 def test_s_t_is_the_exact_feasible_set_where_it_can_be_enumerated(cells):
@@ -85,11 +90,35 @@ def test_s_t_is_the_exact_feasible_set_where_it_can_be_enumerated(cells):
     assert len(seen) > 3
 
 
+@pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
+def test_a_robot_that_cannot_wait_has_its_exact_feasible_set_too(cells):
+    """The same worlds without the motion that waits: tables step by step, all futures tried without it."""
+    task = replace(cells.task, robot=RESTLESS)
+    shield = make_shield([synthesise(task, Settings(pitch=0.2))])
+    random, seen = np.random.default_rng(3), set()
+    for i, j, heading in [(i, j, h) for i, j in ((0, 0), (2, 1), (2, 2), (4, 2)) for h in range(4)]:
+        history = [cells.pose(i, j, heading)]
+        for _ in range(task.horizon):
+            motions, kept = cells.futures(history)
+            kept &= (motions != WAIT).all(axis=1)
+            expected = np.array([kept[motions[:, 0] == m].any() for m in range(WAIT)])
+            decision = decide(shield, history, np.zeros(WAIT))
+            if decision.mode in ("shaped", "fallback"):
+                assert decision.j_values == tuple(expected.astype(float))
+                seen.add(tuple(expected))
+            motion = int(random.choice(np.flatnonzero(expected) if expected.any() else WAIT))
+            history.append(decision.next_poses[motion])
+    assert len(seen) > 3
+
+
 def test_a_policy_comes_back_from_its_files_as_it_was():
     task = WORLDS["in turn, with a forbidden cell"].task
+    restless = synthesise(replace(task, robot=RESTLESS), Settings(pitch=0.2))
+    again = load_policy(restless.weights(), restless.card, restless.task)
+    np.testing.assert_array_equal(again.tables.bits, restless.tables.bits)
     policy = synthesise(task, Settings(pitch=0.2))
-    again = load_policy(policy.weights(), policy.card, task)
     history = np.array([[0.1, 0.1, 0.0]])
+    again = load_policy(policy.weights(), policy.card, task)
     ours, theirs = policy.propose(history, {}, 0.0), again.propose(history, {}, 0.0)
     np.testing.assert_array_equal(ours.motions, theirs.motions)
     np.testing.assert_array_equal(ours.poses, theirs.poses)
@@ -100,6 +129,14 @@ def test_a_policy_comes_back_from_its_files_as_it_was():
             load_policy(policy.weights(), {**policy.card, "options": options}, task)
     with pytest.raises(PolicyError, match="safetensors"):
         load_policy(policy.weights()[:-9], policy.card, task)
+    for theirs in (policy.weights(), save({"cell": again.tables.cell, "bits": again.tables.bits[1:]})):
+        with pytest.raises(PolicyError) as caught:
+            load_policy(theirs, restless.card, restless.task)
+        assert caught.value.path.startswith("weights")
+    cell = restless.tables.cell.copy()
+    cell[0, 0] += 1000
+    with pytest.raises(PolicyError, match="fit"):
+        load_policy(save({"cell": cell, "bits": again.tables.bits}), restless.card, restless.task)
 
 
 def test_a_visit_is_no_graze_where_there_is_time():
@@ -117,9 +154,6 @@ def test_what_the_tables_do_not_cover_is_refused():
     grid = OccupancyGrid(np.zeros((20, 20), bool), 0.1)
     with pytest.raises(FragmentError, match="too many"):
         synthesise(make_task(grid, STRETCH, " and ".join(f"F[0,{k}] A" for k in range(1, 10)), regions))
-    restless = robot_from_json({"footprint": {"radius": 0.1}, "actions": [{"name": "go", "translate": 0.1}]})
-    with pytest.raises(FragmentError, match="wait"):
-        synthesise(make_task(grid, restless, "F[0,9] A", regions))
     with pytest.raises(PolicyError, match="not in range") as caught:
         read_settings({"pitch": 0})
     assert caught.value.path == "options.pitch"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
-from specshield.errors import FragmentError, PolicyError
+from specshield.errors import PolicyError
 from specshield.policy.latest import Phase, latest_times, masks_of, phases_of
 from specshield.policy.lattice import heading_count, holds_at, make_lattice
 from specshield.policy.policy import Card, Proposal, make_card, read_tensors, wait_motion
@@ -23,6 +23,7 @@ from specshield.policy.progress import (
     signal_rows,
 )
 from specshield.policy.search import propose_all
+from specshield.policy.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
 from specshield.policy.tables import INVALID, SCALE, Tables
 from specshield.policy.walk import Guide
 from specshield.robot.unicycle import Body, make_body
@@ -99,13 +100,14 @@ class ReachabilityPolicy:
 
     def weights(self) -> bytes:
         """The safetensors file."""
-        return save_tensors({"cell": self.tables.cell, "code": self.tables.code, "table": self.tables.table})
+        names = ("cell", "bits") if len(self.tables.bits) else ("cell", "code", "table")
+        return save_tensors({name: getattr(self.tables, name) for name in names})
 
 
 def synthesise(
     task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
 ) -> ReachabilityPolicy:
-    """Makes the tables. Raises FragmentError for a formula or robot they do not cover, PolicyError for a
+    """Makes the tables. Raises FragmentError for a formula that they do not cover, PolicyError for a
     map too large.
     """
     began = time.perf_counter()
@@ -113,13 +115,22 @@ def synthesise(
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     goals, pitch = _goals(task, rules, settings)
     lattice = make_lattice(body, pitch)
-    masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
-    latest, valid = latest_times(lattice, rules, holds_at(body, rules, lattice), goals, masks, phases)
-    tables = _pack(latest, valid, masks, phases, goals, len(rules.kind), pitch)
-    start = latest[0, masks.index(0)][valid[0] == 1]
+    holds = holds_at(body, rules, lattice)
+    if wait_motion(task.robot) < 0:
+        used = np.any(lattice.valid, axis=2)
+        bits, feasible = feasible_steps(lattice, rules, holds, task.horizon, used)
+        tables = _step_tables(rules, task.horizon, _numbered(used), bits, pitch)
+        size = tables.bits.nbytes + tables.cell.nbytes
+    else:
+        masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
+        latest, valid = latest_times(lattice, rules, holds, goals, masks, phases)
+        tables = _pack(latest, valid, masks, phases, goals, rules, pitch)
+        start = latest[0, masks.index(0)][valid[0] == 1]
+        feasible = float((start >= 0.0).mean()) if len(start) else 0.0
+        size = tables.code.nbytes + tables.cell.nbytes
     metrics = {
-        "feasible_start": round(float((start >= 0.0).mean()), 4) if len(start) else 0.0,
-        "size_bytes": int(tables.code.nbytes + tables.cell.nbytes),
+        "feasible_start": round(feasible, 4),
+        "size_bytes": int(size),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
     card = make_card(task, "reachability", asdict(settings), 0, metrics, spec)
@@ -131,8 +142,28 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
     settings = read_settings(card.get("options", {}))
     rules = make_rules(task)
     goals, pitch = _goals(task, rules, settings)
-    tensors = read_tensors(weights)
-    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
+    tensors, (shape, headings) = read_tensors(weights), _shape(task, pitch)
+    if wait_motion(task.robot) < 0:
+        cell, bits = _read(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
+        size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
+        _check_fit(cell, shape, bits.shape[1], bits.shape == size, f"bits {list(size)}")
+        return ReachabilityPolicy(task, card, settings, _step_tables(rules, task.horizon, cell, bits, pitch))
+    cell, code, table = _read(
+        tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
+    )
+    phases = phases_of(rules, task.horizon)
+    fits = (
+        code.shape[2] == headings and table.shape == (len(phases), 1 << len(goals))
+        and table.min() >= -1 and table.max() < code.shape[0]
+    )  # fmt: skip
+    wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {1 << len(goals)}]"
+    _check_fit(cell, shape, code.shape[1], fits, wanted)
+    return ReachabilityPolicy(
+        task, card, settings, _time_tables(rules, goals, phases, cell, code, table, pitch)
+    )
+
+
+def _read(tensors: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[type, int]]) -> list[NDArray[Any]]:
     for name, (dtype, rank) in wanted.items():
         array = tensors.get(name)
         if array is None or array.dtype != dtype or array.ndim != rank:
@@ -141,24 +172,16 @@ def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPol
                 got=None if array is None else f"{array.dtype} {list(array.shape)}",
                 expected=f"{dtype.__name__}, rank {rank}",
             )  # fmt: skip
-    cell, code, table = tensors["cell"], tensors["code"], tensors["table"]
-    shape, headings = _shape(task, pitch)
-    phases = phases_of(rules, task.horizon)
-    fits = (
-        cell.shape == shape and code.shape[2] == headings and table.shape == (len(phases), 1 << len(goals))
-        and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
-        and table.min() >= -1 and table.max() < code.shape[0]
-    )  # fmt: skip
-    if not fits:
+    return [np.ascontiguousarray(tensors[name]) for name in wanted]
+
+
+def _check_fit(cell: NDArray[np.int32], shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
+    if not fits or cell.shape != shape or cell.min(initial=-1) < -1 or cell.max(initial=-1) >= rows:
         raise PolicyError(
             "the tables do not fit the task", path="weights",
-            got=[list(cell.shape), list(code.shape), list(table.shape)],
-            expected=f"cell {list(shape)}, code [tables, cells, {headings}], "
-            f"table [{len(phases)}, {1 << len(goals)}]",
+            got=f"cell {list(cell.shape)} and tables of {rows} cells",
+            expected=f"cell {list(shape)}, {wanted}",
         )  # fmt: skip
-    cell, code, table = (np.ascontiguousarray(array) for array in (cell, code, table))
-    tables = Tables(cell, code, table, *_times(phases), _bits(goals, len(rules.kind)), pitch)
-    return ReachabilityPolicy(task, card, settings, tables)
 
 
 def check(task: Task, settings: Settings) -> None:
@@ -168,21 +191,21 @@ def check(task: Task, settings: Settings) -> None:
 
 def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[NDArray[np.int64], float]:
     """The obligations that are not `always`, and the lattice's pitch, where the tables cover the task."""
-    if wait_motion(task.robot) < 0:
-        raise FragmentError(
-            "reachability needs a robot that can wait", path="robot", got=list(task.robot.action_names),
-            expected="an action with translate 0 and rotate 0; or method 'dqn'",
-        )  # fmt: skip
     goals = np.flatnonzero(rules.kind != ALWAYS)
-    tables = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
-    for pitch, limit in ((settings.pitch / 3.0, FINE_ENTRIES), (settings.pitch, MAX_ENTRIES)):
+    if wait_motion(task.robot) < 0:
+        entries, unit = (task.horizon + 1) * -(-state_count(rules) // 8), "bytes"
+        limits = FINE_ENTRIES, MAX_BYTES
+    else:
+        entries = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
+        limits, unit = (FINE_ENTRIES, MAX_ENTRIES), "entries"
+    for pitch, limit in zip((settings.pitch / 3.0, settings.pitch), limits, strict=True):
         (ny, nx), headings = _shape(task, pitch)
-        if ny * nx * headings * tables <= limit:
+        if ny * nx * headings * entries <= limit:
             return goals, pitch
     raise PolicyError(
         "the tables are too large", path="options.pitch",
-        got=f"{tables} tables of {ny} x {nx} x {headings} poses",
-        expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer windows that overlap",
+        got=f"{entries} {unit} for each of {ny} x {nx} x {headings} poses",
+        expected=f"at most {limit} {unit}: a larger pitch, or fewer windows that overlap",
     )  # fmt: skip
 
 
@@ -194,10 +217,11 @@ def _shape(task: Task, pitch: float) -> tuple[tuple[int, int], int]:
     return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
 
 
-def _bits(goals: NDArray[np.int64], obligations: int) -> NDArray[np.int64]:
-    bit = np.zeros(obligations, np.int64)
-    bit[goals] = 1 << np.arange(len(goals))
-    return bit
+def _numbered(used: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Rows of the cells that are used, -1 elsewhere."""
+    cell = np.full(used.shape, -1, np.int32)
+    cell[used] = np.arange(int(used.sum()))
+    return cell
 
 
 def _pack(
@@ -206,12 +230,10 @@ def _pack(
     masks: list[int],
     phases: tuple[Phase, ...],
     goals: NDArray[np.int64],
-    obligations: int,
+    rules: Rules,
     pitch: float,
 ) -> Tables:
-    used = valid.any(axis=(0, 3))
-    cell = np.full(used.shape, -1, np.int32)
-    cell[used] = np.arange(int(used.sum()))
+    used = np.any(valid, axis=(0, 3))
     table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
     codes: list[NDArray[np.uint16]] = []
     for i in range(len(phases)):
@@ -224,12 +246,31 @@ def _pack(
             code[valid[i][used] == 0] = INVALID
             table[i, mask] = len(codes)
             codes.append(code)
-    shape = (len(codes), int(used.sum()), valid.shape[3])
-    code = np.array(codes, np.uint16).reshape(shape)
-    return Tables(cell, code, table, *_times(phases), _bits(goals, obligations), pitch)
+    code = np.array(codes, np.uint16).reshape(len(codes), int(used.sum()), valid.shape[3])
+    return _time_tables(rules, goals, phases, _numbered(used), code, table, pitch)
 
 
-def _times(phases: tuple[Phase, ...]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The phase of each step, and each phase's last step."""
+def _time_tables(
+    rules: Rules,
+    goals: NDArray[np.int64],
+    phases: tuple[Phase, ...],
+    cell: NDArray[np.int32],
+    code: NDArray[np.uint16],
+    table: NDArray[np.int32],
+    pitch: float,
+) -> Tables:
+    bit = np.zeros(len(rules.kind), np.int64)
+    bit[goals] = 1 << np.arange(len(goals))
     ends = np.array([phase.end for phase in phases], np.int32)
-    return np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32), ends
+    phase = np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32)
+    none = np.empty((0, 0, 0, 0), np.uint8)
+    return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch)
+
+
+def _step_tables(
+    rules: Rules, horizon: int, cell: NDArray[np.int32], bits: NDArray[np.uint8], pitch: float
+) -> Tables:
+    code = np.empty((0, *bits.shape[1:3]), np.uint16)
+    phase, end = np.zeros(horizon + 1, np.int32), np.array([horizon], np.int32)
+    bit = np.zeros(len(rules.kind), np.int64)
+    return Tables(cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch)

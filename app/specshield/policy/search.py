@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel, leaf
 from specshield.policy.beam import EASY, MAX_ROOTS, beam
 from specshield.policy.progress import forgive, replay
-from specshield.policy.tables import HOPELESS, slack
+from specshield.policy.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.walk import SETTLED_ALL, STUCK, Guide, Work, fill, make_work, observe, rejoin, walk
-from specshield.robot.unicycle import Body, step
+from specshield.robot.unicycle import Body, simulate, step
 
 ESCAPE_GAIN = 2.0  # [steps] later than where it got stuck: what a way out has to reach
 ESCAPE_LOSS = 6.0  # [steps] of slack that it may cost on the way
 ESCAPE_DEPTH = 24
 MAX_ESCAPES = 8
 BAND = -3.0  # [steps] of slack: how far the tables err
+NARROW = 2  # poses that the first beam of a robot that cannot wait keeps for each motion
 SMALL = 30_000  # poses of a lattice on which nearly every way can be tried
 SMALL_SHARE = 512
 
@@ -68,6 +69,9 @@ def propose_all(
     order = np.empty(count, np.int64)
     _first_steps(guide, t, history[t], status, run, motions, poses, starts, work)
     _by_slack(starts.slack, order)
+    if guide.wait < 0:
+        _propose_restless(guide, t, width, order, starts, motions, poses, work)
+        return int(order[0])
     base = -1
     for m in order:
         turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
@@ -85,6 +89,28 @@ def propose_all(
         _beam_out(guide, t, SMALL_SHARE, width, 2.0 * HOPELESS, order, starts, motions, poses, work)
     best = order[0]
     return int(guide.wait if starts.slack[guide.wait] == starts.slack[best] else best)
+
+
+@kernel
+def _propose_restless(
+    guide: Guide,
+    t: int,
+    width: int,
+    order: NDArray[np.int64],
+    starts: Starts,
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    work: Work,
+) -> None:
+    """For a robot that cannot wait, by tables step by step: beams all the way, a narrow one first."""
+    for m in order:
+        motions[m, 1:] = m
+        simulate(guide.body, poses[m, 0], motions[m, 1:], poses[m, 1:])
+        starts.settled[m] = starts.slack[m] == SAFE
+    for share in (NARROW, width):
+        _beam_out(guide, t, share, width, 0.0, order, starts, motions, poses, work)
+    if guide.tables.bits.shape[1] * guide.tables.bits.shape[2] <= SMALL:
+        _beam_out(guide, t, SMALL_SHARE, width, 2.0 * HOPELESS, order, starts, motions, poses, work)
 
 
 @leaf
@@ -240,4 +266,8 @@ def _beam_out(
             if taken[i] > 0:
                 _resume(starts.status[m], starts.run[m], work)
                 n = _take(guide, t, 1, way[i, : taken[i]], motions[m], poses[m], work)
-                starts.settled[m] = _follow(guide, width, t, n, True, motions[m], poses[m], work)
+                if guide.wait >= 0:
+                    starts.settled[m] = _follow(guide, width, t, n, True, motions[m], poses[m], work)
+                    continue
+                starts.settled[m] = goals_settled(guide.rules, work.status)
+                simulate(guide.body, poses[m, n - 1], motions[m, n:], poses[m, n:])

@@ -1,4 +1,4 @@
-"""The tables of latest feasible times as decisions read them: the slack of a pose, and where it grows."""
+"""The tables as decisions read them: the slack of a pose, and where it grows."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ SAFE = 1e6
 
 
 class Tables(NamedTuple):
-    """Latest feasible times, stored over the cells that have a valid pose.
+    """Latest feasible times, or feasibility step by step (policy/stepwise.py), over the cells that have a
+    valid pose.
 
     cell [ny, nx]: row of `code`, -1 where no pose is valid. code [P, cells, H]: INVALID, 0 for never, else
     1 + SCALE * L. table [phases, 2^G]: which table a set of settled goals has in a phase, -1 if it has none.
     phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
-    settled
-    goals, 0 for an `always`.
+    settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: step by step; bits has
+    no steps where the tables are latest times.
     """
 
     cell: NDArray[np.int32]
@@ -35,6 +36,9 @@ class Tables(NamedTuple):
     phase: NDArray[np.int32]
     end: NDArray[np.int32]
     bit: NDArray[np.int64]
+    bits: NDArray[np.uint8]
+    stride: NDArray[np.int64]
+    dwell: NDArray[np.int64]
     pitch: float
 
 
@@ -88,6 +92,8 @@ def slack(
     """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something
     is broken.
     """
+    if tables.bits.shape[0] > 0:
+        return _steps_ahead(body, rules, tables, x, y, theta, t, status, run)
     mask, every = 0, 0
     for k in range(status.shape[0]):
         if status[k] == BROKEN:
@@ -108,6 +114,60 @@ def slack(
             if over < tables.phase.shape[0]:
                 best = max(best, _after_dwell(tables, mask | tables.bit[k], every, over, v, u, h))
     return best
+
+
+@leaf
+def _steps_ahead(
+    body: Body,
+    rules: Rules,
+    tables: Tables,
+    x: float,
+    y: float,
+    theta: float,
+    t: int,
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+) -> float:
+    """How feasible a pose is, step by step: from 0 to 1 now, and as much for each of some delays [steps]
+    that it would stand. SAFE once nothing is pending, HOPELESS where it is not feasible at all.
+    """
+    progress, pending = 0, False
+    for k in range(status.shape[0]):
+        if status[k] == BROKEN:
+            return HOPELESS
+        pending = pending or status[k] == PENDING
+        if rules.kind[k] != ALWAYS:
+            digit = min(run[k], tables.dwell[k]) if status[k] == PENDING else tables.dwell[k] + 1
+            progress += tables.stride[k] * digit
+    if not pending:
+        return SAFE
+    v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
+    ahead = 0.0
+    for delay in (0, 1, 2, 4, 8):
+        if t + delay >= tables.bits.shape[0]:
+            break
+        ahead += _feasible_at(tables, t + delay, progress, v, u, h)
+        if ahead == 0.0:
+            return HOPELESS
+    return ahead
+
+
+@leaf
+def _feasible_at(tables: Tables, t: int, progress: int, v: float, u: float, h: float) -> float:
+    """The share of the lattice's corners, by weight, from which the formula can be satisfied at step t."""
+    ny, nx = tables.cell.shape
+    headings = tables.bits.shape[2]
+    j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
+    share = 0.0
+    for corner in range(8):
+        dj, di, dk = corner >> 2, corner >> 1 & 1, corner & 1
+        if j + dj < 0 or j + dj >= ny or i + di < 0 or i + di >= nx or tables.cell[j + dj, i + di] < 0:
+            continue
+        bits = tables.bits[t, tables.cell[j + dj, i + di], (k + dk) % headings, progress >> 3]
+        if bits >> (progress & 7) & 1:
+            w = (v - j if dj else 1.0 - v + j) * (u - i if di else 1.0 - u + i)
+            share += w * (h - k if dk else 1.0 - h + k)
+    return share
 
 
 @inlined
@@ -155,6 +215,9 @@ def score(
 
     last: the motion before, -1 for none. HOPELESS for what leads straight back: the tables err by a little.
     """
+    if tables.bits.shape[0] > 0:
+        scores[:] = SAFE
+        return
     mask, every = 0, 0
     for k in range(status.shape[0]):
         every |= tables.bit[k]
