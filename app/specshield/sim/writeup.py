@@ -184,8 +184,8 @@ def _calibrations(found: dict[Path, Results]) -> Iterator[str]:
             covered = sum(record.residual <= made["margin"] for record in runs)
             lines.append(
                 f"- {results['case']}, {results['experiment']['noise']}, {made['method']}: "
-                f"{made['margin']:.4f} m from {made['runs']} other runs; it covered every step of {covered} of "
-                f"{len(runs)} runs."
+                f"{made['margin']:.4f} m from {made['runs']} other runs; it covered every step of {covered} "
+                f"of {len(runs)} runs."
             )
     if lines:
         yield (
