@@ -49,7 +49,7 @@ async def create(request: Request, server: ServerState) -> Any:
     Policies are immutable and known by the hash of task, method, options and seed: the same request again
     answers the policy there is, and queues it once more if it failed. A formula has to be a conjunction of
     `F[a,b]`, `G[a,b]` and `F[a,c] G[d,b]` over boolean combinations of predicates.
-    `dqn` learns, in minutes; `reachability` computes, in seconds, for robots that can wait.
+    `dqn` learns, in minutes; `reachability` computes, in seconds.
     """
     if uploads.is_multipart(request):
         weights, card = await uploads.parts(request, "weights", "card")
