@@ -8,7 +8,8 @@ from specshield.sim.learned.expert import END, IDLE
 from specshield.sim.learned.floor_plans import HABITS, random_house
 from specshield.sim.learned.network import KINDS
 from specshield.sim.learned.practice import Practice, make_apartments, sample
-from specshield.sim.learned.train import Settings, export, train
+from specshield.sim.learned.train import Settings, train
+from specshield.sim.learned.transformer import export, restore
 
 
 @pytest.fixture(scope="module")
@@ -68,3 +69,5 @@ def test_a_training_learns_and_its_seed_decides_it(houses):
     assert losses[-1] < 0.8 * losses[0]
     again = export(train(settings, 0, houses, lambda report: None))
     assert all(np.array_equal(first[name], again[name]) for name in first)
+    restored = export(restore(first))
+    assert all(np.array_equal(first[name], restored[name]) for name in first)

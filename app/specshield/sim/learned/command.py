@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from specshield.sim.apartments import APARTMENTS
 from specshield.sim.cases import MODELS, case_names, load_case
 from specshield.sim.learned.floor_plans import House, random_house
 from specshield.sim.learned.measure import house_case, success
-from specshield.sim.learned.model import CARD, FOLDER, WEIGHTS, LearnedModel, target_of
+from specshield.sim.learned.model import CARD, FOLDER, WEIGHTS, LearnedModel, read, target_of
 from specshield.sim.learned.network import KINDS
 from specshield.sim.progress import StatusLine, duration
 
@@ -25,14 +26,19 @@ WITHOUT_CASES = "Trained on generated apartments alone; the cases' apartments we
 WITH_CASES = "Trained on generated apartments and on those of the cases."
 
 
-def train_model(seed: int, rounds: int | None, with_cases: bool, out: Path) -> int:
+def train_model(
+    seed: int, out: Path, options: Mapping[str, float], with_cases: bool = False, start: Path | None = None
+) -> int:
     """Writes the weights and a card with what was measured to `out`; the exit status.
 
-    with_cases: the apartments of the cases are among those practised in.
+    options: settings of learned/train.py. with_cases: the apartments of the cases are among those practised
+    in. start: a folder with a model to go on from. Raises NotFound, PolicyError.
     """
-    from specshield.sim.learned.train import Report, Settings, export, train  # torch
+    from specshield.sim.learned.train import Report, Settings, train  # torch
+    from specshield.sim.learned.transformer import export, restore
 
-    settings = Settings() if rounds is None else Settings(rounds=rounds)
+    settings = Settings(**options)  # type: ignore[arg-type]
+    before = None if start is None else read(start)
     status, began = StatusLine(), time.monotonic()
 
     def show(report: Report) -> None:
@@ -49,7 +55,8 @@ def train_model(seed: int, rounds: int | None, with_cases: bool, out: Path) -> i
         )
         for case in cases
     ]
-    weights, options = export(train(settings, seed, practised, show)), settings.to_json()
+    begun = None if before is None else restore(before.weights)
+    weights = export(train(settings, seed, practised, show, begun))
     wall = time.monotonic() - began
     status.say("measuring ...")
     metrics = measure(weights, TEMPERATURE) | {"wall_time_s": round(wall, 1)}
@@ -58,9 +65,10 @@ def train_model(seed: int, rounds: int | None, with_cases: bool, out: Path) -> i
         "about": ABOUT + (WITH_CASES if with_cases else WITHOUT_CASES),
         "temperature": TEMPERATURE,
         "kinds": list(KINDS),
-        "options": options | {"with_cases": with_cases},
+        "options": settings.to_json() | {"with_cases": with_cases},
         "seed": seed,
         "metrics": metrics,
+        "started_from": None if before is None else before.card,
     }
     status.clear()
     write(out, weights, card)
@@ -95,11 +103,13 @@ def write(out: Path, weights: dict[str, Any], card: dict[str, Any]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Train the learned foundation model.")
     parser.add_argument("--seed", type=int, default=0, help="decides everything random")
-    parser.add_argument("--rounds", type=int, help="of practice and learning")
+    parser.add_argument("--option", action="append", default=[], help="a setting, as rounds=100; repeatable")
+    parser.add_argument("--start", type=Path, help="folder with a model to go on from")
     parser.add_argument("--with-cases", action="store_true", help="practise in the cases' apartments too")
     parser.add_argument("--out", type=Path, default=MODELS / FOLDER, help="folder to write to")
     chosen = parser.parse_args()
-    raise SystemExit(train_model(chosen.seed, chosen.rounds, chosen.with_cases, chosen.out))
+    options = {name: json.loads(value) for name, _, value in (text.partition("=") for text in chosen.option)}
+    raise SystemExit(train_model(chosen.seed, chosen.out, options, chosen.with_cases, chosen.start))
 
 
 if __name__ == "__main__":

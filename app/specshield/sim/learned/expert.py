@@ -101,6 +101,8 @@ def way_off_the_wall(
                 left = _metres(body, to_go, nx, ny)
                 onward = abs(bearing_of_way(body, to_go, nx, ny, heading)) / math.radians(30.0)
                 cost = k // 5 + k % 5 + onward + (left % OFF) / 0.2 + (AT_WALL if left >= OFF else 0.0)
+                if move == BACK:
+                    cost += 2.0 * BACKWARDS
                 if cost < best:
                     best, token = cost, move if k == 0 else nudge if k < 5 else turn
     return token

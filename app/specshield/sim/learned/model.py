@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,8 +49,8 @@ class LearnedModel:
 
 def load_learned(instruction: str, folder: Path = MODELS / FOLDER) -> LearnedModel:
     """The model in `folder`, told an instruction. Raises NotFound, PolicyError."""
-    weights, temperature = _read(folder)
-    return LearnedModel(weights, target_of(instruction), temperature)
+    shipped = read(folder)
+    return LearnedModel(shipped.weights, target_of(instruction), shipped.temperature)
 
 
 def target_of(instruction: str) -> str:
@@ -64,19 +64,27 @@ def target_of(instruction: str) -> str:
     return named[0]
 
 
+class Shipped(NamedTuple):
+    """A model as it is in a folder: checked weights, temperature, and the card."""
+
+    weights: dict[str, Array]
+    temperature: float
+    card: dict[str, Any]
+
+
 @lru_cache(maxsize=4)
-def _read(folder: Path) -> tuple[dict[str, Array], float]:
+def read(folder: Path) -> Shipped:
+    """Raises NotFound, PolicyError."""
     path = folder / WEIGHTS
     if not path.is_file():
         raise NotFound(
             "there is no learned model", path="model", got=str(folder), expected=f"{WEIGHTS} and {CARD}"
         )
     card = json.loads((folder / CARD).read_text())
-    return check(read_tensors(path.read_bytes())), read_temperature(card)
+    return Shipped(check(read_tensors(path.read_bytes())), _temperature(card), card)
 
 
-def read_temperature(card: Any) -> float:
-    """From a card. Raises PolicyError."""
+def _temperature(card: Any) -> float:
     value = card.get("temperature") if isinstance(card, dict) else None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.05 <= value <= 20.0:
         raise PolicyError(

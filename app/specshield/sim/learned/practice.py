@@ -101,8 +101,15 @@ class Practice:
     last. advice [N, A]: the expert's distribution. kind [N]: what each looks for. done [N]: it ended there.
     """
 
-    def __init__(self, apartments: Apartments, robots: int, random: np.random.Generator) -> None:
-        self.apartments, self.random = apartments, random
+    def __init__(
+        self,
+        apartments: Apartments,
+        robots: int,
+        random: np.random.Generator,
+        weight: NDArray[np.float64] | None = None,
+    ) -> None:
+        """weight (H,): the chance of each apartment; by default all are alike."""
+        self.apartments, self.random, self.weight = apartments, random, weight
         patches = apartments.room_of.shape[1]
         self.pose = np.zeros((robots, 3))
         self.senses = np.zeros((robots, INPUTS), np.float32)
@@ -114,7 +121,7 @@ class Practice:
     def reset(self, chances: Sequence[float]) -> None:
         """chances (K,): of each kind of target."""
         n, random, a = len(self.pose), self.random, self.apartments
-        self.house = random.integers(0, len(a.occupied), n)
+        self.house = random.choice(len(a.occupied), n, p=self.weight)
         there = ~np.isnan(a.targets[self.house, :, 0])
         wish = np.log(np.asarray(chances)) + random.gumbel(size=there.shape)
         self.kind = np.where(there, wish, -np.inf).argmax(axis=1)
@@ -278,4 +285,5 @@ def _look(
         near = seen and distance < END_WITHIN
         there = goal[n] != kind[n] and a.ways[i, goal[n], row, col] < THERE
         advise(own, representative, a.ways[i, goal[n]], x, y, theta, near, there, advice[n])
-        advise(own, representative, a.ways[i, other[n]], x, y, theta, False, False, detour[n])
+        there = a.ways[i, other[n], row, col] < THERE
+        advise(own, representative, a.ways[i, other[n]], x, y, theta, False, there, detour[n])

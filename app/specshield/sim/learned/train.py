@@ -1,4 +1,4 @@
-"""Training of the learned foundation model: imitation of shortest paths, in rounds; alone in importing torch.
+"""Training of the learned foundation model: imitation of shortest paths, in rounds.
 
 Each round the robots practise in random apartments, each driven by the expert or by what has been learned so
 far (DAgger: Ross et al., 2011), and the network learns the expert's answers to all that they met, of this
@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -22,19 +21,9 @@ from torch.nn import functional
 
 from specshield.sim.learned.expert import END
 from specshield.sim.learned.floor_plans import House, random_house
-from specshield.sim.learned.network import (
-    ACTIONS,
-    FEATURES,
-    KINDS,
-    LAYERS,
-    NOTHING,
-    SLOPES,
-    UNITS,
-    WINDOW,
-    Array,
-    features,
-)
+from specshield.sim.learned.network import ACTIONS, FEATURES, KINDS, features
 from specshield.sim.learned.practice import Practice, make_apartments, sample
+from specshield.sim.learned.transformer import Transformer
 
 CHANCES = (0.25, 0.25, *([0.125] * (len(KINDS) - 2)))  # of each kind: two of them are kept in kitchens
 
@@ -44,120 +33,19 @@ WRONG_END = 3.0  # what an `end` at the wrong place costs, beside the imitation
 
 @dataclass(frozen=True)
 class Settings:
-    houses: int = 400
-    rounds: int = 300
+    houses: int = 250
+    rounds: int = 380
     robots: int = 64  # episodes a round
     steps: int = 256  # of an episode, at most
     passes: int = 2  # over as many episodes as a round has, drawn from the recent ones
     recent: int = 20  # rounds
-    batch: int = 16  # episodes
+    batch: int = 8  # episodes
     learning_rate: float = 1e-3
-    own: float = 0.7  # share of the episodes that the network drives itself, from a third of the rounds on
+    given: float = 0.25  # share of the episodes in given apartments, where there are any
+    own: float = 0.8  # share of the episodes that the network drives itself, from a third of the rounds on
 
     def to_json(self) -> dict[str, float]:
         return asdict(self)
-
-
-class Transformer(nn.Module):
-    """Like network.py, which has the words: all steps of an episode at once, or one with what is cached."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.sense1, self.sense2 = nn.Linear(FEATURES, 2 * UNITS), nn.Linear(2 * UNITS, UNITS)
-        self.last, self.kind = nn.Embedding(NOTHING + 1, UNITS), nn.Embedding(len(KINDS), UNITS)
-        self.blocks = nn.ModuleList(Block() for _ in range(LAYERS))
-        self.norm, self.head = nn.LayerNorm(UNITS), nn.Linear(UNITS, ACTIONS)
-        for embedding in (self.last, self.kind):
-            nn.init.normal_(embedding.weight, std=0.3)
-
-    def embed(self, x: torch.Tensor, last: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
-        out: torch.Tensor = self.sense2(torch.relu(self.sense1(x))) + self.last(last) + self.kind(kind)
-        return out
-
-    def forward(self, x: torch.Tensor, last: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
-        """x [B, T, FEATURES], last [B, T], kind [B]; logits [B, T, A]."""
-        h = self.embed(x, last, kind[:, None])
-        bias = biases(x.shape[1])
-        for block in self.blocks:
-            h = block(h, bias)
-        out: torch.Tensor = self.head(self.norm(h))
-        return out
-
-    def begin(self, robots: int, steps: int) -> None:
-        """Empties the cache."""
-        shape = (robots, len(SLOPES), steps, UNITS // len(SLOPES))
-        self.cache = [(torch.zeros(shape), torch.zeros(shape)) for _ in self.blocks]
-        self.bias = biases(steps)
-
-    def keep(self, these: torch.Tensor) -> None:
-        """Goes on with some of the robots: bool [B]."""
-        self.cache = [(keys[these], values[these]) for keys, values in self.cache]
-
-    @torch.no_grad()
-    def distribution(
-        self, t: int, x: Array, last: NDArray[np.int64], kind: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
-        """Probabilities [B, A] of step t; x [B, FEATURES]."""
-        out: NDArray[np.float32] = self.step(t, *map(torch.from_numpy, (x, last, kind))).softmax(-1).numpy()
-        return out
-
-    def step(self, t: int, x: torch.Tensor, last: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
-        """Logits [B, A] of step t; x [B, FEATURES]."""
-        h = self.embed(x, last, kind)
-        for block, (keys, values) in zip(self.blocks, self.cache, strict=True):
-            h = cast(Block, block).step(t, h, keys, values, self.bias[:, t, : t + 1])
-        out: torch.Tensor = self.head(self.norm(h))
-        return out
-
-
-def export(network: Transformer) -> dict[str, Array]:
-    """The weights as network.py takes them: w [inputs, outputs]."""
-    tensors = {}
-    for name, tensor in network.state_dict().items():
-        array = tensor.detach().numpy()
-        if name in ("last.weight", "kind.weight"):
-            tensors[name.removesuffix(".weight")] = array.copy()
-        else:
-            serving = name.removeprefix("blocks.").replace(".weight", ".w").replace(".bias", ".b")
-            tensors[serving] = np.ascontiguousarray(array.T if array.ndim == 2 else array).copy()
-    return tensors
-
-
-class Block(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.norm1, self.norm2 = nn.LayerNorm(UNITS), nn.LayerNorm(UNITS)
-        self.qkv, self.out = nn.Linear(UNITS, 3 * UNITS), nn.Linear(UNITS, UNITS)
-        self.up, self.down = nn.Linear(UNITS, 4 * UNITS), nn.Linear(4 * UNITS, UNITS)
-
-    def forward(self, h: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
-        b, t, d = h.shape
-        q, k, v = self.qkv(self.norm1(h)).view(b, t, 3, len(SLOPES), -1).permute(2, 0, 3, 1, 4)
-        a = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias)
-        h = h + self.out(a.transpose(1, 2).reshape(b, t, d))
-        return h + self._mlp(h)
-
-    def step(
-        self, t: int, h: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, bias: torch.Tensor
-    ) -> torch.Tensor:
-        b, d = h.shape
-        q, k, v = self.qkv(self.norm1(h)).view(b, 3, len(SLOPES), -1).unbind(1)
-        keys[:, :, t], values[:, :, t] = k, v
-        weights = (keys[:, :, : t + 1] @ q[..., None])[..., 0] / q.shape[-1] ** 0.5 + bias
-        a = weights.softmax(-1)[:, :, None] @ values[:, :, : t + 1]
-        h = h + self.out(a.reshape(b, d))
-        return h + self._mlp(h)
-
-    def _mlp(self, h: torch.Tensor) -> torch.Tensor:
-        out: torch.Tensor = self.down(torch.relu(self.up(self.norm2(h))))
-        return out
-
-
-def biases(steps: int) -> torch.Tensor:
-    """What is added to the attention of step i to step j, [heads, T, T]: less the longer ago, none ahead."""
-    ago = torch.arange(steps)[:, None] - torch.arange(steps)[None, :]
-    bias = -torch.tensor(SLOPES)[:, None, None] * ago
-    return bias.masked_fill((ago < 0) | (ago >= WINDOW), float("-inf"))
 
 
 @dataclass
@@ -202,15 +90,21 @@ def practise(
 
 
 def train(
-    settings: Settings, seed: int, houses: list[House], on_round: Callable[[Report], None]
+    settings: Settings,
+    seed: int,
+    given: list[House],
+    on_round: Callable[[Report], None],
+    start: Transformer | None = None,
 ) -> Transformer:
-    """houses: apartments to practise in besides `settings.houses` random ones."""
+    """given: apartments to practise in besides `settings.houses` random ones. start: goes on from it."""
     torch.set_num_threads(1)  # more of them wait for each other, one practises meanwhile
     random = np.random.default_rng(seed)
     torch.manual_seed(seed)
-    houses = houses + [random_house(random) for _ in range(settings.houses)]
-    practice = Practice(make_apartments(houses), settings.robots, random.spawn(1)[0])
-    network, actor = Transformer(), Transformer()
+    houses = given + [random_house(random) for _ in range(settings.houses)]
+    weight = np.full(len(houses), (1.0 - settings.given if given else 1.0) / settings.houses)
+    weight[: len(given)] = settings.given / max(len(given), 1)
+    practice = Practice(make_apartments(houses), settings.robots, random.spawn(1)[0], weight)
+    network, actor = start or Transformer(), Transformer()
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=0.01)
     rounds: list[Episodes] = []
     own = random.spawn(1)[0]
