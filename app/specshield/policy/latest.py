@@ -111,7 +111,7 @@ def latest_times(
                             _settle(rules, holds, added, later, float(phases[j].start), table)
             table[table > phase.end] = phase.end
             table[(table < phase.start) | (valid[i] == 0)] = NEVER
-            _sweep(lattice, valid[i], float(phase.start), table)
+            sweep(lattice, valid[i], float(phase.start), table)
     return tables, valid
 
 
@@ -200,7 +200,7 @@ def bilinear(valid: NDArray[np.uint8], table: NDArray[np.float32], v: float, u: 
 
 
 @kernel
-def _sweep(lattice: Lattice, valid: NDArray[np.uint8], start: float, table: NDArray[np.float32]) -> None:
+def sweep(lattice: Lattice, valid: NDArray[np.uint8], start: float, table: NDArray[np.float32]) -> None:
     """Relaxes max_a L(f(s, a)) - 1 in place to its fixed point, visiting only cells near what changed.
 
     start: the phase's first step, before which there is no time.

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.policy.residual import residuals
 from specshield.policy.view import view_of
 from specshield.shield import shaping
 from specshield.shield.aim import aim
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho
-from specshield.shield.residual import residuals
 from specshield.stl import SATISFIED_ABOVE
 
 Floats = NDArray[np.float64]

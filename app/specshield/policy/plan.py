@@ -1,0 +1,352 @@
+"""Plans for any formula: go to where a predicate holds, stay, go on; searched in exact simulation.
+
+A node of the search is a simulated prefix. Its children serve one literal each, the one due first before
+the others: walk to where it holds and stay until it is not due any more. A child that no continuation can
+save (the upper bound on rho) is cut; a node from which staying to the horizon satisfies the formula ends the
+search. The order is right nearly always, so the search tries first the ways that depart least from it
+(limited discrepancy search, Harvey and Ginsberg 1995). What it may spend is counted, not timed: one question
+has one answer.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel, leaf
+from specshield.policy.agenda import (
+    NEVER,
+    Bounds,
+    due,
+    foresee,
+    is_open,
+    needed_until,
+    read_signals,
+    stay_for,
+)
+from specshield.policy.approach import (
+    BEGIN,
+    DUE,
+    LENGTH,
+    UNTIL,
+    WIDTH,
+    Work,
+    World,
+    beam,
+    holds,
+    move,
+    read_at,
+    stay,
+    walk,
+)
+from specshield.policy.fields import to_go_at
+from specshield.robot.unicycle import Body, step
+from specshield.stl.program import STACK_SIZE
+from specshield.stl.tree import tree_value
+
+DEEP = 128  # nodes on one way, at most
+BAND = 6.0  # [steps] how far the fields may err
+SPARE = 3  # [steps] left over where one departs as late as can be
+SHARE = 0.25  # of the effort of one plan: what a first motion may cost that the plan does not begin with
+
+MADE, COUNT, TRIED, OPENED, USED = range(5)  # of a node
+KEY, LITERAL, BEFORE, STAY, KEEP = range(5)  # of a child
+FIRST, SECOND, LATER, LAST = 0, 1 << 20, 1 << 21, 1 << 22  # its key: which kind comes first; then what is due
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Nodes(NamedTuple):
+    """The nodes from the root to the newest.
+
+    state [DEEP, 5]: motions MADE, COUNT of children, how many were TRIED, how many of those were OPENED,
+    discrepancies USED. need [DEEP, L, 3]: by when a literal is DUE, and from which step (BEGIN) UNTIL which
+    it has to hold throughout. child [DEEP, C, 5], by KEY: go to LITERAL after waiting BEFORE steps, and STAY
+    there (1) or not (0); or, with KEEP, go at once but keep that literal for the next BEFORE steps; or, with
+    LITERAL -1, STAY that long here.
+    """
+
+    state: Ints
+    need: Ints
+    child: Ints
+
+
+@leaf
+def _value(world: World, work: Work) -> float:
+    """rho of a way that is complete."""
+    for i in range(work.buffer.shape[0]):
+        work.buffer[i] = work.known[i]
+    work.spent[0] += world.cost
+    return tree_value(world.agenda.rule.tree, work.buffer)
+
+
+@leaf
+def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, keep: int) -> None:
+    """Adds a child to the node on depth d, in its place among those not tried yet."""
+    i, child = nodes.state[d, COUNT], nodes.child
+    if i == child.shape[1]:
+        return
+    nodes.state[d, COUNT] += 1
+    while i > nodes.state[d, TRIED] and child[d, i - 1, KEY] > key:
+        for c in range(child.shape[2]):
+            child[d, i, c] = child[d, i - 1, c]
+        i -= 1
+    child[d, i, KEY], child[d, i, LITERAL], child[d, i, BEFORE] = key, literal, before
+    child[d, i, STAY], child[d, i, KEEP] = stays, keep
+
+
+@leaf
+def _guarding(world: World, need: Ints) -> bool:
+    """Whether something has to hold for a while that not every field keeps."""
+    guarding = False
+    for k in range(need.shape[0]):
+        guarding = guarding or (need[k, UNTIL] >= 0 and world.field[k, 0] != world.field[k, 1])
+    return guarding
+
+
+@leaf
+def _expand(
+    world: World, t: int, d: int, n: int, used: int, motions: Ints, poses: Floats, work: Work, nodes: Nodes
+) -> bool:
+    """Makes the node on depth d, of motions[:n]. Whether staying here satisfies the formula."""
+    agenda, margin, steps, s, need = world.agenda, world.margin, motions.shape[0], t + n, nodes.need[d]
+    state = nodes.state[d]
+    state[MADE], state[USED], state[COUNT], state[TRIED], state[OPENED] = n, used, 0, 0, 0
+    stay(world, t, n, steps, motions, poses, work)
+    work.spent[0] += 0.1 * (steps - n)
+    if _value(world, work) > margin:
+        return True
+    read_at(world, poses, n, work)
+    foresee(agenda, s, work.known, work.held, work.bounds.low, work.bounds.high)
+    x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
+    bits = 2.0 + math.log2(float(steps))
+    for k in range(need.shape[0]):
+        work.spent[0] += 2.0 * bits * world.cost
+        by = due(agenda, k, s, margin, work.bounds)
+        need[k, DUE], need[k, BEGIN], need[k, UNTIL] = by, NEVER, -1
+        if by != NEVER:
+            until = needed_until(agenda, k, s, by, margin, work.bounds)
+            if until >= by:
+                need[k, BEGIN], need[k, UNTIL] = by, until
+    dwelling, dwell = -1, 0
+    for k in range(need.shape[0]):
+        by = need[k, DUE]
+        if by == NEVER or not holds(world, k, work.rho):
+            continue
+        stays = stay_for(agenda, k, s, by, steps - n, margin, work.bounds)
+        work.spent[0] += bits * world.cost
+        if stays <= steps - n and (stays > 1 or (stays == 1 and need[k, BEGIN] == s + 1)):
+            _add(nodes, d, SECOND + by, -1, 0, stays, -1)
+            if stays < steps - n:
+                dwelling, dwell = k, stays
+    for k in range(need.shape[0]):
+        by, f = need[k, DUE], world.field[k, 0]
+        if f < 0 or holds(world, k, work.rho):
+            continue
+        ahead = to_go_at(world.body, world.fields, f, x, y, theta)
+        if not ahead - BAND < min(steps - n, by - s):
+            continue
+        if dwelling >= 0:
+            _add(nodes, d, SECOND + min(by, LAST), k, dwell, 1, dwelling)
+        if by == NEVER:
+            _add(nodes, d, LAST + int(ahead), k, 0, 1, -1)
+            continue
+        _add(nodes, d, FIRST + by, k, 0, 1, -1)
+        late = by - s - math.ceil(ahead) - SPARE
+        if late > 1:
+            _add(nodes, d, LATER + by, k, late, 1, -1)
+    return False
+
+
+@leaf
+def _serve(
+    world: World, t: int, d: int, c: int, motions: Ints, poses: Floats, work: Work, nodes: Nodes
+) -> int:
+    """Makes child c of the node on depth d: how many motions there are then, -1 where it leads nowhere."""
+    agenda, margin, steps, need = world.agenda, world.margin, motions.shape[0], nodes.need[d]
+    n = nodes.state[d, MADE]
+    k, before, stays = nodes.child[d, c, LITERAL], nodes.child[d, c, BEFORE], nodes.child[d, c, STAY]
+    keep = nodes.child[d, c, KEEP]
+    if k < 0:
+        stay(world, t, n, n + stays, motions, poses, work)
+        n += stays
+    else:
+        by = need[k, DUE]
+        begin, until = 0, 0
+        if keep >= 0:
+            begin, until = need[keep, BEGIN], need[keep, UNTIL]
+            need[keep, BEGIN], need[keep, UNTIL] = t + n + 1, t + n + before
+        else:
+            stay(world, t, n, n + before, motions, poses, work)
+            n += before
+        arrived, guarding = -1, _guarding(world, need)
+        for column in range(1, -1, -1):
+            f = world.field[k, column]
+            if arrived < 0 and f >= 0 and (column == 0 or guarding):
+                stop, waits = min(steps, by - t), column == 0 or keep >= 0
+                arrived = walk(world, k, f, waits, t, n, stop, need, motions, poses, work)
+                if arrived < 0:  # it came too late, or got stuck: look at more than one way
+                    arrived = beam(world, k, f, t, n, stop, 0.0, LENGTH, need, motions, poses, work)
+        if keep >= 0:
+            need[keep, BEGIN], need[keep, UNTIL] = begin, until
+        if arrived < 0:
+            return -1
+        n = arrived
+        if by != NEVER and stays == 1:
+            foresee(agenda, t + n, work.known, work.held, work.bounds.low, work.bounds.high)
+            stays = stay_for(agenda, k, t + n, by, steps - n, margin, work.bounds)
+            work.spent[0] += 8.0 * world.cost
+            if 0 < stays <= steps - n:
+                if before == 0:  # or wait first and go there when it counts, or go on before it is served
+                    _add(nodes, d, SECOND + by, k, stays, 1, -1)
+                    _add(nodes, d, LATER + by, k, 0, 0, -1)
+                stay(world, t, n, n + stays, motions, poses, work)
+                n += stays
+    foresee(agenda, t + n, work.known, work.held, work.bounds.low, work.bounds.high)
+    work.spent[0] += world.cost
+    return n if is_open(agenda, -1, t + n, 0, 0, 0, margin, work.bounds) else -1
+
+
+@leaf
+def _search(
+    world: World, t: int, n: int, effort: float, motions: Ints, poses: Floats, work: Work, nodes: Nodes
+) -> bool:
+    """A way to the horizon that satisfies the formula, on from motions[:n], into motions (T - t,) and
+    poses (T - t + 1, 3), which begins with x_t. work.known: the leaves to step t + n. effort [about us].
+    """
+    state, most = nodes.state, work.spent[0] + effort
+    limit, cut = 0, True  # discrepancies allowed, and whether ways with more were left out
+    d, made, used = -1, n, 0
+    while True:
+        if made >= 0:
+            d += 1
+            if _expand(world, t, d, made, used, motions, poses, work, nodes):
+                return True
+            made = -1
+        more = state[d, TRIED] < state[d, COUNT]
+        if more and work.spent[0] > most:
+            return False
+        if not more or state[d, USED] + state[d, OPENED] > limit or d + 1 == DEEP:
+            cut = cut or more
+            d -= 1
+            if d < 0:
+                if not cut:
+                    return False
+                limit, cut, made, used = limit + 1, False, n, 0
+            continue
+        state[d, TRIED] += 1
+        after = _serve(world, t, d, state[d, TRIED] - 1, motions, poses, work, nodes)
+        if after > state[d, MADE]:
+            made, used = after, state[d, USED] + state[d, OPENED]
+            state[d, OPENED] += 1
+
+
+@leaf
+def _undoing(body: Body, pose: Floats, reached: Floats) -> int:
+    """The motion that leads from `reached` back to `pose`, -1 where it is the same, -2 where none does."""
+    if _same(pose[0], pose[1], pose[2], reached):
+        return -1
+    for m in range(body.translate.shape[0]):
+        x, y, theta = step(body, reached[0], reached[1], reached[2], m)
+        if _same(x, y, theta, pose):
+            return m
+    return -2
+
+
+@leaf
+def _same(x: float, y: float, theta: float, pose: Floats) -> bool:
+    turn = abs(theta - pose[2])
+    return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)
+
+
+@leaf
+def _rejoin(world: World, t: int, base: Ints, motions: Ints, poses: Floats, work: Work) -> bool:
+    """Undoes the first motion and goes by `base` (T - t,), a way from x_t; the steps lost are made up where
+    it stays. Whether that satisfies the formula.
+    """
+    back = _undoing(world.body, poses[0], poses[1])
+    if back == -2:
+        return False
+    behind, at, steps = 1 if back < 0 else 2, 0, motions.shape[0]
+    for n in range(1, steps):
+        motion = back
+        if n > 1 or back < 0:
+            while behind > 0 and at < steps and base[at] == world.pad:
+                at += 1
+                behind -= 1
+            motion = base[at] if at < steps else world.pad
+            at += 1
+        move(world, t, n, motion, motions, poses, work)
+    work.spent[0] += 0.3 * steps
+    return _value(world, work) > world.margin
+
+
+@kernel
+def propose_all(
+    world: World,
+    t: int,
+    pose: Floats,
+    signals: Floats,
+    prefix: Floats,
+    effort: float,
+    motions: Ints,
+    poses: Floats,
+) -> tuple[int, bool]:
+    """A continuation a first motion, into motions (M, T - t) and poses (M, T - t + 1, 3); returns the motion
+    that the plan from x_t takes, and whether there is one.
+
+    signals (S,): those held; prefix (size,): the formula's leaves to step t. One plan is made from x_t, if
+    there is one. For the other first motions it is enough to undo them and go the same way; where that comes
+    too late, they are planned for themselves.
+    """
+    agenda, (count, steps) = world.agenda, motions.shape
+    size, literals, leaves = prefix.shape[0], agenda.literal.shape[0], agenda.leaf.shape[0]
+    bounds = Bounds(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
+    values = np.zeros(3 + agenda.rule.first.shape[0] + signals.shape[0])
+    values[values.shape[0] - signals.shape[0] :] = signals
+    work = Work(
+        values, np.empty(STACK_SIZE), np.empty(agenda.predicate.shape[0]), np.empty(leaves), prefix.copy(),
+        np.empty(size), bounds, np.empty(count), np.empty((LENGTH + 1, WIDTH, 4)),
+        np.empty((LENGTH + 1, WIDTH, 2), np.int64), np.zeros(1),
+    )  # fmt: skip
+    nodes = Nodes(
+        np.empty((DEEP, 5), np.int64), np.empty((DEEP, literals, 3), np.int64),
+        np.empty((DEEP, 6 * literals + 1, 5), np.int64),
+    )  # fmt: skip
+    read_signals(agenda, work.values, work.stack, work.held)
+    way, places = np.empty(steps, np.int64), np.empty((steps + 1, 3))
+    base = -1
+    for root in range(
+        -2, count
+    ):  # x_t itself, staying (what others can fall back on), then every other motion
+        m = world.pad if root < 0 else root
+        if root >= -1 and (m == base or (root >= 0 and m == world.pad)):
+            continue
+        work.known[:] = prefix
+        work.spent[0] = 0.0
+        places[0] = pose
+        n, found = 0, False
+        if root >= -1:
+            read_at(world, places, 0, work)
+            move(world, t, 0, m, way, places, work)
+            n = 1
+            if base >= 0:
+                found = _rejoin(world, t, motions[base], way, places, work)
+        read_at(world, places, n, work)
+        foresee(agenda, t + n, work.known, work.held, work.bounds.low, work.bounds.high)
+        if not found and is_open(agenda, -1, t + n, 0, 0, 0, world.margin, work.bounds):
+            found = _search(world, t, n, effort * (1.0 if n == 0 else SHARE), way, places, work, nodes)
+        if root == -2 and not found:
+            continue
+        if root == -2:
+            m = way[0]
+        if found and base < 0:
+            base = m
+        if not found:
+            stay(world, t, n, steps, way, places, work)
+        motions[m], poses[m] = way, places
+    return (base, True) if base >= 0 else (world.pad, False)
