@@ -20,6 +20,7 @@ from specshield.robot.unicycle import step
 
 MAX_ROOTS = 62  # bits of a tag
 ROOM = 128  # poses kept at a step, at most
+MANY = 16  # motions from a pose: of more, only those that are nearly the best
 EASY = 8.0  # [steps] of slack after a goal was settled: from there the tables can be followed again
 TWIN = 1e3  # [1/m, 1/rad] poses as near as a millimetre count as one
 
@@ -138,8 +139,9 @@ def _expand(
             continue
         x, y, theta = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
         score(body, rules, tables, x, y, theta, t + n, here.status[w], here.run[w], wait, -1, work.scores)
+        lowest = max(band + t + n + 1, _lowest(work.scores))
         for m in range(body.translate.shape[0]):
-            if work.scores[m] - (t + n + 1) < band:
+            if work.scores[m] < lowest:
                 continue
             x, y, theta = step(body, here.pose[w, 0], here.pose[w, 1], here.pose[w, 2], m)
             _copy(here, w, new, found)
@@ -159,6 +161,25 @@ def _expand(
                 joined += 1
     edges.made[n] = joined
     return found
+
+
+@leaf
+def _lowest(scores: NDArray[np.float64]) -> float:
+    """The score from which on a motion is tried: of many motions only those that are nearly the best."""
+    if scores.shape[0] <= MANY:
+        return -np.inf
+    best = -np.inf
+    for m in range(scores.shape[0]):
+        best = max(best, scores[m])
+    gap = 4.0
+    while gap > 0.1:
+        count = 0
+        for m in range(scores.shape[0]):
+            count += scores[m] >= best - gap
+        if count <= MANY:
+            break
+        gap *= 0.5
+    return best - gap
 
 
 @leaf

@@ -32,7 +32,7 @@ SMALL_SHARE = 512
 class Starts(NamedTuple):
     """After each first motion [M]: the progress, the slack, whether a way was found.
 
-    turn, move: the motions that undo it, nearly; -1 where none is needed, -2 where there is none.
+    turn, move: the motions that undo it, nearly; -1 where none is needed, a turn of -2 where there is none.
     """
 
     status: NDArray[np.int8]
@@ -75,10 +75,10 @@ def propose_all(
     base = -1
     for m in order:
         turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
-        if base >= 0 and turn > -2 and move > -2:
+        if base >= 0 and turn > -2:
             _resume(starts.status[m], starts.run[m], work)
             starts.settled[m] = rejoin(guide, t, turn, move, motions[base], motions[m], poses[m], work)
-        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == -2 or move == -2):
+        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == -2):
             _resume(starts.status[m], starts.run[m], work)
             escapes = ahead >= (0.0 if base < 0 else EASY)
             starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
@@ -142,24 +142,22 @@ def _first_steps(
 
 @leaf
 def _turning_back(body: Body, motion: int) -> int:
-    """The turn that undoes a motion's, -1 where it turns nothing, -2 where there is none."""
-    return _motion_by(body, 0.0, -body.rotate[motion]) if body.rotate[motion] != 0.0 else -1
+    """The turn that undoes a motion's, -2 where there is none."""
+    for m in range(body.translate.shape[0]):
+        if body.translate[m] == 0.0 and body.rotate[m] == -body.rotate[motion]:
+            return m
+    return -2
 
 
 @leaf
 def _moving_back(body: Body, motion: int, moved: float) -> int:
-    """The move that brings the robot nearer to where it was, having moved so far; -1, -2 as above."""
-    if moved <= 0.5 * abs(body.translate[motion]):
-        return -1
-    return _motion_by(body, -body.translate[motion], 0.0)
-
-
-@leaf
-def _motion_by(body: Body, translate: float, rotate: float) -> int:
+    """The move that brings the robot nearest to where it was, having moved so far [m]; -1: none helps."""
+    ahead = moved if body.translate[motion] > 0.0 else -moved
+    best, left = -1, 0.75 * moved
     for m in range(body.translate.shape[0]):
-        if body.translate[m] == translate and body.rotate[m] == rotate:
-            return m
-    return -2
+        if body.rotate[m] == 0.0 and abs(ahead + body.translate[m]) < left:
+            best, left = m, abs(ahead + body.translate[m])
+    return best
 
 
 @leaf

@@ -35,6 +35,7 @@ SPARE = 10.0  # [steps] of slack from which on a few are spent on going deeper
 DEEP = 0.2  # [m] inside a goal: robust enough
 DEEPER = 0.01  # [m] by which a step has to lead deeper
 SPARE = 10.0  # [steps] of slack above which some are spent on going deeper
+TIE = 0.5  # [steps] by which a motion has to be better than waiting, where waiting pays
 FAILED, SETTLED_ALL, STUCK = 0, 1, 2
 
 
@@ -164,11 +165,11 @@ def walk(
         phase = tables.phase[t + n + 1]
         chosen, goal = -1, -1
         while True:
-            best = wait  # waiting wins ties
+            best = wait
             for m in range(scores.shape[0]):
                 if scores[m] > scores[best]:
                     best = m
-            if best == wait and scores[wait] > HOPELESS:
+            if scores[wait] > HOPELESS and scores[wait] > scores[best] - TIE:
                 waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - 0.1
                 goal = _pays_to_wait(rules, t + n, x, y, theta, work)
                 if waits_for_phase or goal >= 0:
