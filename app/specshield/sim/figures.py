@@ -30,7 +30,7 @@ OF_MODE = {
     "shaped": "#2563c8", "switched": "#e27d22", "completion": "#2b8a5a", "prior": "#c9ccd3",
     "fallback": "#f6be28", "violated": "#c63c3c",
 }  # fmt: skip
-STYLE = {
+STYLE: Any = {
     "font.size": 9.0, "axes.edgecolor": FAINT, "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK,
     "ytick.color": INK, "axes.spines.top": False, "axes.spines.right": False, "axes.titlesize": 10.0,
     "axes.titleweight": "bold", "axes.titlelocation": "left", "legend.frameon": False,
