@@ -73,6 +73,10 @@ def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path)
 
 def test_report_writes_a_page_and_its_pictures(tmp_path):
     pytest.importorskip("matplotlib")
+    kept = tmp_path / "results" / "case2" / "gaussian"
+    kept.mkdir(parents=True)
+    calibration = {"method": "ours@0.04/4", "margin": 0.0391, "runs": 60}
+    (kept / "calibration.json").write_text(json.dumps({"ours@conformal/4": calibration}))
     arguments = ["--runs", "2", "--processes", "1", "--out", str(tmp_path / "results")]
     specshield("evaluate", "--case", "2", "--methods", "unmodified,simplex", *arguments)
     specshield("evaluate", "--case", "2", "--methods", "ours@conformal/4", "--noise", "gaussian", *arguments)
@@ -80,8 +84,8 @@ def test_report_writes_a_page_and_its_pictures(tmp_path):
     specshield("report", str(tmp_path / "results"), "--out", str(page))
     text = page.read_text()
     assert "| case2 | unmodified | 0 % | 99 % | 0 % | 100 % |" in text
-    assert "| gaussian | ours@0.0" in text
-    assert "it covered every step of" in text
+    assert "| gaussian | ours@0.04/4 | 2 of 2 (15.8 to 100.0 %)" in text
+    assert "ours@0.04/4: 0.0391 m from 60 other runs; it covered every step of" in text
     for name in ("ways", "robustness", "mass", "modes"):
         assert f"![{name} of case2](page/case2/{name}.png)" in text
         assert (tmp_path / "page" / "case2" / f"{name}.png").stat().st_size > 10_000
@@ -161,7 +165,7 @@ def test_train_computes_a_policy_too(tmp_path):
     [
         (["evaluate", "--case", "case9"], "one of case1, case2"),
         (["train", "--case", "case1", "--method", "dqn", "--option", "units=9000"], "from 4 to 128"),
-        (["train", "--case", "case1", "--method", "magic"], "'dqn' or 'reachability'"),
+        (["train", "--case", "case1", "--method", "magic"], "'dqn', 'planner' or 'reachability'"),
     ],
 )
 def test_a_mistake_is_told_in_a_line(arguments, said):

@@ -1,6 +1,7 @@
 """Campaigns: the same records whichever process made them, and whether at once or in two goes."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from tests.serving import wait_for
 
 from specshield.errors import InputError, NotFound, StoreError
 from specshield.service.embedded import EmbeddedStore
+from specshield.sim import calibration
 from specshield.sim.cases import load_case
 from specshield.sim.evaluation import evaluate
 from specshield.sim.experiment import Experiment
@@ -81,6 +83,19 @@ def test_processes_and_a_second_go_make_the_same_records(serial, tmp_path):
     assert same(evaluate(EXPERIMENT, 2, METHODS, tmp_path)) == same(serial[:4])
     with pytest.raises(InputError):
         evaluate(Experiment("case1", seed=6), 1, METHODS, tmp_path)
+
+
+def test_a_margin_is_calibrated_on_other_runs_and_kept(monkeypatch, tmp_path):
+    monkeypatch.setattr(calibration, "RUNS", 19)
+    asked = "ours@conformal/8"
+    chosen = calibration.calibrated(EXPERIMENT, asked, tmp_path, 1)
+    kept = json.loads((tmp_path / "calibration.json").read_text())[asked]
+    assert kept["method"] == chosen == f"ours@{math.ceil(1e3 * kept['margin']) / 1e3:g}/8"
+    assert 0.03 < kept["margin"] < 0.06  # some 100 motions of sigma 0.01 m and 0.5 degrees
+    assert kept["seed"] != EXPERIMENT.seed
+    monkeypatch.setattr(calibration, "evaluate", None)  # not asked again
+    assert calibration.calibrated(EXPERIMENT, asked, tmp_path, 1) == chosen
+    assert calibration.calibrated(EXPERIMENT, "ours@0.1", tmp_path, 1) == "ours@0.1"
 
 
 @pytest.fixture

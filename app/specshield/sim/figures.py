@@ -21,6 +21,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
+from matplotlib.patheffects import Normal, Stroke
 
 WAYS = 6  # runs drawn on a map
 INK, FAINT, WALL, PAPER = "#282b32", "#9ea0a5", "#343840", "#faf9f6"
@@ -97,7 +98,8 @@ def _floor(axis: Axes, case: Case) -> None:
         axis.contour(x, y, depth, levels=[0.0], colors=[color], linewidths=1.0)
         rows, columns = np.nonzero(depth > 0.0)
         below = points[rows.min(), int(columns[rows == rows.min()].mean())] - (0.0, 0.08)
-        axis.annotate(name, below, color=color, fontsize=6.5, ha="center", va="top")
+        halo = [Stroke(linewidth=2.0, foreground=PAPER), Normal()]  # readable across a wall
+        axis.annotate(name, below, color=color, fontsize=6.5, ha="center", va="top", path_effects=halo)
     axis.set_axis_off()
 
 
@@ -141,7 +143,7 @@ def _band(axis: Axes, values: Floats, name: str, color: str) -> None:
     there = np.isfinite(values).any(axis=0)
     low, middle, high = np.nanpercentile(values[:, there], (10, 50, 90), axis=0)
     steps = np.flatnonzero(there)
-    axis.fill_between(steps, low, high, color=color, alpha=0.12, lw=0)
+    axis.fill_between(steps, low, high, color=color, alpha=0.08, lw=0)
     axis.plot(steps, middle, color=color, lw=1.6, label=name)
 
 
