@@ -42,6 +42,18 @@ NOISES = {
     "collider": "the Stretch's off-centre footprint, told as a centred one",
 }
 
+MODELS = {
+    "goal-seeker": "goal-seeker, a stand-in that is told the way along free space and strays from it",
+    "learned": "learned, a transformer that imitates shortest paths, from egocentric senses",
+}
+WHY_NEXT_STEP = """\
+Next-step methods keep a G, and of a window they see the last step alone: where the place to visit is further
+than that, nothing is left to choose. What RCD adds to the logits leads straight at a place, walls or not."""
+WHY_SLACK = """\
+Projection lets a model put a visit off to the last step from which it can still be certified, and noise then
+takes that step: slack gives time back. A margin keeps room to what is forbidden, and asks for visits that are
+not grazed."""
+
 Results = dict[str, Any]
 
 
@@ -84,6 +96,9 @@ def _sections(found: dict[Path, Results], drawn: dict[Path, list[Path]], page: P
     yield METHODS.format(alpha=ALPHA, beta=BETA)
     yield "## Beside the paper's Table II"
     yield _beside(cases.values())
+    yield WHY_NEXT_STEP
+    used = dict.fromkeys(_model(results) for results in found.values())
+    yield f"Models: {'; '.join(MODELS[name] for name in used)}. They know no rule."
     for kept, results in told.items():
         yield f"## {results['case']}: method by method"
         yield _about(results)
@@ -98,9 +113,14 @@ def _sections(found: dict[Path, Results], drawn: dict[Path, list[Path]], page: P
         for case in dict.fromkeys(r["case"] for r in disturbed):
             yield f"### {case}"
             yield _noise_table([r for r in found.values() if r["case"] == case])
+        yield WHY_SLACK
         yield from _calibrations(found)
     yield "## How it was run"
     yield "```sh\n" + "\n".join(_commands(found.values())) + "\n```"
+
+
+def _model(results: Results) -> str:
+    return str(results["experiment"]["model"])
 
 
 def _about(results: Results) -> str:
