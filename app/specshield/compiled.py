@@ -34,6 +34,14 @@ def inlined(function: F) -> F:
     return _leaf(function, forceinline=True)
 
 
+def merged(function: F) -> F:
+    """A kernel that is written into the one that calls it: each that is compiled by itself, with all that it
+    calls, costs seconds.
+    """
+    compiled: F = njit(inline="always")(function)
+    return compiled
+
+
 def _leaf(function: F, **options: bool) -> F:
     try:
         compiled: F = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, **options)(function)

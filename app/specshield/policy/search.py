@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import kernel, leaf, merged
 from specshield.policy.beam import EASY, MAX_ROOTS, beam
 from specshield.policy.progress import forgive, replay
 from specshield.policy.tables import HOPELESS, SAFE, goals_settled, slack
@@ -69,11 +69,13 @@ def propose_all(
     order = np.empty(count, np.int64)
     _first_steps(guide, t, history[t], status, run, motions, poses, starts, work)
     _by_slack(starts.slack, order)
-    if guide.wait < 0:
-        _propose_restless(guide, t, width, order, starts, motions, poses, work)
-        return int(order[0])
-    base = -1
+    waits, base = guide.wait >= 0, -1
     for m in order:
+        if not waits:  # tables step by step: beams all the way
+            motions[m, 1:] = m
+            simulate(guide.body, poses[m, 0], motions[m, 1:], poses[m, 1:])
+            starts.settled[m] = starts.slack[m] == SAFE
+            continue
         turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
         if base >= 0 and turn > -2:
             _resume(starts.status[m], starts.run[m], work)
@@ -84,33 +86,17 @@ def propose_all(
             starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
         if starts.settled[m] and base < 0:
             base = int(m)
-    _beam_out(guide, t, width, width, BAND, order, starts, motions, poses, work)
-    if guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL:
-        _beam_out(guide, t, SMALL_SHARE, width, 2.0 * HOPELESS, order, starts, motions, poses, work)
+    small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
+    for attempt in range(3):
+        share, band = width, BAND if waits else 0.0
+        if attempt == 0:
+            share = NARROW
+        elif attempt == 2:
+            share, band = SMALL_SHARE, 2.0 * HOPELESS
+        if (attempt > 0 or not waits) and (attempt < 2 or small):
+            _beam_out(guide, t, share, width, band, order, starts, motions, poses, work)
     best = order[0]
-    return int(guide.wait if starts.slack[guide.wait] == starts.slack[best] else best)
-
-
-@kernel
-def _propose_restless(
-    guide: Guide,
-    t: int,
-    width: int,
-    order: NDArray[np.int64],
-    starts: Starts,
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-    work: Work,
-) -> None:
-    """For a robot that cannot wait, by tables step by step: beams all the way, a narrow one first."""
-    for m in order:
-        motions[m, 1:] = m
-        simulate(guide.body, poses[m, 0], motions[m, 1:], poses[m, 1:])
-        starts.settled[m] = starts.slack[m] == SAFE
-    for share in (NARROW, width):
-        _beam_out(guide, t, share, width, 0.0, order, starts, motions, poses, work)
-    if guide.tables.bits.shape[1] * guide.tables.bits.shape[2] <= SMALL:
-        _beam_out(guide, t, SMALL_SHARE, width, 2.0 * HOPELESS, order, starts, motions, poses, work)
+    return int(guide.wait if waits and starts.slack[guide.wait] == starts.slack[best] else best)
 
 
 @leaf
@@ -177,7 +163,7 @@ def _resume(status: NDArray[np.int8], run: NDArray[np.int64], work: Work) -> Non
         work.status[k], work.run[k] = status[k], run[k]
 
 
-@kernel
+@merged
 def _follow(
     guide: Guide,
     width: int,
@@ -234,7 +220,7 @@ def _take(
     return n
 
 
-@kernel
+@merged
 def _beam_out(
     guide: Guide,
     t: int,
