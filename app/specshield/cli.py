@@ -166,7 +166,7 @@ def report(
 def train(
     case: Annotated[str, typer.Option(help="A case of maps/.")],
     method: Annotated[
-        str, typer.Option(help="How the policy is made: reachability or dqn.")
+        str, typer.Option(help="How the policy is made: reachability, planner or dqn.")
     ] = "reachability",
     seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,

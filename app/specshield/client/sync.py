@@ -140,7 +140,7 @@ class Policies:
         *,
         signals: Mapping[str, float] | None = None,
         robot: str | Mapping[str, Any] = "stretch",
-        method: Literal["dqn", "reachability"] = "reachability",
+        method: Literal["dqn", "planner", "reachability"] = "reachability",
         seed: int = 0,
         options: Mapping[str, Any] | None = None,
     ) -> Policy:

@@ -32,8 +32,8 @@ class Agenda(NamedTuple):
 
     rule: the view of the formula as `separate` leaves it. leaf [l, 2]: which predicate each of its leaves is,
     -1 for one that reads signals alone, and -1 for its negation. predicate [P, 2]: a leaf that is the
-    predicate, and -1 where that is its negation. literal [L, 3]: predicate, -1 for its negation, and the last
-    step at which some leaf reads it.
+    predicate, and -1 where that is its negation. literal [L, 4]: predicate, -1 for its negation, the last
+    step at which some leaf reads it, and whether it guards (see `Literal`).
     """
 
     rule: View
@@ -77,8 +77,8 @@ def agenda_of(task: Task, formula: Formula) -> tuple[Agenda, tuple[Literal, ...]
         known = literals.get(key)
         literals[key] = Literal(base, key[1], guards or (known is not None and known.guards))
         last[key] = max(last.get(key, 0), int(view.tree.leaf_stop[n]) - 1)
-    rows = [(*key, last[key]) for key in literals]
-    agenda = Agenda(view, _columns(leaves, 2), _columns(examples, 2), _columns(rows, 3))
+    rows = [(*key, last[key], int(literal.guards)) for key, literal in literals.items()]
+    agenda = Agenda(view, _columns(leaves, 2), _columns(examples, 2), _columns(rows, 4))
     return agenda, tuple(literals.values())
 
 
@@ -240,16 +240,19 @@ def is_open(
 
 
 @leaf
-def due(agenda: Agenda, k: int, s: int, margin: float, bounds: Bounds) -> int:
-    """The step by which literal k has to have held at some step after s; NEVER where it may fail for good."""
+def due(agenda: Agenda, k: int, s: int, guess: int, margin: float, bounds: Bounds) -> int:
+    """The step by which literal k has to have held at some step after s; NEVER where it may fail for good.
+
+    guess: where to look first.
+    """
     last = agenda.literal[k, 2]
-    low, high, tried = s, last + 1, last
+    low, high, tried = s, last + 1, guess if s < guess <= last else last
     while high - low > 1:
         if is_open(agenda, k, s, s, s + 1, tried, margin, bounds):
-            low = tried
+            low, after = tried, last
         else:
-            high = tried
-        tried = (low + high) // 2
+            high, after = tried, tried - 1
+        tried = after if tried == guess and low < after else (low + high) // 2
     return high if high <= last else NEVER
 
 

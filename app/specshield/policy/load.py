@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from specshield.errors import PolicyError
+from specshield.policy.planner import load_planner
 from specshield.policy.policy import Card, Proposer, load_dqn
 from specshield.policy.reachability import load_reachability
 from specshield.task import Task
 
 READERS: dict[str, Callable[[bytes, Card, Task], Proposer]] = {
     "dqn": load_dqn,
+    "planner": load_planner,
     "reachability": load_reachability,
 }
 

@@ -125,10 +125,12 @@ def _expand(
     x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
     bits = 2.0 + math.log2(float(steps))
     for k in range(need.shape[0]):
-        work.spent[0] += 2.0 * bits * world.cost
-        by = due(agenda, k, s, margin, work.bounds)
+        guess = nodes.need[d - 1, k, DUE] if d > 0 else NEVER  # most stay what they were
+        by = due(agenda, k, s, guess, margin, work.bounds)
+        work.spent[0] += (3.0 if by in (guess, NEVER) else bits) * world.cost
         need[k, DUE], need[k, BEGIN], need[k, UNTIL] = by, NEVER, -1
-        if by != NEVER:
+        if by != NEVER and agenda.literal[k, 3] == 1:
+            work.spent[0] += bits * world.cost
             until = needed_until(agenda, k, s, by, margin, work.bounds)
             if until >= by:
                 need[k, BEGIN], need[k, UNTIL] = by, until

@@ -39,12 +39,16 @@ from specshield.world.regions import pack_regions
 
 MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
 MAX_FIELDS = 32
+USUAL = 150
 STARTS = 50  # poses that a new policy is tried from
 
 
 @dataclass(frozen=True)
 class Settings:
-    """pitch: of the lattice [m]. effort: what one plan may cost [about us]; a decision is 3 to 4 at most."""
+    """pitch: of the lattice [m]. effort: what one plan may cost [about us], a decision 2 to 3 times that.
+
+    Over USUAL steps of horizon it grows with the horizon's square: a way has more legs, and each costs more.
+    """
 
     pitch: float = 0.1
     effort: float = 10_000.0
@@ -128,7 +132,8 @@ class PlannerPolicy:
                 look(world.agenda.rule, history, rows, known)
         motions = np.empty((len(self._body.translate), self.task.horizon - t), np.int64)
         poses = np.empty((len(motions), motions.shape[1] + 1, 3))
-        world, effort = world._replace(margin=margin), self.settings.effort
+        effort = self.settings.effort * max(1.0, self.task.horizon / USUAL) ** 2
+        world = world._replace(margin=margin)
         first, found = propose_all(world, t, history[-1], rows[-1], known, effort, motions, poses)
         return Proposal(motions, np.ascontiguousarray(poses[:, 1:]), int(first)), bool(found)
 

@@ -51,7 +51,8 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
     """Compiles the task's formula. Raises FragmentError outside the paper's fragment or MAX_OBLIGATIONS."""
     parts = obligations(task.formula)
     if len(parts) > MAX_OBLIGATIONS:
-        raise FragmentError("too many obligations", got=len(parts), expected=f"at most {MAX_OBLIGATIONS}")
+        expected = f"at most {MAX_OBLIGATIONS}; or method 'planner', which takes any formula"
+        raise FragmentError("too many obligations", got=len(parts), expected=expected)
     names = [*POSE_NAMES, *task.regions, *task.signals]
     slots = {name: i for i, name in enumerate(names)}
     ops, args, starts = pack([compile_predicate(part.predicate, slots) for part in parts])

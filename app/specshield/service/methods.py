@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 if TYPE_CHECKING:  # a worker waits for jobs without the weight of the core
     from specshield.task import Task
 
-METHODS = ("dqn", "reachability")
+METHODS = ("dqn", "planner", "reachability")
 
 
 class Made(Protocol):
@@ -30,18 +30,23 @@ def available() -> list[str]:
 
 def complete(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """All options of the method, as JSON, those given checked. Raises PolicyError. Needs no torch."""
-    from specshield.policy import reachability, settings
+    from specshield.policy import planner, reachability, settings
 
     if method == "dqn":
         return settings.options_of(settings.read_settings(options))
+    if method == "planner":
+        return asdict(planner.read_settings(options))
     return asdict(reachability.read_settings(options))
 
 
 def check(method: str, task: Task, options: Mapping[str, Any]) -> None:
     """Raises what `make` would for a task that the method cannot serve. Needs no torch."""
-    from specshield.policy import reachability
+    from specshield.policy import planner, reachability
     from specshield.policy.progress import make_rules
 
+    if method == "planner":
+        planner.check(task, planner.read_settings(options))
+        return
     if method == "reachability":
         reachability.check(task, reachability.read_settings(options))
     make_rules(task)
@@ -62,6 +67,10 @@ def make(
         from specshield.policy import reachability
 
         return reachability.synthesise(task, reachability.read_settings(options), spec)
+    if method == "planner":
+        from specshield.policy import planner
+
+        return planner.synthesise(task, planner.read_settings(options), spec)
 
     from specshield.policy import dqn, settings
 

@@ -225,8 +225,10 @@ class PolicyRequest(Strict):
     map_id: Id = Field(description="Id or name of the map.")
     robot: RobotChoice = Field("stretch", description="A preset (`stretch`) or a robot of your own.")
     spec: Spec
-    method: Literal["dqn", "reachability"] = Field(
-        "reachability", description="How the policy is made: computed in seconds, or learned in minutes."
+    method: Literal["dqn", "planner", "reachability"] = Field(
+        "reachability",
+        description="How the policy is made: computed in seconds, for the fragment (`reachability`) or any "
+        "formula (`planner`), or learned in minutes (`dqn`).",
     )
     seed: int = Field(0, ge=0, lt=2**63, description="Of everything random in the training.")
     options: dict[str, bool | int | float | str | list[float]] = Field(
@@ -244,7 +246,7 @@ class Card(BaseModel):
     map_id: Id
     robot: RobotChoice
     spec: Spec
-    method: Literal["dqn", "reachability"]
+    method: Literal["dqn", "planner", "reachability"]
     seed: int = Field(ge=0, lt=2**63)
     options: dict[str, bool | int | float | str | list[float]] = Field(max_length=64)
     task_hash: Name

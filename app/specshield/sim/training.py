@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from specshield.errors import Unsupported
-from specshield.policy import reachability
+from specshield.policy import planner, reachability
 from specshield.policy.settings import read_settings
 from specshield.sim.cases import MODELS, Case, load_case
 from specshield.sim.progress import StatusLine, duration
@@ -34,12 +34,16 @@ def train(
     if method == "dqn":
         weights, card = _learn(loaded, seed, updates, _options(options), out / "checkpoint", resume)
     elif method == "reachability":
-        policy = reachability.synthesise(
+        table = reachability.synthesise(
             loaded.task, reachability.read_settings(_options(options)), dict(loaded.spec)
         )
-        weights, card = policy.weights(), policy.card
+        weights, card = table.weights(), table.card
+    elif method == "planner":
+        plans = planner.synthesise(loaded.task, planner.read_settings(_options(options)), dict(loaded.spec))
+        weights, card = plans.weights(), plans.card
     else:
-        raise Unsupported("unknown method", path="method", got=method, expected="'dqn' or 'reachability'")
+        expected = "'dqn', 'planner' or 'reachability'"
+        raise Unsupported("unknown method", path="method", got=method, expected=expected)
     out.mkdir(parents=True, exist_ok=True)
     (out / "policy.safetensors").write_bytes(weights)
     (out / "card.json").write_text(json.dumps(card, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""The fragment a policy can be made for: conjunctions of F, G and F[a,c1] G[c2,b] over predicates.
+"""The fragment that tables can be made for: conjunctions of F, G and F[a,c1] G[c2,b] over predicates.
 
     phi = psi | phi and phi | F[a,b] psi | G[a,b] psi | F[a,c1] G[c2,b] psi       (the paper's grammar of STL)
 
@@ -107,5 +107,7 @@ def _shifted(inner: Obligation, a: int, b: int) -> Obligation:
 def _outside(formula: Formula) -> FragmentError:
     expected = "conjunctions of F, G and F[a,c1] G[c2,b] over boolean combinations of predicates"
     return FragmentError(
-        f"no policy can be made for '{formula}'; expected {expected}", got=str(formula), expected=expected
+        f"'{formula}' is outside the fragment of this method; expected {expected}",
+        got=str(formula),
+        expected=f"{expected}; or method 'planner', which takes any formula",
     )

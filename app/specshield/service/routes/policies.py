@@ -47,9 +47,9 @@ async def create(request: Request, server: ServerState) -> Any:
     """Training takes minutes: read the policy to see how far it is.
 
     Policies are immutable and known by the hash of task, method, options and seed: the same request again
-    answers the policy there is, and queues it once more if it failed. A formula has to be a conjunction of
-    `F[a,b]`, `G[a,b]` and `F[a,c] G[d,b]` over boolean combinations of predicates.
-    `dqn` learns, in minutes; `reachability` computes, in seconds.
+    answers the policy there is, and queues it once more if it failed. `reachability` computes, in seconds,
+    and `dqn` learns, in minutes, for conjunctions of `F[a,b]`, `G[a,b]` and `F[a,c] G[d,b]` over boolean
+    combinations of predicates; `planner` is made in seconds for any formula, and plans at every decision.
     """
     if uploads.is_multipart(request):
         weights, card = await uploads.parts(request, "weights", "card")

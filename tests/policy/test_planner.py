@@ -1,0 +1,189 @@
+"""The planner against every future of a small world, a rule of each shape; robots, files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tests.oracles.cells import END, MOTIONS, Cells
+from tests.policy.rooms import CUSTOM, flat
+
+from specshield.errors import InfeasibleStart, PolicyError
+from specshield.policy.load import load_policy
+from specshield.policy.planner import Settings, read_settings, synthesise
+from specshield.robot.unicycle import simulate
+from specshield.shield.episode import Carry, decide, make_shield, start
+from specshield.stl import robustness
+
+EVENT = np.zeros(8)  # the signal, held from the newest sample on, as the oracles below read it
+
+
+def within(inside, a, b):
+    """F[a,b] at every step from 0 to T - b."""
+    return np.stack([inside[..., k + a : k + b + 1].any(-1) for k in range(inside.shape[-1] - b)], axis=-1)
+
+
+WORLDS = {
+    "patrol": Cells(
+        "G[0,3] F[0,4] A and G[0,3] F[0,4] B and G[0,7] not C",
+        lambda s: within(s["A"], 0, 4).all(-1) & within(s["B"], 0, 4).all(-1) & ~s["C"].any(-1),
+        {"A": (0, 0), "B": (0, 1), "C": (1, 0)},
+    ),
+    "reactive": Cells(
+        "G[0,4] (event > 0.5 -> F[0,3] A)",
+        lambda s: np.all([(EVENT[k] <= 0.5) | within(s["A"], 0, 3)[..., k] for k in range(5)], axis=0),
+        {"A": (1, 2)},
+        {"event": 0.0},
+    ),
+    "reactive, in one predicate": Cells(
+        "G[0,4] F[0,3] (event < 0.5 or A) and F[3,7] B",
+        lambda s: within((EVENT < 0.5) | s["A"], 0, 3).all(-1) & s["B"][..., 3:].any(-1),
+        {"A": (1, 2), "B": (2, 2)},
+        {"event": 0.0},
+    ),
+    "until": Cells(
+        "not B U[0,6] A and F[4,7] B",
+        lambda s: (
+            np.any([s["A"][..., k] & ~s["B"][..., :k].any(-1) for k in range(7)], axis=0)
+            & s["B"][..., 4:].any(-1)
+        ),
+        {"A": (2, 2), "B": (2, 1)},
+    ),
+    "disjunction": Cells(
+        "F[0,5] A and F[3,7] C or G[2,7] B",
+        lambda s: (s["A"][..., :6].any(-1) & s["C"][..., 3:].any(-1)) | s["B"][..., 2:].all(-1),
+        {"A": (2, 1), "B": (0, 1), "C": (2, 2)},
+    ),
+    "nested": Cells(
+        "G[0,4] (A -> F[0,3] B) and F[0,5] (A and F[1,2] not A)",
+        lambda s: (
+            np.all([~s["A"][..., k] | within(s["B"], 0, 3)[..., k] for k in range(5)], axis=0)
+            & np.any([s["A"][..., k] & ~s["A"][..., k + 1 : k + 3].all(-1) for k in range(6)], axis=0)
+        ),
+        {"A": (2, 2), "B": (2, 1)},
+    ),
+    "a dwell, then away": Cells(
+        "F[1,3] G[1,3] A and G[5,7] not A",
+        lambda s: s["A"][..., 2:5].all(-1) & ~s["A"][..., 5:].any(-1),
+        {"A": (2, 2)},
+    ),
+}
+EACH = pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
+STARTS = [(i, j, h) for i, j in ((0, 0), (0, 1), (1, 2), (2, 1), (2, 2)) for h in range(4)]
+
+
+def see(samples):
+    """The signal so far, for a decision; the oracles see it held."""
+    EVENT[: len(samples)], EVENT[len(samples) :] = samples, samples[-1]
+    return {"event": np.array(samples)}
+
+
+@EACH
+def test_what_it_claims_is_so_and_it_claims_nearly_all(cells):
+    """S_t of the planner alone, no witness carried, along random ways and with events at random steps."""
+    shield, random = make_shield([synthesise(cells.task, Settings(pitch=0.2))]), np.random.default_rng(2)
+    found = missed = 0
+    for state in STARTS:
+        history, rise = [cells.pose(*state)], random.integers(8)
+        for t in range(cells.task.horizon):
+            signals = see([float(k >= rise) for k in range(t + 1)])
+            expected = cells.feasible(history)
+            decision = decide(shield, history, np.zeros(5), signals=signals if cells.signals else {})
+            if decision.mode in ("shaped", "fallback"):
+                claimed = np.array(decision.j_values[:MOTIONS]) == 1.0
+                assert not (claimed & ~expected).any()
+                found, missed = found + claimed.sum(), missed + (expected & ~claimed).sum()
+            likely = (
+                np.flatnonzero(expected) if expected.any() and random.random() < 0.8 else np.arange(MOTIONS)
+            )
+            history.append(decision.next_poses[random.choice(likely)])
+    assert found > 50
+    assert missed <= 0.02 * found
+
+
+@EACH
+def test_once_feasible_always_feasible(cells):
+    """Whatever the model wants; a signal stays as it was at the start, as J supposes."""
+    shield, random = make_shield([synthesise(cells.task, Settings(pitch=0.2))]), np.random.default_rng(3)
+    played = 0
+    for state in STARTS:
+        history, carry, done = [cells.pose(*state)], None, False
+        event = float(random.integers(2)) if cells.signals else 0.0
+        see([event])
+        if not cells.feasible(history).any():
+            if event == 0.0:  # as the signal is before its first sample
+                with pytest.raises(InfeasibleStart):
+                    start(shield, history[0])
+            continue
+        for t in range(cells.task.horizon):
+            signals = see([event] * (t + 1)) if cells.signals else {}
+            logits = random.normal(0, 3, 5)
+            decision = decide(shield, history, None if done else logits, done, signals, carry)
+            assert decision.reason != "infeasible"
+            action = int(random.choice(5, p=decision.distribution))
+            if action == END:
+                done = True
+                action = END if decision.completion_action is None else decision.completion_action
+            history.append(decision.next_poses[action])
+            carry = Carry.from_json(decision.carry.to_json())
+        signals = see([event] * 8) if cells.signals else {}
+        assert cells.kept(history)
+        assert robustness(cells.task.formula, cells.task.samples(np.array(history), signals)) > 0.0
+        played += 1
+    assert played >= 3
+
+
+def test_a_robot_that_cannot_stand_still_is_planned_for():
+    """It turns where it would wait; a row for every motion, and its poses are those of f."""
+    task = flat("G[0,20] F[0,40] West and F[10,60] East", CUSTOM)
+    policy = synthesise(task)
+    history = np.array([[*task.grid.to_map((1.5, 1.5)), 0.3]])
+    shield = make_shield([policy])
+    proposal = policy.propose(history, {}, 0.0)
+    assert proposal.motions[:, 0].tolist() == [0, 1, 2]
+    for motions, poses in zip(proposal.motions, proposal.poses, strict=True):
+        again = np.empty_like(poses)
+        simulate(shield.body, history[0], motions, again)
+        np.testing.assert_array_equal(poses, again)
+    assert any(decide(shield, history, np.zeros(3)).j_values)
+
+
+def test_what_is_broken_is_dropped_and_the_rest_is_kept():
+    """Begun on the forbidden cell: the rule is lost, its patrol and the rest of its G are not."""
+    rule = "G[0,7] not C and F[3,7] B"
+    cells = Cells(rule, lambda s: ~s["C"].any(-1) & s["B"][..., 3:].any(-1), {"B": (0, 0), "C": (0, 2)})
+    shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
+    history, carry = [cells.pose(0, 2, 3)], None
+    while len(history) <= cells.task.horizon:
+        decision = decide(shield, history, None, True, carry=carry)
+        assert decision.mode == "violated"
+        history.append(decision.next_poses[decision.completion_action])
+        carry = decision.carry
+    states = [cells.state(pose)[:2] for pose in history]
+    assert (0, 2) not in states[1:]
+    assert (0, 0) in states[3:]
+
+
+def test_a_policy_comes_back_from_its_files_as_it_was():
+    task = WORLDS["patrol"].task
+    policy = synthesise(task, Settings(pitch=0.2))
+    again = load_policy(policy.weights(), policy.card, task)
+    history = np.array([WORLDS["patrol"].pose(0, 0, 0)])
+    ours, theirs = policy.propose(history, {}, 0.0), again.propose(history, {}, 0.0)
+    np.testing.assert_array_equal(ours.motions, theirs.motions)
+    assert synthesise(task, Settings(pitch=0.2)).weights() == policy.weights()
+    with pytest.raises(PolicyError, match="do not fit"):
+        load_policy(policy.weights(), {**policy.card, "options": {"pitch": 0.1}}, task)
+    with pytest.raises(PolicyError, match="safetensors"):
+        load_policy(policy.weights()[:-9], policy.card, task)
+    with pytest.raises(PolicyError, match="not in range") as caught:
+        read_settings({"effort": 0})
+    assert caught.value.path == "options.effort"
+
+
+def test_where_there_is_nothing_to_find_it_ends_and_says_the_same_again():
+    patrols = " and ".join(f"G[0,80] F[0,20] {name}" for name in ("West", "East", "Hole"))
+    policy = synthesise(flat(f"{patrols} and (F[0,99] West or G[0,50] East or not West U[3,90] Hole)"))
+    history = np.array([[*policy.task.grid.to_map((1.0, 1.0)), 0.0]])
+    first, second = (policy.propose(history, {}, 0.0) for _ in range(2))
+    np.testing.assert_array_equal(first.motions, second.motions)
+    np.testing.assert_array_equal(first.poses, second.poses)
