@@ -1,4 +1,5 @@
-"""Reachability on real floor plans: a formula of each shape of the fragment, its time, memory and size.
+"""Reachability on real floor plans: a formula of each shape of the fragment, its time, memory and size;
+also for a robot that cannot wait.
 
     python -m benchmarks.houses [FOLDER]
 
@@ -9,6 +10,7 @@ Prints Markdown. Peak memory is the process's, so far.
 from __future__ import annotations
 
 import json
+import math
 import resource
 import sys
 import time
@@ -22,7 +24,7 @@ from specshield.errors import SpecshieldError
 from specshield.policy.environment import free_poses
 from specshield.policy.load import load_policy
 from specshield.policy.reachability import synthesise
-from specshield.robot import STRETCH
+from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.unicycle import make_body
 from specshield.sim.cases import REPOSITORY
 from specshield.task import make_task
@@ -41,6 +43,21 @@ SHAPES = {
     "one visit for two": "F[0,80] (A or B) and F[80,160] A",
     "disjunctions": "F[0,60] (A or B) and F[80,140] (B or C)",
 }
+RESTLESS = robot_from_json(
+    {
+        "footprint": {"radius": STRETCH.radius, "offset": list(STRETCH.offset)},
+        "on_contact": "stop",
+        "actions": [
+            {"name": "forward", "translate": 0.2},
+            {"name": "left", "rotate": math.radians(30)},
+            {"name": "right", "rotate": -math.radians(30)},
+        ],
+    }
+)
+ASKED = [(shape, formula, STRETCH) for shape, formula in SHAPES.items()]
+ASKED += [
+    (f"{shape}; cannot wait", SHAPES[shape], RESTLESS) for shape in ("in turn, G throughout", "a dwell")
+]
 
 World = tuple[str, OccupancyGrid, Mapping[str, Any]]
 
@@ -76,8 +93,8 @@ def main() -> None:
     print("| loaded [ms] | feasible starts |")
     print("|---|---|---|---|---|---|---|---|")
     for name, grid, regions in worlds(data):
-        for shape, formula in SHAPES.items():
-            task = make_task(grid, STRETCH, formula, regions=regions)
+        for shape, formula, robot in ASKED:
+            task = make_task(grid, robot, formula, regions=regions)
             size = f"{grid.width * grid.resolution:.1f} x {grid.height * grid.resolution:.1f}"
             began = time.perf_counter()
             try:
