@@ -1,0 +1,227 @@
+"""Look-ahead: exact where the lattice is, vanishing where the model cannot be known, pure and repeatable."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from tests.oracles.cells import MOTIONS, STATES, Cells
+from tests.policy.rooms import flat
+
+from specshield.policy.progress import make_rules
+from specshield.robot.unicycle import make_body, step, successors
+from specshield.shield.belief import Belief
+from specshield.shield.desirability import NEVER, desirability, solve
+from specshield.shield.lookahead import prepare
+from specshield.shield.planes import make_planes
+from specshield.shield.shaping import log_softmax, restrict
+from specshield.shield.surrogate import FEATURES, chart, end_chance, follow, is_blocked, make_goals
+
+WORLD = Cells(
+    "F[0,4] A and F[5,9] B and G[0,9] not C",
+    lambda s: s["A"][..., :5].any(-1) & s["B"][..., 5:10].any(-1) & ~s["C"].any(-1),
+    {"A": (1, 0), "B": (0, 2), "C": (0, 3)},
+)
+HORIZON = 9
+
+
+def model(random):
+    """A model on the cells: motion probabilities [states, M] and the chance of an end [states]."""
+    logits = random.normal(0, 1.5, (len(STATES), MOTIONS))
+    weights = np.exp(logits)
+    return weights / weights.sum(axis=1, keepdims=True), random.uniform(0.0, 0.2, len(STATES))
+
+
+def settled(mask, state, t):
+    """The goals A and B settled at t, None where C breaks the rule: the formula written again."""
+    cell = STATES[state][:2]
+    if cell == WORLD.regions["C"]:
+        return None
+    mask |= cell == WORLD.regions["A"] and t <= 4
+    return mask | 2 * (cell == WORLD.regions["B"] and 5 <= t <= 9)
+
+
+def exact(r, e):
+    """The least KL of a path that keeps the rule, {(t, mask): [states]}; what comes after an end is free."""
+    found = {(HORIZON, m): np.where(m == 3, 0.0, np.inf) * np.ones(len(STATES)) for m in range(4)}
+    for t, mask in itertools.product(reversed(range(HORIZON)), range(4)):
+        values = np.full(len(STATES), np.inf)
+        for s in range(len(STATES)):
+            weight = 0.0
+            for m in range(MOTIONS):
+                after = int(WORLD.table[s, m])
+                then = settled(mask, after, t + 1)
+                weight += 0.0 if then is None else r[s, m] * np.exp(-found[t + 1, then][after])
+            values[s] = -(1.0 - e[s]) * np.log(weight) if weight > 0.0 else np.inf
+        found[t, mask] = values
+    return found
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """D on the lattice for a random model of the cells, which are the lattice's own; and the model."""
+    r, e = model(np.random.default_rng(5))
+    planes = make_planes(WORLD.body, make_rules(WORLD.task), HORIZON)
+    headings, cells = planes.valid.shape
+    assert headings == 4
+    motions, ends = np.zeros((MOTIONS, headings, cells), np.float32), np.zeros((headings, cells), np.float32)
+    for s, (i, j, h) in enumerate(STATES):
+        at = (j + planes.pad) * planes.width + i + planes.pad
+        motions[:, h, at], ends[h, at] = np.log(r[s]), e[s]
+    return planes, solve(WORLD.body, planes, 0, motions, ends), r, e
+
+
+def test_desirability_is_exact_where_the_lattice_is(solved):
+    planes, table, r, e = solved
+    wanted, seen = exact(r, e), 0
+    for t, mask in ((0, 0), (3, 0), (2, 1), (6, 1), (7, 3)):
+        for s, state in enumerate(STATES):
+            pose = WORLD.pose(*state)
+            if not planes.valid[state[2]][(state[1] + planes.pad) * planes.width + state[0] + planes.pad]:
+                continue
+            found = desirability(WORLD.body, planes, table, 0, t, mask, *pose)
+            if settled(mask, s, t) != mask or not np.isfinite(wanted[t, mask][s]):
+                continue
+            assert found == pytest.approx(wanted[t, mask][s], rel=0.03, abs=0.03)
+            seen += 1
+    assert seen > 100
+
+
+def test_following_it_costs_what_the_best_path_does(solved):
+    """Path KL of restrict(r exp(-D), S_t), worked out over all its ways, within 5 % of the least there is."""
+    planes, table, r, e = solved
+    wanted, checked = exact(r, e), 0
+
+    def cost(t, mask, s):
+        if t == HORIZON:
+            return 0.0
+        left, feasible = np.full(MOTIONS, float(NEVER)), np.zeros(MOTIONS, bool)
+        for m in range(MOTIONS):
+            after = int(WORLD.table[s, m])
+            then = settled(mask, after, t + 1)
+            if then is not None and np.isfinite(wanted[t + 1, then][after]):
+                feasible[m] = True
+                left[m] = desirability(WORLD.body, planes, table, 0, t + 1, then, *WORLD.pose(*STATES[after]))
+        chosen = restrict(log_softmax(np.log(r[s]) - left), feasible)
+        total = 0.0
+        for m in np.flatnonzero(chosen > 0.0):
+            after = int(WORLD.table[s, m])
+            rest = memo(t + 1, settled(mask, after, t + 1), after)
+            total += chosen[m] * (np.log(chosen[m] / r[s, m]) + rest)
+        return (1.0 - e[s]) * total
+
+    known = {}
+
+    def memo(*key):
+        if key not in known:
+            known[key] = cost(*key)
+        return known[key]
+
+    for s in range(len(STATES)):
+        mask = settled(0, s, 0)
+        i, j, _ = STATES[s]
+        free = WORLD.body.occupied[j, i] == 0
+        if free and mask is not None and np.isfinite(wanted[0, mask][s]):
+            assert memo(0, mask, s) <= 1.05 * wanted[0, mask][s] + 1e-3
+            checked += 1
+    assert checked >= 8
+
+
+TASK = flat("F[0,30] West and F[30,60] East and G[0,60] not Hole")
+
+
+def drive(speak, steps=25, start=(-0.4, 2.4, 0.2)):
+    """Beliefs and additions along the way of a model that is let go where it wants to."""
+    ahead, body = prepare(TASK), make_body(TASK.robot, TASK.grid)
+    belief, history, given = ahead.begin(), [np.array(start)], []
+    random = np.random.default_rng(0)
+    for t in range(steps):
+        log_prior = log_softmax(speak(t, history[-1], random))
+        belief, added = ahead.step(belief, np.array(history), {}, log_prior)
+        given.append((belief, added))
+        weights = np.where(TASK.robot.terminal, 0.0, np.exp(log_prior))
+        action = random.choice(len(weights), p=weights / weights.sum())
+        history.append(np.array(step(body, *history[-1], int(TASK.robot.motion_of[action]))))
+    return ahead, np.array(history), given
+
+
+def seeks(goal):
+    """What the surrogate itself would say with this goal and a sharpness of its own."""
+    ahead = prepare(TASK)
+    course = chart(ahead.goals, np.array([goal]), np.ones(1))
+
+    def speak(t, pose, random):
+        nexts, motions = np.empty((len(TASK.robot.motions), 3)), len(TASK.robot.motions)
+        successors(ahead.body, pose, nexts)
+        blocked = np.array([is_blocked(ahead.body, m, *pose, after) for m, after in enumerate(nexts)])
+        log_r, scratch = np.empty(motions), np.empty((motions, FEATURES))
+        end = follow(ahead.body, course, np.array([2.8, 2.8, -2.8, -1.0]), *pose, blocked, scratch, log_r)
+        of = TASK.robot.motion_of
+        shares = np.bincount(of[~TASK.robot.terminal])
+        return np.where(TASK.robot.terminal, np.log(max(end, 1e-4)), log_r[of] - np.log(shares[of]))
+
+    return speak
+
+
+def test_it_learns_where_a_model_goes():
+    ahead = prepare(TASK)
+    goal = len(ahead.goals.distance) - 1
+    _, _, given = drive(seeks(goal))
+    belief = given[-1][0]
+    row, column = np.argwhere(ahead.goals.distance[goal] == 0)[0]
+    off = ahead.goals.distance[:, row, column] / 100.0  # metres from each goal to the true one
+    assert belief.probabilities() @ off < 0.25 * off.mean()
+    assert belief.weight > 0.9
+    assert belief.style[0] == pytest.approx(2.8, rel=0.3)
+    assert max(np.ptp(added) for _, added in given) > 1.0
+
+
+def test_with_a_model_that_wants_nothing_it_vanishes():
+    """Fixed likings and noise: habits predict such a model better than any goal does."""
+    wants = np.random.default_rng(3).normal(0, 1.5, len(TASK.robot.actions))
+    wants[TASK.robot.motion_of == TASK.robot.motions.index((0.0, 0.0))] -= 2.0
+    _, _, given = drive(lambda t, pose, random: wants + random.normal(0, 0.3, len(wants)), 40)
+    assert all(belief.weight < 0.1 for belief, _ in given[15:])
+    assert all(np.ptp(added) < 2.0 for _, added in given[20:])
+
+
+def test_it_is_pure_and_its_state_travels_as_json():
+    ahead, history, given = drive(seeks(0), 12)
+    belief, added = given[10]
+    text = json.dumps(belief.to_json())
+    assert len(text) < 20_000
+    log_prior = log_softmax(seeks(0)(11, history[11], None))
+    again = ahead.step(Belief.from_json(json.loads(text)), history[:12], {}, log_prior)
+    once = ahead.step(belief, history[:12], {}, log_prior)
+    assert json.dumps(again[0].to_json()) == json.dumps(once[0].to_json())
+    np.testing.assert_array_equal(again[1], once[1])
+    assert np.all(added[TASK.robot.terminal] == 0.0)
+    assert np.all(added <= 0.0)
+
+
+def test_a_model_that_only_ends_teaches_nothing():
+    ahead = prepare(TASK)
+    log_prior = np.where(TASK.robot.terminal, 0.0, -np.inf)
+    belief, added = ahead.step(ahead.begin(), np.array([[-0.4, 2.4, 0.2]]), {}, log_prior)
+    assert not added.any()
+    assert json.dumps(belief.to_json()) == json.dumps(ahead.begin().to_json())
+
+
+def test_goals_cover_the_floor_and_ways_lead_to_them():
+    body = make_body(TASK.robot, TASK.grid)
+    goals = make_goals(body, TASK.grid)
+    assert 10 < len(goals.distance) < 60
+    for g in range(len(goals.distance)):
+        row, column = np.argwhere(goals.distance[g] == 0)[0]
+        assert body.clearance[row, column] > body.radius
+        away = np.argwhere((goals.distance[g] < 60000) & (goals.distance[g] > 100))
+        row, column = away[len(away) // 2]
+        v, u = row + 0.5, column + 0.5
+        for _ in range(400):  # follow the way
+            du, dv = goals.way[g, int(v), int(u)]
+            v, u = v + 0.3 * dv / 127, u + 0.3 * du / 127
+        assert goals.distance[g, int(v), int(u)] < 40
+    assert end_chance(0) > 0.2
+    assert end_chance(300) < 1e-6
