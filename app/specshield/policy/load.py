@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 from specshield.errors import PolicyError
 from specshield.policy.planner import load_planner
@@ -10,14 +11,14 @@ from specshield.policy.policy import Card, Proposer, load_dqn
 from specshield.policy.reachability import load_reachability
 from specshield.task import Task
 
-READERS: dict[str, Callable[[bytes, Card, Task], Proposer]] = {
+READERS: dict[str, Callable[[bytes | Path, Card, Task], Proposer]] = {
     "dqn": load_dqn,
     "planner": load_planner,
     "reachability": load_reachability,
 }
 
 
-def load_policy(weights: bytes, card: Card, task: Task) -> Proposer:
+def load_policy(weights: bytes | Path, card: Card, task: Task) -> Proposer:
     """A policy from its two files, for the task it was made for. Raises PolicyError where they do not fit."""
     if card.get("task_hash") != task.content_hash:
         raise PolicyError(

@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,10 @@ from specshield.policy.approach import World
 from specshield.policy.fields import Fields, steps_to, values_at
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
 from specshield.policy.plan import propose_all
-from specshield.policy.policy import Card, Proposal, make_card, read_tensors
+from specshield.policy.policy import Card, Proposal, make_card
 from specshield.policy.progress import signal_rows
 from specshield.policy.residual import residuals
+from specshield.policy.tensors import read_tensors
 from specshield.policy.view import look
 from specshield.robot.unicycle import Body, make_body
 from specshield.stl import SATISFIED_ABOVE, Formula
@@ -189,7 +191,7 @@ def synthesise(
     return PlannerPolicy(task, card, settings, fields, chosen)
 
 
-def load_planner(weights: bytes, card: Card, task: Task) -> PlannerPolicy:
+def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_settings(card.get("options", {}))
     _, literals = agenda_of(task, task.formula)

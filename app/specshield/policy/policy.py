@@ -9,18 +9,18 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from specshield.errors import PolicyError
 from specshield.policy.network import Network, make_network
 from specshield.policy.observation import Sight, make_sight, observation_size
 from specshield.policy.progress import Rules, make_rules, signal_rows
 from specshield.policy.rollout import propose_all
+from specshield.policy.tensors import read_tensors
 from specshield.robot import Robot, robot_to_json
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
@@ -167,21 +167,8 @@ def task_spec(task: Task) -> dict[str, Any]:
     return spec | ({"signals": dict(task.signals)} if task.signals else {})
 
 
-def load_dqn(weights: bytes, card: Card, task: Task) -> Policy:
+def load_dqn(weights: bytes | Path, card: Card, task: Task) -> Policy:
     """A policy from its two files. Raises PolicyError where the weights do not fit the task."""
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     inputs, outputs = observation_size(rules, body), len(body.translate)
     return Policy(task, card, make_network(read_tensors(weights), inputs, outputs))
-
-
-def read_tensors(weights: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of a safetensors file. Raises PolicyError for any other bytes."""
-    try:
-        return load_tensors(weights)
-    except Exception as error:  # the parser raises its own types for hostile bytes
-        raise PolicyError(
-            f"not a safetensors file: {error}",
-            path="weights",
-            got=f"{len(weights)} bytes",
-            expected="safetensors",
-        ) from error

@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from safetensors.numpy import save as save_tensors
 from specshield.errors import PolicyError
 from specshield.policy.latest import Phase, latest_times, masks_of, phases_of
 from specshield.policy.lattice import heading_count, holds_at, make_lattice
-from specshield.policy.policy import Card, Proposal, make_card, read_tensors, wait_motion
+from specshield.policy.policy import Card, Proposal, make_card, wait_motion
 from specshield.policy.progress import (
     ALWAYS,
     Rules,
@@ -25,6 +26,7 @@ from specshield.policy.progress import (
 from specshield.policy.search import propose_all
 from specshield.policy.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
 from specshield.policy.tables import INVALID, SCALE, Tables
+from specshield.policy.tensors import read_tensors
 from specshield.policy.walk import Guide
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
@@ -137,7 +139,7 @@ def synthesise(
     return ReachabilityPolicy(task, card, settings, tables)
 
 
-def load_reachability(weights: bytes, card: Card, task: Task) -> ReachabilityPolicy:
+def load_reachability(weights: bytes | Path, card: Card, task: Task) -> ReachabilityPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_settings(card.get("options", {}))
     rules = make_rules(task)

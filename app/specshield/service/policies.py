@@ -106,7 +106,7 @@ class Policies:
                 f"policy {record.id} is not ready", path="policy_id", got=record.id, expected="status ready"
             )
         folder = self._models / record.name if record.name else self._folder / record.id
-        return load_policy((folder / "policy.safetensors").read_bytes(), record.card, self.task(record.about))
+        return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
 
     def resolve(self, about: Description) -> Description:
         """The same with the map's id, whatever it was called. Raises NotFound."""

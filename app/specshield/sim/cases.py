@@ -74,7 +74,7 @@ def shipped(case: Case, method: str) -> Proposer:
             expected=f"a folder {folder.name} in models/",
         )
     card = json.loads((folder / "card.json").read_text())
-    return load_policy((folder / "policy.safetensors").read_bytes(), card, case.task)
+    return load_policy(folder / "policy.safetensors", card, case.task)
 
 
 def load_case(name: str, folder: Path = MAPS) -> Case:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import NotFound, PolicyError
-from specshield.policy.policy import read_tensors
+from specshield.policy.tensors import read_tensors
 from specshield.sim.cases import MODELS
 from specshield.sim.learned.network import KINDS, NOTHING, Array, Network, check, features
 from specshield.sim.robot import SimulatedRobot
@@ -81,7 +81,7 @@ def read(folder: Path) -> Shipped:
             "there is no learned model", path="model", got=str(folder), expected=f"{WEIGHTS} and {CARD}"
         )
     card = json.loads((folder / CARD).read_text())
-    return Shipped(check(read_tensors(path.read_bytes())), _temperature(card), card)
+    return Shipped(check(read_tensors(path)), _temperature(card), card)
 
 
 def _temperature(card: Any) -> float:

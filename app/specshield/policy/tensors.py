@@ -1,0 +1,49 @@
+"""The arrays of a safetensors file, from its bytes or mapped from the disk; nothing is unpickled."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.numpy import load
+
+from specshield.errors import PolicyError
+
+KINDS = {
+    "BOOL": np.bool_, "U8": np.uint8, "U16": np.uint16, "U32": np.uint32, "U64": np.uint64,
+    "I8": np.int8, "I16": np.int16, "I32": np.int32, "I64": np.int64, "F32": np.float32, "F64": np.float64,
+}  # fmt: skip
+
+
+def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
+    """The arrays by name. A file is mapped: the processes that read it share one copy in memory.
+
+    Raises PolicyError for anything but safetensors.
+    """
+    try:
+        return _mapped(weights) if isinstance(weights, Path) else load(weights)
+    except Exception as error:  # the parser raises its own types for hostile bytes
+        got = str(weights) if isinstance(weights, Path) else f"{len(weights)} bytes"
+        raise PolicyError(
+            f"not a safetensors file: {error}", path="weights", got=got, expected="safetensors"
+        ) from error
+
+
+def _mapped(path: Path) -> dict[str, NDArray[Any]]:
+    with safe_open(path, "numpy"):  # the library checks the header against the file
+        pass
+    # Copy on write, never written: compiled code knows one kind of array, those that can be written.
+    content = np.asarray(np.memmap(path, np.uint8, "c"))
+    begin = 8 + int(content[:8].view(np.uint64)[0])
+    header = json.loads(content[8:begin].tobytes())
+    header.pop("__metadata__", None)
+    arrays = {}
+    for name, about in header.items():
+        first, last = about["data_offsets"]
+        array = content[begin + first : begin + last].view(KINDS[about["dtype"]]).reshape(about["shape"])
+        arrays[name] = np.require(array, requirements=["C", "ALIGNED"])
+    return arrays
