@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel, leaf
 from specshield.policy.progress import advance, read_predicates
 from specshield.policy.tables import SAFE, is_broken, score, slack
-from specshield.policy.walk import Guide, Work
+from specshield.policy.work import Guide, Work
 from specshield.robot.unicycle import step
 
 MAX_ROOTS = 62  # bits of a tag

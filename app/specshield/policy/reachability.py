@@ -27,7 +27,7 @@ from specshield.policy.search import propose_all
 from specshield.policy.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
 from specshield.policy.tables import INVALID, SCALE, Tables
 from specshield.policy.tensors import read_tensors
-from specshield.policy.walk import Guide
+from specshield.policy.work import Guide
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task
 

@@ -16,7 +16,8 @@ from specshield.compiled import kernel, leaf, merged
 from specshield.policy.beam import EASY, MAX_ROOTS, beam
 from specshield.policy.progress import forgive, replay
 from specshield.policy.tables import HOPELESS, SAFE, goals_settled, slack
-from specshield.policy.walk import SETTLED_ALL, STUCK, Guide, Work, fill, make_work, observe, rejoin, walk
+from specshield.policy.walk import SETTLED_ALL, STUCK, rejoin, walk
+from specshield.policy.work import Guide, Work, fill, make_work, observe
 from specshield.robot.unicycle import Body, simulate, step
 
 ESCAPE_GAIN = 2.0  # [steps] later than where it got stuck: what a way out has to reach
