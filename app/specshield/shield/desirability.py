@@ -55,7 +55,9 @@ def solve(body: Body, planes: Planes, since: int, motions: Singles, ends: Single
                 _gather(planes, t + 1, mask, following, ahead)
                 for h in range(headings):
                     _back(body, planes, h, edge, motions, ends, ahead, cost, least, total, here)
-            _encode(planes.valid, here, table[planes.slot[t, mask] - skipped])
+            known = planes.possible.shape[0] > 0
+            possible = planes.possible[planes.slot[t, mask]] if known else planes.valid
+            _encode(possible, here, table[planes.slot[t, mask] - skipped])
         following, current = current, following
     return table
 
@@ -201,11 +203,11 @@ def _close(least: Singles, total: Singles, ends: Singles, out: Singles) -> None:
 
 
 @kernel
-def _encode(valid: NDArray[np.uint8], values: Singles, out: NDArray[np.uint16]) -> None:
+def _encode(possible: NDArray[np.uint8], values: Singles, out: NDArray[np.uint16]) -> None:
     top = np.float32((NO_CODE - 1) / CODES)
-    for h in range(valid.shape[0]):
-        for c in range(valid.shape[1]):
-            if not valid[h, c]:
+    for h in range(possible.shape[0]):
+        for c in range(possible.shape[1]):
+            if not possible[h, c]:
                 values[h, c] = NEVER
             value = max(min(values[h, c], top), np.float32(0.0))
             out[h, c] = np.uint16(NO_CODE) if values[h, c] >= NEVER else np.uint16(value * np.float32(CODES))

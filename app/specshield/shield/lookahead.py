@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel
 from specshield.policy.lattice import pose_of
 from specshield.policy.progress import SETTLED, Rules, make_rules, replay, signal_rows
+from specshield.policy.reachability import ReachabilityPolicy, synthesise
 from specshield.robot.unicycle import Body, make_body, successors
 from specshield.shield import belief as beliefs
 from specshield.shield.belief import Belief, Plan
@@ -97,10 +98,13 @@ class LookAhead:
 
 
 @lru_cache(maxsize=16)
-def prepare(task: Task) -> LookAhead:
-    """The look-ahead for a task. Raises FragmentError outside the fragment, Unsupported if too large."""
+def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
+    """The look-ahead for a task; `policy`: one made for it, if there is any.
+
+    Raises FragmentError outside the fragment, PolicyError or Unsupported for a task too large.
+    """
     body, rules = make_body(task.robot, task.grid), make_rules(task)
-    planes = make_planes(body, rules, task.horizon)
+    planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
     return LookAhead(task, body, rules, make_goals(body, task.grid), planes)
 
 

@@ -14,11 +14,14 @@ from specshield.policy.lattice import heading_count, pose_of
 from specshield.policy.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
+    PENDING,
+    SETTLED,
     STACK,
     Rules,
     read_predicates,
     value_count,
 )
+from specshield.policy.tables import Tables, slack
 from specshield.robot.unicycle import Body, in_collision, step
 from specshield.shield.surrogate import is_blocked
 
@@ -34,7 +37,8 @@ class Planes(NamedTuple):
     N]: bit g where goal g's, bit k where obligation k's predicate is true. goal [G]: the obligations that are
     goals; first, last [G]: the steps at which a visit settles them (of a dwell, its beginning). due, open [T
     + 2]: bits of the always that hold at a step, of the goals that can be settled. slot [T + 2, 2^G]: the
-    table of each step and set of settled goals, -1 where there is none.
+    table of each step and set of settled goals, -1 where there is none. possible [slots, H, N]: 1 where the
+    rule can still be kept, as a policy's tables say; of no slots where there are none to say so.
     """
 
     pitch: float
@@ -50,9 +54,12 @@ class Planes(NamedTuple):
     due: NDArray[np.int32]
     open: NDArray[np.int32]
     slot: NDArray[np.int64]
+    possible: NDArray[np.uint8]
 
 
-def make_planes(body: Body, rules: Rules, horizon: int, pitch: float = PITCH) -> Planes:
+def make_planes(
+    body: Body, rules: Rules, horizon: int, tables: Tables | None = None, pitch: float = PITCH
+) -> Planes:
     """Raises Unsupported where the tables would be too large."""
     largest = float(np.max(np.abs(body.rotate), initial=0.0))
     headings = min(heading_count([largest] if largest else []), MAX_HEADINGS)
@@ -81,9 +88,14 @@ def make_planes(body: Body, rules: Rules, horizon: int, pitch: float = PITCH) ->
         pitch, pad, width, np.zeros(shape, np.uint8), np.zeros((len(body.translate), *shape), np.float32),
         np.zeros(shape, np.int32), np.zeros(shape, np.int32), goal, first, last,
         due.astype(np.int32), opened.astype(np.int32), slot,
+        np.zeros((0, *shape), np.uint8),
     )  # fmt: skip
     _survey(body, rules, planes)
-    return planes
+    if tables is None:
+        return planes
+    possible = np.zeros((slot.max() + 1, *shape), np.uint8)
+    _foresee(body, rules, tables, planes, possible)
+    return planes._replace(possible=possible)
 
 
 def _slots(first: NDArray[np.int64], last: NDArray[np.int64], horizon: int) -> NDArray[np.int64]:
@@ -118,3 +130,24 @@ def _survey(body: Body, rules: Rules, planes: Planes) -> None:
             for m in range(planes.free.shape[0]):
                 after[0], after[1], after[2] = step(body, x, y, theta, m)
                 planes.free[m, h, c] = not is_blocked(body, m, x, y, theta, after)
+
+
+@kernel
+def _foresee(body: Body, rules: Rules, tables: Tables, planes: Planes, possible: NDArray[np.uint8]) -> None:
+    """Where the tables leave any slack, with each set of settled goals at each step."""
+    headings, cells = planes.valid.shape
+    status, run = np.zeros(rules.kind.shape[0], np.int8), np.zeros(rules.kind.shape[0], np.int64)
+    for t in range(planes.slot.shape[0] - 1):
+        for mask in range(planes.slot.shape[1]):
+            slot = planes.slot[t, mask]
+            if slot < 0:
+                continue
+            for g in range(planes.goal.shape[0]):
+                status[planes.goal[g]] = SETTLED if mask >> g & 1 else PENDING
+            for h in range(headings):
+                for c in range(cells):
+                    if planes.valid[h, c]:
+                        j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
+                        x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
+                        spare = slack(body, rules, tables, x, y, theta, t, status, run)
+                        possible[slot, h, c] = spare >= 0.0

@@ -139,7 +139,8 @@ def chart(goals: Goals, chosen: NDArray[np.int64], weights: Floats) -> Course:
     for n in range(chosen.shape[0]):
         for j in range(height):
             for i in range(width):
-                ends[j, i] += weights[n] * end_chance(goals.distance[chosen[n], j, i])
+                if goals.distance[chosen[n], j, i] < 200.0 * END_WITHIN:
+                    ends[j, i] += weights[n] * end_chance(goals.distance[chosen[n], j, i])
                 for k in range(2):
                     way[j, i, k] += weights[n] * goals.way[chosen[n], j, i, k] / UNIT
     return Course(goals.pitch, way, ends)
