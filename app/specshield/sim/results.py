@@ -20,7 +20,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
         by_method.setdefault(record.method, []).append(record)
     runs = sorted({record.run for record in records})
     complete = {name: sorted(found, key=lambda r: r.run) for name, found in by_method.items()}
-    plain = complete.get("unmodified", [])
+    plain = {record.run: record for record in complete.get("unmodified", [])}
     case = experiment.setting.case
     return {
         "experiment": experiment.to_json(),
@@ -30,7 +30,9 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
         "runs": len(runs),
         "refused_starts": sum({record.run: record.refused for record in records}.values()),
         "methods": [
-            summary(name, found, plain if len(plain) == len(found) else [])
+            summary(
+                name, found, [plain[r.run] for r in found] if plain.keys() >= {r.run for r in found} else []
+            )
             for name, found in complete.items()
         ],
     }
