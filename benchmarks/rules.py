@@ -4,9 +4,9 @@
 
 Episodes of the goal-seeking model behind the shield, from random feasible starts; of a reactive rule the
 event rises at a random step and stays. Prints Markdown: how many episodes kept the rule, how many starts were
-refused, the time of a decision, and recall: of the (history, action) pairs that are certified with the
-witness carried or by plans of REFERENCE times the effort, the share that the planner certifies on its own.
-(tests/policy/test_planner.py has the recall against every future, on small worlds.)
+refused, the processor time of a decision, and recall: of the (history, action) pairs that are certified with
+the witness carried or by plans of REFERENCE times the effort, the share that the planner certifies on its
+own. (tests/policy/test_planner.py has the recall against every future, on small worlds.)
 """
 
 from __future__ import annotations
@@ -101,9 +101,9 @@ def run(
         if task.signals:
             episode.events.append(float(t >= rise))
         logits = None if done else model.logits(robot)
-        began = time.perf_counter()
+        began = time.thread_time()
         decision = decide(shield, episode.poses, logits, done, episode.signals(), carry)
-        episode.ms.append(1e3 * (time.perf_counter() - began))
+        episode.ms.append(1e3 * (time.thread_time() - began))
         episode.modes[decision.mode] += 1
         if reference is not None and t % EVERY == 0 and decision.mode in ("shaped", "completion"):
             episode.feasible.append(_recall(shield, reference, episode, carry))

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from tests.oracles.brute_stl import brute_robustness
 from tests.oracles.cells import END, MOTIONS, Cells
-from tests.policy.rooms import CUSTOM, flat
+from tests.policy.rooms import CUSTOM, OCCUPIED, REGIONS, flat
+from tests.stl.formulas import formulas
 
 from specshield.errors import InfeasibleStart, PolicyError
 from specshield.policy.load import load_policy
 from specshield.policy.planner import Settings, read_settings, synthesise
+from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.unicycle import simulate
 from specshield.shield.episode import Carry, decide, make_shield, start
 from specshield.stl import robustness
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 
+RESTLESS = robot_from_json({"footprint": {"radius": 0.1}, "actions": [{"name": "go", "translate": 0.1}]})
 EVENT = np.zeros(8)  # the signal, held from the newest sample on, as the oracles below read it
 
 
@@ -130,6 +138,34 @@ def test_once_feasible_always_feasible(cells):
         assert robustness(cells.task.formula, cells.task.samples(np.array(history), signals)) > 0.0
         played += 1
     assert played >= 3
+
+
+@settings(max_examples=60, deadline=None)
+@given(formula=formulas(), robot=st.sampled_from([STRETCH, CUSTOM, RESTLESS]), data=st.data())
+def test_any_formula_has_a_proposal_for_every_motion(formula, robot, data):
+    """Whatever is asked for, whatever the robot: rows of f's own poses, and what is claimed is so."""
+    assume(formula.horizon >= 1)
+    regions = {"Charger1": REGIONS["West"], "Bedroom_2": REGIONS["East"]}
+    signals = {"_": 1.0, "GF": 0.0, "notable": -1.0}
+    task = make_task(OccupancyGrid(OCCUPIED, 0.1), robot, str(formula), regions, signals=signals)
+    policy = synthesise(task, Settings(pitch=0.2))
+    heading = data.draw(st.floats(-3.0, 3.0))
+    history = np.array([[0.8, 1.5, heading], [0.9, 1.5, heading]])[: task.horizon]
+    proposal = policy.propose(history, {}, 0.0)
+    assert sorted(set(proposal.motions[:, 0])) == list(range(len(robot.motions)))
+    shield = make_shield([policy])
+    for motions, poses in zip(proposal.motions, proposal.poses, strict=True):
+        again = np.empty_like(poses)
+        simulate(shield.body, history[-1], motions, again)
+        np.testing.assert_array_equal(poses, again)
+    decision = decide(shield, history, np.zeros(len(robot.actions)), witnesses=True)
+    for action, witness in enumerate(decision.witnesses):
+        if witness is not None and decision.spec_status == "pending":
+            ways = np.array([robot.motion_of[a] for a in (action, *witness)], np.int64)
+            after = np.empty((len(ways), 3))
+            simulate(shield.body, history[-1], ways, after)
+            samples = {n: v.tolist() for n, v in task.samples(np.concatenate([history, after])).items()}
+            assert brute_robustness(task.formula, samples) > 0.0
 
 
 def test_a_robot_that_cannot_stand_still_is_planned_for():

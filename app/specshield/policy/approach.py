@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import leaf
+from specshield.compiled import leaf, merged
 from specshield.policy.agenda import Agenda, Bounds, note, read_pose
 from specshield.policy.fields import FAR, Fields, to_go_after, to_go_at
 from specshield.robot.unicycle import Body, step
@@ -104,7 +104,7 @@ def _keeps(world: World, at: int, need: Ints, rho: Floats) -> bool:
     return kept
 
 
-@leaf
+@merged
 def walk(
     world: World,
     k: int,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import kernel, leaf, merged
 from specshield.policy.agenda import (
     NEVER,
     Bounds,
@@ -108,7 +108,7 @@ def _guarding(world: World, need: Ints) -> bool:
     return guarding
 
 
-@leaf
+@merged
 def _expand(
     world: World, t: int, d: int, n: int, used: int, motions: Ints, poses: Floats, work: Work, nodes: Nodes
 ) -> bool:
@@ -164,7 +164,7 @@ def _expand(
     return False
 
 
-@leaf
+@merged
 def _serve(
     world: World, t: int, d: int, c: int, motions: Ints, poses: Floats, work: Work, nodes: Nodes
 ) -> int:
