@@ -24,6 +24,8 @@ from specshield.sim.robot import SimulatedRobot
 
 FOLDER, WEIGHTS, CARD = "fm", "model.safetensors", "model.json"  # in models/
 FLOOR = 16.0  # [nats] below the best logit is as unlikely as an action gets
+RELUCTANCE = 2.0  # [nats] to undo what was executed last: without it, it turns to and fro where it is unsure
+OPPOSITE = {0: 3, 3: 0, 1: 2, 2: 1, 6: 7, 7: 6}  # of the Stretch tokens m, b, r, l, ls, rs
 
 
 class LearnedModel:
@@ -42,7 +44,10 @@ class LearnedModel:
         seen = (float(senses.seen), senses.distance, senses.bearing)
         last = NOTHING if senses.last_action is None else senses.last_action
         raw = self._network.step(features(np.array([*senses.ranges, *seen])), last, self._kind)
-        logits = raw.astype(np.float64) / self._temperature
+        logits = raw.astype(np.float64)
+        if last in OPPOSITE:
+            logits[OPPOSITE[last]] -= RELUCTANCE
+        logits /= self._temperature
         floored: NDArray[np.float64] = np.maximum(logits, logits.max() - FLOOR)
         return floored
 
