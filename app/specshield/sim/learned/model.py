@@ -1,7 +1,8 @@
 """The learned foundation model: it imitates shortest paths, as SPOC does, and knows no rule and no region.
 
 Egocentric only: a range scan, whether and where the target is seen, what it is told to find, and the action
-that was executed last, its own or not. What it remembers is its own.
+that was executed last, its own or not. What it remembers is its own. The weights that are shipped
+were trained in generated apartments alone; the card says how, and what was measured.
 """
 
 from __future__ import annotations
