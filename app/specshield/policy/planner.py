@@ -205,7 +205,7 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
                 got=None if array is None else f"{array.dtype} {list(array.shape)}",
                 expected=f"{dtype.__name__}, rank {rank}",
             )  # fmt: skip
-    cell, code, chosen = (np.array(tensors[name], order="C") for name in wanted)  # writable, as new ones are
+    cell, code, chosen = (np.require(tensors[name], requirements=["C", "W"]) for name in wanted)
     ny, nx, headings = _shape(task, settings)
     fits = (
         cell.shape == (ny, nx) and code.shape[2] == headings and chosen.shape == (len(literals), 2)
