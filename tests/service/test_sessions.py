@@ -46,6 +46,17 @@ def test_an_episode_to_its_end(client, begin, step):
     problem(step(session, 10, [START]), 409, "session-finished")
 
 
+def test_a_session_that_looks_ahead(begin, step):
+    session, poses = begin(shaping="lookahead", slack=1, margin=0.01), [START]
+    assert (session["shaping"], session["slack"], session["margin"]) == ("lookahead", 1, 0.01)
+    for t in range(9):
+        answer = step(session, t, poses[-1:], logits=LOGITS).json()
+        assert answer["mode"] == ("shaped" if t < 8 else "prior")
+        assert answer["distribution"][4] == 0.0
+        poses.append(answer["next_poses"][0])
+    assert answer["spec_status"] == "satisfied"
+
+
 def test_timings_are_told(begin, step):
     session = begin()
     timing = dict(

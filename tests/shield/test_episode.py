@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from tests.oracles.cells import END, FORWARD, LEFT, MOTIONS, RIGHT, WAIT, Cells, Exhaustive, Scripted, waits
 
-from specshield.errors import InputError, LogitsError, PolicyError, PoseError, SampleError, Unsupported
+from specshield.errors import InputError, LogitsError, PolicyError, PoseError, SampleError
 from specshield.shield.episode import Carry, Config, close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
 from specshield.stl import robustness
@@ -571,7 +571,7 @@ def test_a_later_pose_in_collision_is_answered_and_flagged(pose):
         ({"evaluation": "vibes"}, "evaluation", InputError),
         ({"margin": -0.1}, "margin", InputError),
         ({"margin": math.inf}, "margin", InputError),
-        ({"shaping": "lookahead"}, "shaping", Unsupported),
+        ({"shaping": "lookahead", "threshold": 0.9}, "shaping", InputError),
         ({"shaping": "sideways"}, "shaping", InputError),
     ],
 )

@@ -10,10 +10,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.errors import InputError, PolicyError, Unsupported
+from specshield.errors import InputError, PolicyError
 from specshield.policy.policy import Proposer
 from specshield.policy.view import View, view_of
 from specshield.robot.unicycle import Body, make_body
+from specshield.shield.belief import Belief
 from specshield.stl import Verdict
 from specshield.task import Task
 
@@ -28,7 +29,8 @@ class Config:
 
     threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho
     > margin [m]. slack: J asks for every F this many steps early. Where either cannot be had, the most that
-    can. max_steps: None is max(600, T + 1). seed: of the drawn actions.
+    can. shaping: whether the model's preference inside S_t is looked ahead for. max_steps: None is max(600, T
+    + 1). seed: of the drawn actions.
     """
 
     threshold: float = 1.0
@@ -47,16 +49,16 @@ class Config:
                 got=self.evaluation,
                 expected="'feasibility' or 'robustness'",
             )
-        if self.shaping == "lookahead":
-            raise Unsupported(
-                "look-ahead shaping is not there yet",
-                path="shaping",
-                got=self.shaping,
-                expected="'projection'",
+        if self.shaping not in ("projection", "lookahead"):
+            raise InputError(
+                "unknown shaping", path="shaping", got=self.shaping, expected="'projection' or 'lookahead'"
             )
-        if self.shaping != "projection":
-            raise InputError("unknown shaping", path="shaping", got=self.shaping, expected="'projection'")
         binary = self.evaluation == "feasibility"
+        if self.shaping == "lookahead" and not (binary and self.threshold == 1.0):
+            raise InputError(
+                "look-ahead chooses within the feasible set", path="shaping", got=self.shaping,
+                expected="'projection', or evaluation 'feasibility' with threshold 1",
+            )  # fmt: skip
         if not math.isfinite(self.threshold) or (binary and not 0.0 < self.threshold <= 1.0):
             raise InputError(
                 "the threshold is out of range", path="threshold", got=self.threshold,
@@ -114,20 +116,25 @@ class Carry:
     """What one decision hands to the next: each motion's next pose and its certified continuation.
 
     next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it; None: not certified.
+    belief: what look-ahead shaping believes of the model.
     """
 
     t: int
     next_poses: Floats
     witnesses: tuple[bytes | None, ...]
+    belief: Belief | None = None
 
     def to_json(self) -> dict[str, Any]:
         witnesses = [None if w is None else w.hex() for w in self.witnesses]
-        return {"t": self.t, "next_poses": self.next_poses.tolist(), "witnesses": witnesses}
+        value = {"t": self.t, "next_poses": self.next_poses.tolist(), "witnesses": witnesses}
+        return value | ({} if self.belief is None else {"belief": self.belief.to_json()})
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> Carry:
         witnesses = tuple(None if w is None else bytes.fromhex(w) for w in value["witnesses"])
-        return Carry(value["t"], np.array(value["next_poses"], dtype=np.float64).reshape(-1, 3), witnesses)
+        poses = np.array(value["next_poses"], dtype=np.float64).reshape(-1, 3)
+        belief = Belief.from_json(value["belief"]) if "belief" in value else None
+        return Carry(value["t"], poses, witnesses, belief)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
+from specshield.policy.reachability import ReachabilityPolicy
 from specshield.robot.unicycle import in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
@@ -28,6 +29,7 @@ from specshield.shield.judgement import (
     robustness_of,
     witnesses_of,
 )
+from specshield.shield.lookahead import LookAhead, prepare
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "close", "decide", "make_shield", "start"]
@@ -60,6 +62,8 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
             "the footprint touches an obstacle", path="initial_pose", got=list(pose),
             expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
         )  # fmt: skip
+    if shield.config.shaping == "lookahead":
+        look_ahead(shield)  # raises for a task that it does not cover
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
     values = rho(prefix, futures(prefix, shield.body, shield.policies, None, shield.config.margin))
     if not np.any(values > SATISFIED_ABOVE):
@@ -101,6 +105,7 @@ def decide(
     nexts = np.empty((len(robot.motions), 3))
     successors(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
+    belief, preference = None if carry is None else carry.belief, None
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     margin = SATISFIED_ABOVE + shield.config.margin  # is nothing left that could change whether it is kept?
@@ -112,7 +117,10 @@ def decide(
         answer = _unmodified(shield, log_prior)
     else:
         judged = judge(shield, prefix, tail, violated=spec_status == "violated")
-        answer = _answer(shield, log_prior, judged, main_task_done)
+        if shield.config.shaping == "lookahead" and log_prior is not None and spec_status == "pending":
+            ahead = look_ahead(shield)
+            belief, preference = ahead.step(belief or ahead.begin(), poses, signals, log_prior)
+        answer = _answer(shield, log_prior, judged, main_task_done, preference)
         if spec_status == "violated":
             answer = _Answer(answer.distribution, "violated", answer.reason)
 
@@ -140,7 +148,7 @@ def decide(
         witnesses=tuple(as_actions(shield, certified, a) for a in range(len(robot.actions)))
         if witnesses
         else (),
-        carry=Carry(t, nexts, certified),
+        carry=Carry(t, nexts, certified, belief),
     )
 
 
@@ -151,8 +159,17 @@ class _Answer:
     reason: Reason | None
 
 
-def _answer(shield: Shield, log_prior: Floats | None, judged: Judged, main_task_done: bool) -> _Answer:
-    """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`."""
+def _answer(
+    shield: Shield,
+    log_prior: Floats | None,
+    judged: Judged,
+    main_task_done: bool,
+    preference: Floats | None,
+) -> _Answer:
+    """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`.
+
+    preference [A]: log-weights inside S_t beside the model's.
+    """
     terminal = shield.task.robot.terminal
     any_feasible = bool(judged.feasible.any())
     said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
@@ -175,7 +192,8 @@ def _answer(shield: Shield, log_prior: Floats | None, judged: Judged, main_task_
         shaped = shaping.tilt(conditional, judged.values, config.threshold)
         attainable = bool(judged.values.max() >= config.threshold)
     elif config.threshold == 1.0:
-        shaped = shaping.restrict(conditional, judged.feasible)
+        wanted = conditional if preference is None else conditional + preference
+        shaped = shaping.restrict(wanted, judged.feasible)
     else:
         shaped = shaping.soften(conditional, judged.feasible, config.threshold)
     reason: Reason | None = said
@@ -184,6 +202,12 @@ def _answer(shield: Shield, log_prior: Floats | None, judged: Judged, main_task_
     mode: Mode = "fallback" if shaped is None else "shaped"
     body = certified if shaped is None else shaped
     return _Answer(np.where(terminal, prior, (1.0 - ending) * body), mode, reason)
+
+
+def look_ahead(shield: Shield) -> LookAhead:
+    """Prepared once a process. Raises FragmentError, PolicyError, Unsupported for what it does not cover."""
+    computed = [policy for policy in shield.policies if isinstance(policy, ReachabilityPolicy)]
+    return prepare(shield.task, computed[0] if computed else None)
 
 
 def _unmodified(shield: Shield, log_prior: Floats | None) -> _Answer:

@@ -1,0 +1,93 @@
+"""Look-ahead shaping in a session's decisions: the same guarantee, another preference."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from specshield.policy.environment import free_poses
+from specshield.shield.decision import Carry, Config
+from specshield.shield.episode import close, decide, make_shield, start
+from specshield.shield.shaping import log_softmax
+from specshield.sim.cases import load_case, shipped
+from specshield.sim.model import make_model
+from specshield.sim.robot import SimulatedRobot
+
+
+@pytest.fixture(scope="module")
+def world():
+    case = load_case("case1")
+    return case, make_shield([shipped(case, "reachability")])
+
+
+def begin(case, shield, seed):
+    (pose,) = free_poses(case.task, case.body, 1, np.random.default_rng([seed, 2])).tolist()
+    start(shield, pose)  # raises where it is not feasible
+    return pose
+
+
+def episode(case, shield, seed, each=lambda decision, logits: None):
+    """(path KL, verdict) of the stand-in model under the shield."""
+    model, robot = make_model("goal-seeker", case), SimulatedRobot(case, tuple(begin(case, shield, seed)))
+    model.reset(np.random.default_rng([seed, 0]))
+    history, carry, over, paid = [], None, False, 0.0
+    for _ in range(case.task.horizon + 1):
+        history.append(robot.pose)
+        logits = None if over else model.logits(robot)
+        decision = decide(shield, history, logits, over, carry=carry)
+        each(decision, logits)
+        paid += decision.kl or 0.0
+        carry = Carry.from_json(json.loads(json.dumps(decision.carry.to_json())))
+        over = over or bool(case.task.robot.terminal[decision.action])
+        if len(history) <= case.task.horizon:
+            robot.execute(
+                decision.completion_action
+                if over and decision.completion_action is not None
+                else decision.action
+            )
+    return paid, close(shield, history)[0]
+
+
+def test_the_guarantee_stays_and_the_path_costs_less(world):
+    case, shield = world
+    ahead = replace(shield, config=Config(shaping="lookahead"))
+    differs = []
+
+    def check(decision, logits):
+        if decision.mode != "shaped":
+            return
+        prior, terminal = np.exp(log_softmax(logits)), case.task.robot.terminal
+        allowed = (np.array(decision.j_values) == 1.0) | terminal
+        assert np.all(decision.distribution[~allowed] == 0.0)
+        assert np.array_equal(decision.distribution[terminal], prior[terminal])
+        projected = np.where(terminal | allowed, prior, 0.0)
+        differs.append(np.abs(decision.distribution - projected / projected.sum()).max())
+
+    seeds = range(4)
+    with_it = [episode(case, ahead, seed, check) for seed in seeds]
+    without = [episode(case, shield, seed) for seed in seeds]
+    assert all(verdict == "satisfied" for _, verdict in with_it + without)
+    assert max(differs) > 0.1
+    assert sum(paid for paid, _ in with_it) < sum(paid for paid, _ in without)
+
+
+def test_a_decision_made_again_is_the_same(world):
+    case, shield = world
+    ahead = replace(shield, config=Config(shaping="lookahead", seed=4))
+    model, robot = make_model("goal-seeker", case), SimulatedRobot(case, tuple(begin(case, ahead, 1)))
+    model.reset(np.random.default_rng(1))
+    history, carry = [], None
+    for _ in range(12):
+        history.append(robot.pose)
+        logits = model.logits(robot)
+        decision = decide(ahead, history, logits, carry=carry)
+        again = decide(
+            ahead, history, logits, carry=None if carry is None else Carry.from_json(carry.to_json())
+        )
+        assert np.array_equal(decision.distribution, again.distribution)
+        assert decision.action == again.action
+        assert decision.carry.to_json() == again.carry.to_json()
+        carry = decision.carry
+        robot.execute(decision.action)
+    assert carry.belief is not None
