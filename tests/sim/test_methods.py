@@ -34,7 +34,7 @@ def walk(*motions, start=(0, 0, 0)):
         (walk(FORWARD), {LEFT, RIGHT, WAIT, END}),  # B is the next cell
         (walk(WAIT, WAIT), {FORWARD, LEFT, RIGHT, WAIT, END}),  # missed: nothing to lose but B
         (walk(FORWARD, FORWARD), {FORWARD}),  # inside B: out of it
-        (walk(FORWARD, FORWARD, RIGHT), set()),  # and no way out at once
+        (walk(FORWARD, FORWARD, RIGHT), {FORWARD, LEFT, RIGHT, WAIT, END}),  # and no way out at once
         (walk(FORWARD, WAIT, WAIT, WAIT), {FORWARD, LEFT, RIGHT, WAIT, END}),  # the horizon is past
     ],
 )
@@ -44,11 +44,14 @@ def test_hard_decoding_masks_what_leaves_no_chance_at_the_next_step(history, lef
     np.testing.assert_array_equal(changed[list(left)], LOGITS[list(left)])
 
 
-def test_with_every_next_state_a_violation_the_model_is_left_as_it_is():
-    answer = Decoding(CELLS.task, HardDecoding(CELLS.task)).act(walk(FORWARD, FORWARD, RIGHT), LOGITS, 0.5)
-    assert (answer.mode, answer.reason) == ("fallback", "infeasible")
-    np.testing.assert_allclose(answer.distribution, np.exp(log_softmax(LOGITS)))
-    assert answer.kl == pytest.approx(0.0, abs=1e-12)
+def test_a_window_that_is_lost_lets_nobody_into_what_is_forbidden():
+    """A at step 2 is out of reach from beside B, facing it; B is one step ahead."""
+    beside = walk(WAIT, start=(3, 0, 2))
+    changed = HardDecoding(CELLS.task).decode(beside, LOGITS)
+    assert set(np.flatnonzero(np.isneginf(changed))) == {FORWARD}
+    answer = Decoding(CELLS.task, HardDecoding(CELLS.task)).act(beside, LOGITS, 0.5)
+    assert (answer.mode, answer.distribution[FORWARD]) == ("shaped", 0.0)
+    assert answer.kl == pytest.approx(-math.log(1.0 - np.exp(log_softmax(LOGITS))[FORWARD]))
 
 
 @pytest.mark.parametrize(

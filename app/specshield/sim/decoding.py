@@ -6,7 +6,7 @@
 What a next state means for a rule with windows is not defined there; we read it as favourably as next-step
 reasoning allows. It violates where the states so far and the next one leave some conjunct no chance,
 whatever follows: the last step of a window that was missed, a step into what G forbids. A conjunct that is
-broken already is dropped, a broken G is enforced again. Its robustness is the smallest of the predicates that
+lost is dropped, a broken G is enforced again. Its robustness is the smallest of the predicates that
 are asked for at t + 1: those of a G in its window, and of an F in its window that has not been satisfied yet.
 A terminal action stands still.
 """
@@ -47,7 +47,7 @@ class HardDecoding:
         self._next = _NextStates(task)
 
     def decode(self, history: Floats, logits: Floats) -> Floats:
-        """Logits [A], -inf where the next state violates; all of them where every one does."""
+        """Logits [A], -inf where the next state violates; what every next state violates masks nothing."""
         task, t = self._next.task, len(history) - 1
         if t >= task.horizon:
             return logits
@@ -65,7 +65,8 @@ class HardDecoding:
         chance = np.ones(len(logits), bool)
         for conjunct in conjuncts(rule):
             _, high = robustness_bounds(conjunct, {name: samples[name] for name in conjunct.names})
-            chance &= high > SATISFIED_ABOVE
+            with_it = chance & (high > SATISFIED_ABOVE)
+            chance = with_it if with_it.any() else chance  # lost whatever is done: the others still count
         return np.where(chance, logits, -np.inf)
 
 

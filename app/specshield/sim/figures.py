@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.sim.cases import Case
+from specshield.sim.experiment import METHODS, split
 from specshield.sim.picture import avoided
 from specshield.sim.runs import Record
 from specshield.sim.statistics import MODES
@@ -44,7 +45,7 @@ ByMethod = dict[str, list[Record]]
 def draw(case: Case, records: Sequence[Record], folder: Path) -> list[Path]:
     """Writes the four pictures of an experiment; the files."""
     by_method: ByMethod = {}
-    for record in records:
+    for record in sorted(records, key=lambda r: (METHODS.index(split(r.method)[0]), r.run)):
         by_method.setdefault(record.method, []).append(record)
     folder.mkdir(parents=True, exist_ok=True)
     written = []

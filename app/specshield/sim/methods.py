@@ -78,19 +78,13 @@ class Decoding:
             raise InputError("next-step decoding has no plan of its own", path="logits", got=None)
         changed = logits if self._how is None else self._how.decode(history, logits)
         log_prior = shaping.log_softmax(logits)
-        mode, reason = "prior", None
-        if not np.isfinite(changed).any():  # no next state will do
-            changed, mode, reason = logits, "fallback", "infeasible"
-        elif changed is not logits and not np.array_equal(changed, logits):
-            mode = "shaped"
         distribution = np.exp(shaping.log_softmax(changed))
         action = drawn(distribution, draw)
         return Answer(
             distribution,
             action,
             None if self._terminal[action] else action,
-            mode,
-            reason,
+            "prior" if np.array_equal(changed, logits) else "shaped",
             kl=shaping.divergence(distribution, log_prior),
         )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from specshield.sim.evaluation import read
-from specshield.sim.experiment import Experiment
+from specshield.sim.experiment import METHODS, Experiment, split
 from specshield.sim.runs import Record
 from specshield.sim.statistics import summary
 
@@ -19,7 +19,8 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
     for record in records:
         by_method.setdefault(record.method, []).append(record)
     runs = sorted({record.run for record in records})
-    complete = {name: sorted(found, key=lambda r: r.run) for name, found in by_method.items()}
+    ranked = sorted(by_method, key=lambda name: METHODS.index(split(name)[0]))
+    complete = {name: sorted(by_method[name], key=lambda r: r.run) for name in ranked}
     plain = {record.run: record for record in complete.get("unmodified", [])}
     case = experiment.setting.case
     return {
