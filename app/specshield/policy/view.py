@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel
 from specshield.stl import Formula
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
 from specshield.stl.tree import Tree, compile_tree, tree_bounds, tree_value
@@ -49,7 +49,7 @@ def view_of(task: Task, formula: Formula) -> View:
     return View(tree, pack_regions(list(task.regions.values())), first, last)
 
 
-@leaf
+@inlined
 def _read(
     view: View, poses: Floats, signals: Floats, start: int, values: Floats, stack: Floats, buffer: Floats
 ) -> bool:

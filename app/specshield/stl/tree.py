@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import leaf
+from specshield.compiled import inlined, leaf
 from specshield.stl.formula import (
     Always,
     And,
@@ -145,7 +145,7 @@ def _unknown(formula: Node) -> tuple[float, float]:
     raise TypeError(f"not a predicate: {formula!r}")
 
 
-@leaf
+@inlined
 def tree_value(tree: Tree, buffer: Floats) -> float:
     """rho, from the leaves' values in `buffer` (size,), which is overwritten."""
     for n in range(tree.op.shape[0]):
@@ -170,7 +170,7 @@ def tree_bounds(tree: Tree, low: Floats, high: Floats) -> tuple[float, float]:
     return float(low[0] + 0.0), float(high[0] + 0.0)
 
 
-@leaf
+@inlined
 def _apply(tree: Tree, n: int, buffer: Floats) -> None:
     """A monotone operator on one end, in place: each value is written after the last that reads it."""
     op, at, count, right = tree.op[n], tree.at[n], tree.length[n], tree.right[n]
@@ -187,7 +187,7 @@ def _apply(tree: Tree, n: int, buffer: Floats) -> None:
         _slide(buffer, at, count, tree.b[n] - tree.a[n] + 1, op == ALWAYS)
 
 
-@leaf
+@inlined
 def _slide(buffer: Floats, at: int, count: int, width: int, least: bool) -> None:
     """The extremum of each `width` neighbours, in log2(width) passes."""
     if count == 1:
