@@ -48,7 +48,7 @@ bench: .venv-bench/.done
 
 # docs/results.md. What is in RESULTS already is not done again.
 RESULTS ?= out/results
-MODEL ?= goal-seeker
+MODEL ?= learned
 EVALUATE = $(BIN)/specshield evaluate --runs 200 --model $(MODEL) --out $(RESULTS)
 results: .venv/.dev
 	$(EVALUATE) --case 1

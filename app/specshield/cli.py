@@ -122,7 +122,7 @@ def evaluate(
     noise: Annotated[
         str, typer.Option(help="none, gaussian, slip, obstacle, shift, collider; or some.")
     ] = "none",
-    model: Annotated[str, typer.Option(help="The model that is to be kept to the rule.")] = "goal-seeker",
+    model: Annotated[str, typer.Option(help="The model that is to be kept to the rule.")] = "learned",
     house: Annotated[str | None, typer.Option(help="A ProcTHOR house, for the case house.")] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder to keep results in and to take them up from.")

@@ -27,15 +27,21 @@ def test_with_the_shield_the_rule_is_kept_and_without_it_broken(campaign, case):
     assert campaign.kept
     for episode in campaign.shielded:
         assert margin(case.spec, padded(episode, case)) > 0.0
-        assert episode.main_done
         assert set(episode.modes) <= {"shaped", "prior", "completion"}
         assert episode.spread >= 0.8 * episode.asked > 0
         assert len(episode.server_ms) == len(episode.round_trip_ms) == sum(episode.modes.values())
     for episode in campaign.unshielded:
         low, high = episode.robustness
-        assert (episode.spec_status, low) == ("violated", high)
+        assert low == high
+        assert episode.spec_status == ("satisfied" if low > 0.0 else "violated")
         assert margin(case.spec, episode.poses) == pytest.approx(low, abs=1e-9)
-        assert episode.main_done
+    assert sum(episode.spec_status == "satisfied" for episode in campaign.unshielded) <= 1  # by chance
+
+
+def test_the_model_finds_its_target_with_the_shield_and_without(campaign):
+    """It is a learned one, which alone finds it in 95 to 99 % of its runs."""
+    for episodes in (campaign.shielded, campaign.unshielded):
+        assert sum(episode.main_done for episode in episodes) >= 0.9 * RUNS
 
 
 def padded(episode, case):
@@ -57,15 +63,18 @@ def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
 def test_the_table_and_the_json_say_what_happened(campaign):
     figures = json.loads(json.dumps(report.summary(campaign)))
     kept = figures["with_shield"]
-    assert (kept["satisfied"], kept["main_done"]) == (RUNS, RUNS)
-    assert figures["without_shield"] == {"satisfied": 0, "main_done": RUNS}
+    done = [sum(e.main_done for e in episodes) for episodes in (campaign.shielded, campaign.unshielded)]
+    lucky = sum(episode.spec_status == "satisfied" for episode in campaign.unshielded)
+    assert (kept["satisfied"], kept["main_done"]) == (RUNS, done[0])
+    assert figures["without_shield"] == {"satisfied": lucky, "main_done": done[1]}
     every = [value for episode in campaign.shielded for value in episode.kl]
     assert kept["kl_per_episode"] == pytest.approx(sum(every) / RUNS, abs=1e-3)
     assert kept["kl_per_decision"] == pytest.approx(sum(every) / len(every), abs=1e-3)
-    later = [s.ended_at - u.ended_at for s, u in zip(campaign.shielded, campaign.unshielded, strict=True)]
+    pairs = zip(campaign.shielded, campaign.unshielded, strict=True)
+    later = [s.ended_at - u.ended_at for s, u in pairs if s.main_done and u.main_done]
     assert kept["extra_steps"] == np.median(later)
     lines = report.table([figures, figures]).splitlines()
-    assert lines[2].split() == ["rule", "satisfied", *f"0 of {RUNS} {RUNS} of {RUNS}".split() * 2]
+    assert lines[2].split() == ["rule", "satisfied", *f"{lucky} of {RUNS} {RUNS} of {RUNS}".split() * 2]
     assert len({len(line) for line in lines[2:]}) <= 2
     json.dumps([episode.to_json() for episode in campaign.shielded])
 

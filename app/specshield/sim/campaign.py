@@ -14,7 +14,7 @@ from specshield.errors import InfeasibleStart
 from specshield.policy.environment import free_poses
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode, with_shield, without_shield
-from specshield.sim.model import GoalSeeker
+from specshield.sim.model import make_model
 from specshield.sim.robot import Pose
 
 DRAWS = 100  # starts tried for one episode before giving up
@@ -51,7 +51,7 @@ def run(
     def pair(i: int) -> tuple[Episode, Episode, int]:
         own = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
         session, start, refused = _begin(client, case, own)
-        model = GoalSeeker(case.task.robot)
+        model = make_model("learned", case)
         return (
             with_shield(session, case, model, start, own),
             without_shield(client, case, model, start, own),

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
-from specshield.errors import InputError, NotFound, Unsupported
+from specshield.errors import InputError, NotFound
 from specshield.policy.policy import Policy, Proposer
 from specshield.policy.reachability import synthesise
 from specshield.robot.unicycle import Body, make_body
@@ -33,7 +33,7 @@ class Experiment:
 
     case: str
     house: str | None = None
-    model: str = "goal-seeker"
+    model: str = "learned"
     noise: str = "none"
     seed: int = 0
 
@@ -102,7 +102,7 @@ class Setting:
     def method(self, name: str) -> Method:
         """A method by its name, NAME@M/K with a margin of M metres and K steps of slack.
 
-        Raises NotFound, InputError; Unsupported for a shaping that is not there.
+        Raises NotFound, InputError.
         """
         kind, margin, slack = split(name)
         careful = Config(margin=margin, slack=slack)
@@ -126,12 +126,7 @@ def experiments(case: str, house: str | None, model: str, noise: str, seed: int)
 
 def available(case: str) -> list[str]:
     """The methods that can be had for a case without options."""
-    absent = {"paper"} if case == "house" else set()
-    try:
-        Config(shaping="lookahead")
-    except Unsupported:
-        absent.add("lookahead")
-    return [name for name in METHODS if name not in absent]
+    return [name for name in METHODS if name != "paper" or case != "house"]
 
 
 def split(method: str) -> tuple[str, float, int]:
