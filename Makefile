@@ -55,11 +55,17 @@ results: .venv/.dev
 	$(EVALUATE) --case 2
 	for case in 1 2; do \
 	  $(EVALUATE) --case $$case --noise gaussian \
-	    --methods unmodified,paper,ours,ours@0/8,ours@conformal,ours@conformal/8 || exit 1; \
-	  $(EVALUATE) --case $$case --noise slip,obstacle,shift,collider --methods paper,ours,ours@0.04/8 || exit 1; \
+	    --methods unmodified,paper,ours,ours@conformal/8 || exit 1; \
+	  $(EVALUATE) --case $$case --noise slip,obstacle,shift,collider --runs 50 \
+	    --methods paper,ours,ours@0.04/8 || exit 1; \
+	  $(EVALUATE) --case $$case --model goal-seeker --seed 1 --out $(RESULTS)-goal-seeker \
+	    --methods unmodified,ours,lookahead || exit 1; \
 	done
-	for house in house_0 house_2; do $(EVALUATE) --case house --house $$house || exit 1; done
+	for house in house_0 house_2; do \
+	  $(EVALUATE) --case house --house $$house --runs 60 --methods unmodified,hcd,ours,lookahead || exit 1; \
+	done
 	$(BIN)/specshield report $(RESULTS)
+	$(BIN)/specshield report $(RESULTS)-goal-seeker --out docs/results-goal-seeker.md
 
 openapi: .venv/.server
 	$(BIN)/specshield openapi > openapi.json

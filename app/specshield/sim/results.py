@@ -9,12 +9,16 @@ from typing import Any
 
 from specshield.sim.evaluation import read
 from specshield.sim.experiment import METHODS, Experiment, split
-from specshield.sim.runs import Record
+from specshield.sim.runs import MAX_STEPS, Record
 from specshield.sim.statistics import summary
 
 
 def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]:
-    """The figures of every method in `records`, as JSON. refused: starts drawn before those that would do."""
+    """The figures of every method in `records`, as JSON. refused: starts drawn before those that would do.
+
+    left: the steps of a run that the rule leaves after its horizon, and in how many runs the model,
+    unmodified, does its task in as many.
+    """
     by_method: dict[str, list[Record]] = {}
     for record in records:
         by_method.setdefault(record.method, []).append(record)
@@ -23,6 +27,8 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
     complete = {name: sorted(by_method[name], key=lambda r: r.run) for name in ranked}
     plain = {record.run: record for record in complete.get("unmodified", [])}
     case = experiment.setting.case
+    left = MAX_STEPS - case.task.horizon
+    in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain.values()]
     return {
         "experiment": experiment.to_json(),
         "case": case.name,
@@ -30,6 +36,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
         "instruction": case.instruction,
         "runs": len(runs),
         "refused_starts": sum({record.run: record.refused for record in records}.values()),
+        "left": {"steps": left, "done": sum(in_time)},
         "methods": [
             summary(
                 name, found, [plain[r.run] for r in found] if plain.keys() >= {r.run for r in found} else []

@@ -167,6 +167,11 @@ def _short(results: Results) -> str:
             parts.append(f"main task {points:+.1f} points below unmodified")
         if parts:
             lines.append(f"- {one['method']}: {'; '.join(parts)}.")
+    if plain is not None:
+        lines.append(
+            f"- A rule may keep the model till its horizon; in the {results['left']['steps']} steps that are "
+            f"then left, unmodified does its task in {results['left']['done']} of {results['runs']} runs."
+        )
     return "\n".join(lines)
 
 
