@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.policy.reachability import ReachabilityPolicy
 from specshield.robot.unicycle import in_collision, successors, wrap
@@ -122,7 +123,7 @@ def decide(
             belief, preference = ahead.step(belief or ahead.begin(), poses, signals, log_prior)
         answer = _answer(shield, log_prior, judged, main_task_done, preference)
         if spec_status == "violated":
-            answer = _Answer(answer.distribution, "violated", answer.reason)
+            answer = replace(answer, mode="violated")
 
     action = _draw(answer.distribution, shield.config.seed, t)
     moved = judged.completion if judged is not None and robot.terminal[action] else action
@@ -137,7 +138,7 @@ def decide(
         action_name=robot.actions[action].name,
         completion_action=None if judged is None else judged.completion,
         spec_status=spec_status,
-        feasible_mass=feasible_mass_of(shield, log_prior, judged),
+        feasible_mass=feasible_mass_of(answer.conditional, judged),
         kl=None if log_prior is None else shaping.divergence(answer.distribution, log_prior),
         reason=answer.reason,
         finished=(spec_status != "pending" and main_task_done) or t >= shield.max_steps,
@@ -154,9 +155,12 @@ def decide(
 
 @dataclass(frozen=True)
 class _Answer:
+    """conditional [A]: the model's log-probabilities given that it does not end."""
+
     distribution: Floats
     mode: Mode
     reason: Reason | None
+    conditional: Floats | None = None
 
 
 def _answer(
@@ -175,18 +179,14 @@ def _answer(
     said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
     certified = np.zeros(len(terminal))
     certified[judged.completion] = 1.0
-    if main_task_done or log_prior is None:
-        return _Answer(
-            certified, "completion" if any_feasible else "fallback", said if any_feasible else "infeasible"
-        )
+    conditional, ending = (None, 0.0) if log_prior is None else shaping.going_on(log_prior, terminal)
+    if main_task_done or log_prior is None or conditional is None:
+        mode: Mode = "completion" if any_feasible else "fallback"
+        return _Answer(certified, mode, said if any_feasible else "infeasible", conditional)
     prior = np.exp(log_prior)
-    ending = float(prior[terminal].sum())
-    going_on = np.where(terminal, -np.inf, log_prior)
-    if not np.isfinite(going_on).any():  # the model ends for certain
-        return _Answer(
-            prior, "shaped" if any_feasible else "fallback", None if any_feasible else "infeasible"
-        )
-    conditional = shaping.log_softmax(going_on)
+    mode = "shaped" if any_feasible else "fallback"
+    if conditional.max() == -np.inf:  # the model ends for certain
+        return _Answer(prior, mode, None if any_feasible else "infeasible")
     config, attainable = shield.config, any_feasible
     if config.evaluation == "robustness":
         shaped = shaping.tilt(conditional, judged.values, config.threshold)
@@ -199,9 +199,9 @@ def _answer(
     reason: Reason | None = said
     if shaped is None:
         reason = "zero_prior_mass" if attainable else "infeasible"
-    mode: Mode = "fallback" if shaped is None else "shaped"
+    mode = "fallback" if shaped is None else "shaped"
     body = certified if shaped is None else shaped
-    return _Answer(np.where(terminal, prior, (1.0 - ending) * body), mode, reason)
+    return _Answer(np.where(terminal, prior, (1.0 - ending) * body), mode, reason, conditional)
 
 
 def look_ahead(shield: Shield) -> LookAhead:
@@ -225,13 +225,21 @@ def _verdict(low: float, high: float) -> Verdict:
 
 def _history(poses: ArrayLike) -> Floats:
     """Poses [t + 1, 3] with theta in (-pi, pi], as f has it. Raises PoseError where they are not finite."""
-    array = np.array(poses, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not np.isfinite(array).all():
+    array = np.array(poses, dtype=np.float64, order="C")
+    if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not _wrapped(array):
         got = str(poses)[:80]
         raise PoseError("not poses", path="poses", got=got, expected="a list of finite [x, y, theta]")
-    for i in np.flatnonzero(np.abs(array[:, 2]) >= math.pi):
-        array[i, 2] = wrap(array[i, 2])
     return array
+
+
+@leaf
+def _wrapped(poses: Floats) -> bool:
+    """Takes headings into (-pi, pi]; False where a number is not finite. poses (n, 3)."""
+    for i in range(poses.shape[0]):
+        if not (math.isfinite(poses[i, 0]) and math.isfinite(poses[i, 1]) and math.isfinite(poses[i, 2])):
+            return False
+        poses[i, 2] = wrap(poses[i, 2])
+    return True
 
 
 def _log_prior(shield: Shield, logits: ArrayLike | None, main_task_done: bool) -> Floats | None:
@@ -252,20 +260,28 @@ def _log_prior(shield: Shield, logits: ArrayLike | None, main_task_done: bool) -
             got=array.shape[0] if array.ndim == 1 else list(array.shape),
             expected=f"{n}, one for each of {', '.join(shield.task.robot.action_names)}",
         )  # fmt: skip
-    wrong = np.flatnonzero(np.isnan(array) | np.isposinf(array))
-    if len(wrong):
-        i = int(wrong[0])
+    i = _wrong(array)
+    if i >= 0:
         raise LogitsError(
             "a logit is NaN or +infinity",
             path=f"logits[{i}]",
             got=str(array[i]),
             expected="a number, or null for -inf",
         )
-    if not np.isfinite(array).any():
+    if array.max() == -np.inf:
         raise LogitsError(
             "every logit is null", path="logits", got="all null", expected="at least one finite logit"
         )
     return shaping.log_softmax(array)
+
+
+@leaf
+def _wrong(logits: Floats) -> int:
+    """The first that is NaN or +infinity, -1 where none is."""
+    for i in range(logits.shape[0]):
+        if math.isnan(logits[i]) or logits[i] == math.inf:
+            return i
+    return -1
 
 
 def _follow(carry: Carry | None, poses: Floats) -> tuple[bytes | None, tuple[float, float] | None]:

@@ -116,10 +116,8 @@ def robustness_of(shield: Shield, judged: Judged | None) -> tuple[float | None, 
     return tuple(None if end else v for end, v in zip(terminal, judged.robustness.tolist(), strict=True))
 
 
-def feasible_mass_of(shield: Shield, log_prior: Floats | None, judged: Judged | None) -> float | None:
-    if log_prior is None or judged is None:
+def feasible_mass_of(conditional: Floats | None, judged: Judged | None) -> float | None:
+    """conditional [A]: log-probabilities given that the model does not end."""
+    if conditional is None or judged is None or conditional.max() == -np.inf:
         return None
-    going_on = np.where(shield.task.robot.terminal, -np.inf, log_prior)
-    if not np.isfinite(going_on).any():
-        return None
-    return shaping.feasible_mass(shaping.log_softmax(going_on), judged.feasible)
+    return shaping.feasible_mass(conditional, judged.feasible)

@@ -27,6 +27,22 @@ def log_softmax(logits: Floats) -> Floats:
 
 
 @kernel
+def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats, float]:
+    """(log-probabilities given that the model does not end, its probability of ending). Shapes (A,).
+
+    All -inf where it ends for certain.
+    """
+    ending, kept = 0.0, log_prior.copy()
+    for a in range(len(kept)):
+        if terminal[a]:
+            ending += np.exp(kept[a])
+            kept[a] = -np.inf
+    if np.max(kept) == -np.inf:
+        return kept, ending
+    return log_softmax(kept), ending
+
+
+@kernel
 def feasible_mass(log_prior: Floats, feasible: Bools) -> float:
     """pi_FM(S_t): the prior's mass on the feasible actions, log_prior conditional on not ending."""
     return float(min(np.sum(np.exp(log_prior[feasible])), 1.0))
