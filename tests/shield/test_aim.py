@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted
 
+from specshield.policy.view import view_of
+from specshield.shield.aim import _open
 from specshield.shield.episode import Config, decide, make_shield
+from specshield.shield.feasibility import prefix_of
 
 EVEN = np.zeros(5)
 SHORTEST = {WAIT: [FORWARD], LEFT: [RIGHT, FORWARD], RIGHT: [LEFT, FORWARD]}
@@ -53,3 +56,22 @@ def test_a_margin_lost_to_what_was_driven_is_asked_of_what_is_to_come():
     assert (found.mode, found.reason) == ("shaped", None)
     assert list(found.j_values[:4]) == [1, 0, 0, 0]
     assert found.robustness[FORWARD] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("asked", [{"slack": 1}, {"margin": 0.3}, {"slack": 2, "margin": 0.3}])
+def test_a_real_valued_j_is_rho_whatever_is_asked_beside_it(asked):
+    plain = {"evaluation": "robustness", "threshold": 0.05}
+    bare, careful = (decision("F[0,2] A and F[0,3] x > 0.22", **plain, **more) for more in ({}, asked))
+    assert careful.j_values == bare.j_values
+    assert np.isfinite(careful.j_values[:4]).all()
+    assert np.array_equal(careful.distribution, bare.distribution)
+    assert careful.distribution[:4] @ careful.j_values[:4] >= 0.05 * careful.distribution[:4].sum() - 1e-12
+
+
+def test_what_a_nested_rule_still_asks():
+    """At t = 8 the windows of G[0,10] F[0,6] that began at step 3 are open still; those before are over."""
+    cells = Cells("G[0,10] F[0,6] x > 0.1 and G[0,9] x > -1", None, {})
+    history = np.array([cells.pose(0, 0, 0)] * 9)
+    task = cells.task
+    prefix = prefix_of(task, task.formula, view_of(task, task.formula), history, {})
+    assert str(_open(prefix, 0)) == "G[3,10] F[0,6] x > 0.1 and G[9,9] x > -1"

@@ -104,6 +104,7 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background shell ignores it
     )
     try:
         if command == "demo":

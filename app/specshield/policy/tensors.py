@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,13 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
         raise PolicyError(
             f"not a safetensors file: {error}", path="weights", got=got, expected="safetensors"
         ) from error
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Writes a file that others may have mapped: they keep what they have."""
+    draft = path.with_name(f"{path.name}.part")
+    draft.write_bytes(content)
+    os.replace(draft, path)
 
 
 def _mapped(path: Path) -> dict[str, NDArray[Any]]:

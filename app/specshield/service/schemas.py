@@ -304,7 +304,7 @@ class SessionRequest(Strict):
         0,
         ge=0,
         le=1000,
-        description="Steps to keep in hand: every F is met so much earlier, where it can be.",
+        description="Steps to keep in hand: each F of the conjunction is met so much earlier, if it can be.",
     )
     evaluation: Literal["feasibility", "robustness"] = Field(
         "feasibility", description="J is 1 or 0 (the rule can be kept or not), or the robustness itself."

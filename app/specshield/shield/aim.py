@@ -49,7 +49,7 @@ def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[
 
 
 def _open(prefix: Prefix, slack: int) -> Formula:
-    """What of the formula the prefix leaves open: a G from t + 1 on, an F `slack` steps early.
+    """What of the formula the prefix leaves open: a G from where its child is, an F `slack` steps early.
 
     A window keeps at least half its length. With nothing open, the formula itself.
     """
@@ -60,7 +60,7 @@ def _open(prefix: Prefix, slack: int) -> Formula:
             continue
         match conjunct:
             case Always(a, b, child):
-                kept.append(Always(max(a, min(prefix.t + 1, b)), b, child))
+                kept.append(Always(max(a, min(prefix.t + 1 - child.horizon, b)), b, child))
             case Eventually(a, b, child):
                 kept.append(Eventually(a, b - min(slack, (b - a) // 2), child))
             case _:

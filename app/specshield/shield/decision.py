@@ -28,9 +28,9 @@ class Config:
     """A session's settings. Raises InputError or Unsupported with the field's path.
 
     threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho
-    > margin [m]. slack: J asks for every F this many steps early. Where either cannot be had, the most that
-    can. shaping: whether the model's preference inside S_t is looked ahead for. max_steps: None is max(600, T
-    + 1). seed: of the drawn actions.
+    > margin [m]. slack: J asks for each F of the conjunction this many steps early. Where either cannot be
+    had, the most that can. shaping: whether the model's preference inside S_t is looked ahead for. max_steps:
+    None is max(600, T + 1). seed: of the drawn actions.
     """
 
     threshold: float = 1.0

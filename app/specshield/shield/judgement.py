@@ -53,7 +53,8 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
             feasible, lowered = _kept(best, asked)
             if feasible.any():
                 break
-    elif shield.config.slack or lowered:
+    values = best.robustness
+    if not violated and (shield.config.slack or lowered):
         best, feasible, lowered = aim(shield, prefix, tried, whole)
     some, first = bool(feasible.any()), tried.preferred
     if tail and feasible[tail[0]]:
@@ -66,7 +67,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
         best=best,
         feasible_motion=feasible,
         feasible=feasible[of] & ~robot.terminal,
-        values=np.where(robot.terminal, -np.inf, best.robustness[of]),
+        values=np.where(robot.terminal, -np.inf, values[of]),
         robustness=whole[best.row][of],
         completion=int(robot.representative[first]),
         margin_unattainable=lowered,

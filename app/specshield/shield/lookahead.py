@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel
+from specshield.errors import Unsupported
 from specshield.policy.lattice import pose_of
 from specshield.policy.progress import SETTLED, Rules, make_rules, replay, signal_rows
 from specshield.policy.reachability import ReachabilityPolicy, synthesise
@@ -104,8 +105,14 @@ def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
     Raises FragmentError outside the fragment, PolicyError or Unsupported for a task too large.
     """
     body, rules = make_body(task.robot, task.grid), make_rules(task)
+    goals = make_goals(body, task.grid)
+    if len(goals.distance) == 0:
+        raise Unsupported(
+            "the robot can turn freely nowhere on this map, so there is nowhere to think of it as going",
+            path="shaping", got="lookahead", expected="'projection'",
+        )  # fmt: skip
     planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
-    return LookAhead(task, body, rules, make_goals(body, task.grid), planes)
+    return LookAhead(task, body, rules, goals, planes)
 
 
 @lru_cache(maxsize=TABLES)

@@ -11,6 +11,7 @@ from typing import Any
 from specshield.errors import Unsupported
 from specshield.policy import planner, reachability
 from specshield.policy.settings import read_settings
+from specshield.policy.tensors import replace_file
 from specshield.sim.cases import MODELS, Case, load_case
 from specshield.sim.progress import StatusLine, duration
 
@@ -45,7 +46,7 @@ def train(
         expected = "'dqn', 'planner' or 'reachability'"
         raise Unsupported("unknown method", path="method", got=method, expected=expected)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "policy.safetensors").write_bytes(weights)
+    replace_file(out / "policy.safetensors", weights)
     (out / "card.json").write_text(json.dumps(card, indent=1) + "\n")
     shutil.rmtree(out / "checkpoint", ignore_errors=True)
     metrics = card["metrics"]

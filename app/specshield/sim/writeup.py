@@ -21,18 +21,20 @@ PAPER = {  # Table II: rule satisfied and main task done, in per cent of 200 run
     "case1": {"unmodified": (0.0, 93.5), "paper": (100.0, 92.5)},
     "case2": {"unmodified": (0.0, 99.0), "paper": (100.0, 82.5)},
 }
-METHODS = """\
-- **unmodified**: the model's own draws; after its `end` the robot stands still.
-- **hcd**: next-step masking, SafeDec's hard constrained decoding: minus infinity where the states so far and
-  the next one leave some conjunct no chance, whatever follows.
-- **rcd**: SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)), rho of the
+METHODS = {
+    "unmodified": "the model's own draws; after its `end` the robot stands still.",
+    "hcd": """next-step masking, SafeDec's hard constrained decoding: minus infinity where the states so far
+  and the next one leave some conjunct no chance, whatever follows.""",
+    "rcd": """SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)), rho of the
   predicates that are asked for at the next step; alpha = {alpha:g} per metre, beta = {beta:g}, the best of 24
-  pairs by runs that kept the rule, on other seeds.
-- **simplex**: the model's draw where it is feasible, else the certified continuation.
-- **paper**: the paper's: a DQN as pi_phi, rolled out literally after every action; hard projection.
-- **ours**: reachability and the DQN together, witnesses carried on; hard projection.
-- **lookahead**: ours, weighted inside S_t by how likely the model itself is to keep the rule from there.
-- NAME@M/K: with a margin of M metres and deadlines aimed at K steps early."""
+  pairs by runs that kept the rule, on other seeds.""",
+    "simplex": "the model's draw where it is feasible, else the certified continuation.",
+    "paper": "the paper's: a DQN as pi_phi, rolled out literally after every action; hard projection.",
+    "ours": "reachability and the DQN together, witnesses carried on; hard projection.",
+    "lookahead": """ours, weighted inside S_t by what the rule will still cost the model, as a surrogate
+  fitted to its logits has it.""",
+}
+CAREFUL = "- NAME@M/K: with a margin of M metres and deadlines aimed at K steps early."
 NOISES = {
     "none": "as told",
     "gaussian": "every motion ends off by sigma 0.01 m along x and y, and 0.5 degrees",
@@ -47,8 +49,8 @@ MODELS = {
     "learned": "learned, a transformer that imitates shortest paths, from egocentric senses",
 }
 WHY_NEXT_STEP = """\
-Next-step methods keep a G, and of a window they see the last step alone: where the place to visit is further
-than that, nothing is left to choose. What RCD adds to the logits leads straight at a place, walls or not."""
+Next-step methods see of a window the last step alone: where the place to visit is further than that, nothing
+is left to choose. HCD keeps a G. What RCD adds to the logits leads straight at a place, walls or not."""
 WHY_SLACK = """\
 Projection lets a model put a visit off to the last step from which it can still be certified, and noise then
 takes that step: slack gives time back. A margin keeps room to what is forbidden, and asks for visits that are
@@ -93,10 +95,13 @@ def _sections(found: dict[Path, Results], drawn: dict[Path, list[Path]], page: P
         "disturbances, run by run. The main task is done when the model says `end` within 1 m of its target "
         "before 600 steps."
     )
-    yield METHODS.format(alpha=ALPHA, beta=BETA)
+    there = {split(one["method"])[0] for r in found.values() for one in r["methods"]}
+    legend = [f"- **{name}**: {text}" for name, text in METHODS.items() if name in there]
+    yield "\n".join([*legend, CAREFUL]).format(alpha=ALPHA, beta=BETA)
     yield "## Beside the paper's Table II"
     yield _beside(cases.values())
-    yield WHY_NEXT_STEP
+    if there & {"hcd", "rcd"}:
+        yield WHY_NEXT_STEP
     used = dict.fromkeys(_model(results) for results in found.values())
     yield f"Models: {'; '.join(MODELS[name] for name in used)}. They know no rule."
     for kept, results in told.items():

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from specshield.policy.tensors import replace_file
 from specshield.sim.apartments import APARTMENTS
 from specshield.sim.cases import MODELS, case_names, load_case
 from specshield.sim.learned.floor_plans import House, random_house
@@ -102,7 +103,7 @@ def write(out: Path, weights: dict[str, Any], card: dict[str, Any]) -> None:
     from safetensors.numpy import save
 
     out.mkdir(parents=True, exist_ok=True)
-    (out / WEIGHTS).write_bytes(save(weights))
+    replace_file(out / WEIGHTS, save(weights))
     (out / CARD).write_text(json.dumps(card, indent=1) + "\n")
 
 
