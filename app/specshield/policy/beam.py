@@ -12,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
-from specshield.policy.progress import advance, read_predicates
+from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.tables import SAFE, is_broken, score, slack
-from specshield.policy.work import Guide, Work
+from specshield.policy.work import Guide, Work, observe
 from specshield.robot.unicycle import step
 
 MAX_ROOTS = 62  # bits of a tag
@@ -116,6 +115,13 @@ def _copy(from_: Poses, i: int, to: Poses, j: int) -> None:
         to.status[j, k], to.run[j, k] = from_.status[i, k], from_.run[i, k]
 
 
+@inlined
+def _put(to: Poses, i: int, x: float, y: float, theta: float, work: Work) -> None:
+    to.pose[i, 0], to.pose[i, 1], to.pose[i, 2] = x, y, theta
+    for k in range(to.status.shape[1]):
+        to.status[i, k], to.run[i, k] = work.status[k], work.run[k]
+
+
 @leaf
 def _expand(
     guide: Guide,
@@ -144,10 +150,10 @@ def _expand(
             if work.scores[m] < lowest:
                 continue
             x, y, theta = step(body, here.pose[w, 0], here.pose[w, 1], here.pose[w, 2], m)
-            _copy(here, w, new, found)
-            new.pose[found, 0], new.pose[found, 1], new.pose[found, 2] = x, y, theta
-            read_predicates(rules, x, y, theta, work.values, work.stack, work.predicates)
-            advance(rules, t + n + 1, work.predicates, new.status[found], new.run[found])
+            for k in range(here.status.shape[1]):
+                work.status[k], work.run[k] = here.status[w, k], here.run[w, k]
+            observe(rules, t + n + 1, x, y, theta, work)
+            _put(new, found, x, y, theta, work)
             at = _place(new, found, table)
             if at == found:
                 new.slack[at] = slack(

@@ -21,6 +21,7 @@ from specshield.policy.progress import (
     replay,
     value_count,
 )
+from specshield.policy.siblings import copy_way, find_sibling, find_twins
 from specshield.robot.unicycle import Body, step, successors
 
 
@@ -145,25 +146,32 @@ def _retrace(
     rules: Rules,
     t: int,
     first: int,
-    undoing: NDArray[np.int64],
+    turn: int,
+    move: int,
     wait: int,
     base: NDArray[np.int64],
+    at: int,
     state: State,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> int:
-    """The motion `first`, what undoes it, then `base` (T - t,), a way from x_t that settles everything.
+    """The motion `first`; `turn` and `move` (-1: none is needed), which lead nearly to where `base` (T - t,),
+    a way that settles everything, is after its first `at` motions; then the rest of `base`.
 
-    undoing (2,): motions, -1: no more is needed. The steps lost are made up for where `base` waits. Ends
-    where something breaks. Other arguments and result as `_follow`.
+    The steps lost are made up for where `base` waits, those gained are waited for. Ends where something
+    breaks. Other arguments and result as `_follow`.
     """
-    steps, behind, at, moved = motions.shape[0], 1, 0, False
+    steps, behind = motions.shape[0], 1 - at + (turn >= 0) + (move >= 0)
     x, y, theta = state.pose[0], state.pose[1], state.pose[2]
     for k in range(steps):
         if k == 0:
             motion = first
-        elif k == behind and k <= 2 and moved and undoing[k - 1] >= 0:
-            motion = undoing[k - 1]
+        elif turn >= 0:
+            motion, turn = turn, -1
+        elif move >= 0:
+            motion, move = move, -1
+        elif behind < 0:
+            motion = wait
             behind += 1
         else:
             while behind > 0 and at < steps and base[at] == wait:
@@ -172,9 +180,9 @@ def _retrace(
             motion = base[at] if at < steps else wait
             at += 1
         nx, ny, ntheta = step(body, x, y, theta, motion)
-        moved = (
-            moved or nx != x or ny != y or ntheta != theta
-        )  # where contact held it, there is nothing to undo
+        if k == 0 and nx == x and ny == y and ntheta == theta:  # contact held it: there is nothing to undo
+            behind -= (turn >= 0) + (move >= 0)
+            turn, move = -1, -1
         x, y, theta = nx, ny, ntheta
         _arrive(rules, t + k + 1, x, y, theta, state)
         motions[k] = motion
@@ -226,9 +234,9 @@ def propose_all(
     """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); returns pi_phi's own.
 
     history (t + 1, 3), signals (t + 1, S); rules.signals is left at the last row. undoing (M, 2): the motions
-    that undo each, -1: no more is needed. Where `literal`, every row is pi_phi's own
-    rollout. Else, once one row settles everything, it is enough for another motion to undo it and go that
-    way; where that fails it is pi_phi's own rollout too.
+    that undo each, -1: no more is needed. Where `literal`, every row is pi_phi's own rollout. Else, once one
+    row settles everything, it is enough for another motion to come onto its way, from the same place or by
+    undoing; where that fails it is pi_phi's own rollout too.
     """
     t, count = history.shape[0] - 1, rules.kind.shape[0]
     status, run = np.empty(count, np.int8), np.empty(count, np.int64)
@@ -236,22 +244,44 @@ def propose_all(
     state = _make_state(body, rules, net)
     _begin(rules, history[t], status, run, state)
     _follow(body, rules, sight, net, t, -1, wait, state, motions[0, :1], poses[0, :1])
-    preferred, base = motions[0, 0], -1
+    preferred, base, ways = motions[0, 0], -1, 0
+    for m in range(motions.shape[0]):
+        x, y, theta = step(body, history[t, 0], history[t, 1], history[t, 2], m)
+        motions[m, 0] = m
+        poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
+    twin, known = np.empty(motions.shape[0], np.int64), np.empty(motions.shape[0], np.int64)
+    sibling = np.empty(3, np.int64)
+    find_twins(poses, twin)
     for i in range(-1, motions.shape[0]):
-        m = preferred if i < 0 else i
-        if i == preferred:
+        m = twin[preferred if i < 0 else i]
+        if i >= 0 and (m != i or m == twin[preferred]):
             continue
         reached = PENDING
         if base >= 0 and not literal:
-            _begin(rules, history[t], status, run, state)
-            reached = _retrace(
-                body, rules, t, m, undoing[m], wait, motions[base], state, motions[m], poses[m]
-            )
+            find_sibling(body, poses, known[:ways], m, wait >= 0, sibling)
+            if sibling[0] >= 0:
+                _begin(rules, history[t], status, run, state)
+                reached = _retrace(
+                    body, rules, t, m, sibling[1], -1, wait, motions[sibling[0]], sibling[2], state,
+                    motions[m], poses[m],
+                )  # fmt: skip
+            if reached != SETTLED:
+                _begin(rules, history[t], status, run, state)
+                reached = _retrace(
+                    body, rules, t, m, undoing[m, 0], undoing[m, 1], wait, motions[base], 0, state,
+                    motions[m], poses[m],
+                )  # fmt: skip
         if reached != SETTLED:
             _begin(rules, history[t], status, run, state)
             reached = _follow(body, rules, sight, net, t, m, wait, state, motions[m], poses[m])
+            if reached == SETTLED:
+                known[ways] = m
+                ways += 1
         if reached == SETTLED and base < 0:
             base = m
+    for m in range(motions.shape[0]):
+        if twin[m] != m:
+            copy_way(motions, poses, twin[m], m)
     return int(preferred)
 
 

@@ -1,7 +1,8 @@
 """A continuation after each first motion, out of the tables of latest feasible times.
 
-The motion of most slack is walked out. For any other it is mostly enough to undo it and go the same way.
-Where that comes too late, or the walk gets stuck, a beam looks for a way.
+The motion of most slack is walked out. For any other it is mostly enough to undo it and go the same way, or
+to turn and go the way of one that led to the same place. Where that comes too late, or the walk gets stuck, a
+beam looks for a way.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel, leaf, merged
 from specshield.policy.beam import EASY, MAX_ROOTS, beam
 from specshield.policy.progress import forgive, replay
+from specshield.policy.siblings import copy_way, find_sibling, find_twins
 from specshield.policy.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.walk import SETTLED_ALL, STUCK, rejoin, walk
 from specshield.policy.work import Guide, Work, fill, make_work, observe
@@ -25,6 +27,7 @@ ESCAPE_LOSS = 6.0  # [steps] of slack that it may cost on the way
 ESCAPE_DEPTH = 24
 MAX_ESCAPES = 8
 BAND = -3.0  # [steps] of slack: how far the tables err
+ROOTS = 4  # first motions that one beam serves, where others may then go the ways it finds
 NARROW = 2  # poses that the first beam of a robot that cannot wait keeps for each motion
 SMALL = 30_000  # poses of a lattice on which nearly every way can be tried
 SMALL_SHARE = 512
@@ -34,6 +37,7 @@ class Starts(NamedTuple):
     """After each first motion [M]: the progress, the slack, whether a way was found.
 
     turn, move: the motions that undo it, nearly; -1 where none is needed, a turn of -2 where there is none.
+    sibling (3,): scratch.
     """
 
     status: NDArray[np.int8]
@@ -42,6 +46,7 @@ class Starts(NamedTuple):
     turn: NDArray[np.int64]
     move: NDArray[np.int64]
     settled: NDArray[np.bool_]
+    sibling: NDArray[np.int64]
 
 
 @kernel
@@ -66,25 +71,33 @@ def propose_all(
     starts = Starts(
         np.empty((count, k_count), np.int8), np.empty((count, k_count), np.int64), np.empty(count),
         np.empty(count, np.int64), np.empty(count, np.int64), np.zeros(count, np.bool_),
+        np.empty(3, np.int64),
     )  # fmt: skip
-    order = np.empty(count, np.int64)
+    order, twin, walked = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
     _first_steps(guide, t, history[t], status, run, motions, poses, starts, work)
     _by_slack(starts.slack, order)
-    waits, base = guide.wait >= 0, -1
+    find_twins(poses, twin)
+    waits, base, ways = guide.wait >= 0, -1, 0
     for m in order:
+        if twin[m] != m:
+            continue
         if not waits:  # tables step by step: beams all the way
             motions[m, 1:] = m
             simulate(guide.body, poses[m, 0], motions[m, 1:], poses[m, 1:])
             starts.settled[m] = starts.slack[m] == SAFE
             continue
         turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
-        if base >= 0 and turn > -2:
+        starts.settled[m] = _join(guide, t, walked[:ways], int(m), starts, motions, poses, work)
+        if base >= 0 and turn > -2 and not starts.settled[m]:
             _resume(starts.status[m], starts.run[m], work)
-            starts.settled[m] = rejoin(guide, t, turn, move, motions[base], motions[m], poses[m], work)
+            starts.settled[m] = rejoin(guide, t, turn, move, motions[base], 0, motions[m], poses[m], work)
         if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == -2):
             _resume(starts.status[m], starts.run[m], work)
             escapes = ahead >= (0.0 if base < 0 else EASY)
             starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
+            if starts.settled[m]:
+                walked[ways] = m
+                ways += 1
         if starts.settled[m] and base < 0:
             base = int(m)
     small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
@@ -95,7 +108,10 @@ def propose_all(
         elif attempt == 2:
             share, band = SMALL_SHARE, 2.0 * HOPELESS
         if (attempt > 0 or not waits) and (attempt < 2 or small):
-            _beam_out(guide, t, share, width, band, order, starts, motions, poses, work)
+            _beam_out(guide, t, share, width, band, order, twin, starts, motions, poses, work)
+    for same in range(count):
+        if twin[same] != same:
+            copy_way(motions, poses, twin[same], same)
     best = order[0]
     return int(guide.wait if waits and starts.slack[guide.wait] == starts.slack[best] else best)
 
@@ -164,6 +180,26 @@ def _resume(status: NDArray[np.int8], run: NDArray[np.int64], work: Work) -> Non
         work.status[k], work.run[k] = status[k], run[k]
 
 
+@leaf
+def _join(
+    guide: Guide,
+    t: int,
+    known: NDArray[np.int64],
+    m: int,
+    starts: Starts,
+    motions: NDArray[np.int64],
+    poses: NDArray[np.float64],
+    work: Work,
+) -> bool:
+    """Goes the way of one of the motions `known` that led to the same place; whether that settles all."""
+    found = starts.sibling
+    find_sibling(guide.body, poses, known, m, True, found)
+    if found[0] < 0:
+        return False
+    _resume(starts.status[m], starts.run[m], work)
+    return rejoin(guide, t, found[1], -1, motions[found[0]], found[2], motions[m], poses[m], work)
+
+
 @merged
 def _follow(
     guide: Guide,
@@ -229,6 +265,7 @@ def _beam_out(
     width: int,
     band: float,
     order: NDArray[np.int64],
+    twin: NDArray[np.int64],
     starts: Starts,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
@@ -236,11 +273,15 @@ def _beam_out(
 ) -> None:
     """Looks for a way for every first motion without one whose slack is at least `band`."""
     steps = motions.shape[1] - 1
-    roots = np.array([m for m in order if not starts.settled[m] and starts.slack[m] >= band], dtype=np.int64)
+    roots = np.array(
+        [m for m in order if twin[m] == m and not starts.settled[m] and starts.slack[m] >= band],
+        dtype=np.int64,
+    )
     if steps == 0:
         return
-    for begin in range(0, roots.shape[0], MAX_ROOTS):
-        some = roots[begin : begin + MAX_ROOTS]
+    few = ROOTS if guide.wait >= 0 else MAX_ROOTS
+    while roots.shape[0] > 0:
+        some, rest = roots[:few], roots[few:]
         way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
         beam(
             guide, t + 1, poses[some, 0], starts.status[some], starts.run[some], share, band, np.inf, work,
@@ -256,3 +297,8 @@ def _beam_out(
                     continue
                 starts.settled[m] = goals_settled(guide.rules, work.status)
                 simulate(guide.body, poses[m, n - 1], motions[m, n:], poses[m, n:])
+        if guide.wait >= 0:
+            known = some[starts.settled[some]]
+            for m in rest:
+                starts.settled[m] = _join(guide, t, known, m, starts, motions, poses, work)
+        roots = rest[~starts.settled[rest]]

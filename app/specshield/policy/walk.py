@@ -209,26 +209,30 @@ def rejoin(
     turn: int,
     move: int,
     base: NDArray[np.int64],
+    at: int,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
     work: Work,
 ) -> bool:
-    """Goes on from motions[:1] by the motions `turn` and `move` that undo it (-1: none is needed), then by
-    `base`, a way from x_t to every goal.
+    """Goes on from motions[:1] by the motions `turn` and `move` (-1: none is needed), which lead nearly to
+    where `base` (T - t,), a way to every goal, is after its first `at` motions; then by the rest of `base`.
 
-    The steps lost are made up for where `base` (T - t,) waits. What is undone only nearly may still do: the
-    result says whether every goal was settled. Other arguments as in `walk`.
+    The steps lost are made up for where `base` waits, those gained are waited for. To be there only nearly
+    may do: the result says whether every goal was settled. Other arguments as in `walk`.
     """
     body, rules, tables, wait = guide
     steps = motions.shape[0]
-    behind = 1 + (turn >= 0) + (move >= 0)
+    behind = 1 - at + (turn >= 0) + (move >= 0)
     x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
-    n, at, looked = 1, 0, False
+    n, looked = 1, False
     while n < steps and not is_over(rules, tables, t + n, work.status) and not is_broken(work.status):
         if turn >= 0:
             motion, turn = turn, -1
         elif move >= 0:
             motion, move = move, -1
+        elif behind < 0:
+            motion = wait
+            behind += 1
         else:
             while behind > 0 and at < steps and base[at] == wait:
                 at += 1
