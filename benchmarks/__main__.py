@@ -16,11 +16,11 @@ from typing import Any
 
 import torch
 
-from benchmarks import cold, decisions, report, sweep, synthesis, timing
+from benchmarks import cold, decisions, report, service, sweep, synthesis, timing
 from specshield.sim.cases import REPOSITORY, case_names
 
-QUICK = {"n": 100, "episodes": 2, "plain": 4, "repeats": 3, "sweep": 12}
-FULL = {"n": 1000, "episodes": 20, "plain": 30, "repeats": 3, "sweep": 50}
+QUICK = {"n": 100, "episodes": 2, "plain": 4, "repeats": 3, "sweep": 100}
+FULL = {"n": 1000, "episodes": 20, "plain": 30, "repeats": 3, "sweep": 300}
 
 
 def main() -> None:
@@ -50,6 +50,8 @@ def main() -> None:
 def measure(size: dict[str, int], seed: int) -> dict[str, Any]:
     began = time.perf_counter()
     figures: dict[str, Any] = {"machine": timing.machine(), "size": size, "seed": seed}
+    say("service")
+    figures["service"] = service.measure(case_names(), size["repeats"], size["episodes"], seed)
     timing.one_core()
     torch.set_num_threads(1)
     say("synthesis")

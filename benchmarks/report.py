@@ -15,6 +15,7 @@ from matplotlib import pyplot as plt
 
 COLUMNS = ("p50", "p90", "p99", "p99.9", "max")
 SWEPT = ("p50", "p99", "max")
+SERVED = ("p50", "p90", "p99", "max")
 SWEEPS = {"c": "(c)", "lost": "(c) lost", "d": "(d)"}
 PLACES = {"start": "t = 0", "along": "along episodes"}
 COLOURS = {"a": "tab:gray", "b": "tab:olive", "c": "tab:blue", "d": "tab:green"}
@@ -102,6 +103,16 @@ def _lines(figures: Figures, race: Figures | None) -> Iterator[str]:
     yield "Reachability on one core, compiled; the DQN as its card says, from the training that was shipped."
     yield ""
     yield from _synthesis(figures["synthesis"])
+    yield ""
+    yield "## The service"
+    yield ""
+    yield (
+        "`specshield serve` with its embedded store and worker, over HTTP, all cores: from the POST of a "
+        "reachability policy until it is `ready` (each one another, made anew), and a step of one robot with "
+        "the learned model, as the robot waits for it and as the server says."
+    )
+    yield ""
+    yield from _service(figures["service"])
     if race:
         yield ""
         yield from _race(race)
@@ -179,6 +190,16 @@ def _synthesis(cases: Figures) -> Iterator[str]:
             [name, *reach, f"{dqn['wall_time_s']:.0f} s", str(dqn["updates"]), f"{dqn['satisfied']:.1%}"]
         )
     header = ["", "reachability", "loaded in", "size", "DQN", "updates", "satisfies alone from"]
+    yield from _table(header, rows)
+
+
+def _service(cases: Figures) -> Iterator[str]:
+    rows = []
+    for name, case in cases.items():
+        times = [*(case["round_trip"][c] for c in SERVED), *(case["server"][c] for c in SERVED)]
+        ready = ", ".join(f"{seconds:.2f}" for seconds in case["ready_s"])
+        rows.append([name, ready, *map(_ms, times), str(case["server"]["calls"])])
+    header = ["", "ready after [s]", *(f"{c}" for c in SERVED), *(f"server {c}" for c in SERVED), "steps"]
     yield from _table(header, rows)
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -67,8 +68,10 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
-    with tempfile.TemporaryDirectory(prefix="specshield-metrics-") as folder:
-        if workers > 1:
+    # Of one process uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
+    metrics = tempfile.TemporaryDirectory(prefix="specshield-metrics-") if workers > 1 else nullcontext()
+    with metrics as folder:
+        if folder is not None:
             os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder  # before prometheus_client is imported
         uvicorn.run(
             "specshield.service.app:create_app",

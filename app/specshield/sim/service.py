@@ -20,10 +20,10 @@ READY_WITHIN = 180.0  # [s] the first start of an installation compiles the kern
 
 
 @contextmanager
-def own_server() -> Iterator[str]:
+def own_server(worker: bool = False) -> Iterator[str]:
     """Starts `specshield serve` on a free port, its data in a temporary folder; yields its address.
 
-    Raises RuntimeError with the server's log where it does not come up.
+    worker: whether it makes policies too. Raises RuntimeError with the server's log where it does not come up.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
         log = Path(folder) / "server.log"
@@ -31,7 +31,7 @@ def own_server() -> Iterator[str]:
         with open(log, "wb") as output:
             server = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "serve", "--port", url.rpartition(":")[2]],
-                env=_environment(Path(folder)),
+                env=_environment(Path(folder), worker),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -55,14 +55,15 @@ def follow_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
-def _environment(folder: Path) -> dict[str, str]:
+def _environment(folder: Path, worker: bool) -> dict[str, str]:
     """This process's, without what would join the server to another's store or lock it."""
     kept = {
         name: value
         for name, value in os.environ.items()
         if not name.startswith("SPECSHIELD_") and name != "REDIS_URL"
     }
-    return {**kept, "SPECSHIELD_DATA_DIR": str(folder / "data"), "SPECSHIELD_WORKER": "false"}
+    own = {"SPECSHIELD_DATA_DIR": str(folder / "data"), "SPECSHIELD_WORKER": "true" if worker else "false"}
+    return {**kept, **own}
 
 
 def _wait_until_ready(url: str, server: subprocess.Popen[bytes], log: Path) -> None:
