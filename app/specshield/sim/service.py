@@ -23,7 +23,8 @@ READY_WITHIN = 180.0  # [s] the first start of an installation compiles the kern
 def own_server(worker: bool = False) -> Iterator[str]:
     """Starts `specshield serve` on a free port, its data in a temporary folder; yields its address.
 
-    worker: whether it makes policies too. Raises RuntimeError with the server's log where it does not come up.
+    worker: whether it makes policies too. Raises RuntimeError with the server's log where it does not come
+    up.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
         log = Path(folder) / "server.log"
