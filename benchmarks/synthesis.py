@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.houses import RESTLESS
 from benchmarks.states import shipped_dqn
 from benchmarks.timing import quietest
 from specshield.policy import reachability
@@ -25,17 +26,22 @@ EVERY = 10_000  # steps of stable-baselines3 between two measurements
 
 
 def reach(case_name: str, repeats: int) -> dict[str, Any]:
-    """Seconds to make the tables and to load them, their size, and the shipped DQN's card beside them."""
+    """Seconds to make the tables and to load them, their size, the same for a robot that cannot wait, and the
+    shipped DQN's card beside them.
+    """
     case = load_case(case_name)
     reachability.synthesise(case.task)  # compiles, or loads what is compiled
     seconds = quietest(lambda: reachability.synthesise(case.task), repeats)
     policy = reachability.synthesise(case.task)
     weights = policy.weights()
     card = shipped_dqn(case).card
+    stepwise = reachability.synthesise(replace(case.task, robot=RESTLESS))
     return {
         "synthesis_s": seconds,
         "load_s": quietest(lambda: load_reachability(weights, policy.card, case.task), repeats),
         "size_bytes": len(weights),
+        "stepwise_s": stepwise.card["metrics"]["wall_time_s"],
+        "stepwise_bytes": len(stepwise.weights()),
         "feasible_start": policy.card["metrics"]["feasible_start"],
         "dqn": {"updates": card["options"]["updates"], **card["metrics"]},
     }
