@@ -42,6 +42,7 @@ from specshield.policy.approach import (
     stay,
     walk,
 )
+from specshield.policy.detour import join
 from specshield.policy.fields import to_go_at
 from specshield.robot.unicycle import Body, step
 from specshield.stl.program import STACK_SIZE
@@ -273,17 +274,10 @@ def _rejoin(world: World, t: int, base: Ints, motions: Ints, poses: Floats, work
     back = _undoing(world.body, poses[0], poses[1])
     if back == -2:
         return False
-    behind, at, steps = 1 if back < 0 else 2, 0, motions.shape[0]
-    for n in range(1, steps):
-        motion = back
-        if n > 1 or back < 0:
-            while behind > 0 and at < steps and base[at] == world.pad:
-                at += 1
-                behind -= 1
-            motion = base[at] if at < steps else world.pad
-            at += 1
-        move(world, t, n, motion, motions, poses, work)
-    work.spent[0] += 0.3 * steps
+    join(back, -1, base, 0, world.pad, motions)
+    for n in range(1, motions.shape[0]):
+        move(world, t, n, motions[n], motions, poses, work)
+    work.spent[0] += 0.3 * motions.shape[0]
     return _value(world, work) > world.margin
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel, leaf
+from specshield.policy.detour import copy_way, find_sibling, find_twins, join
 from specshield.policy.network import Network, greedy
 from specshield.policy.observation import Sight, observe, outcome
 from specshield.policy.progress import (
@@ -21,7 +22,6 @@ from specshield.policy.progress import (
     replay,
     value_count,
 )
-from specshield.policy.siblings import copy_way, find_sibling, find_twins
 from specshield.robot.unicycle import Body, step, successors
 
 
@@ -141,51 +141,27 @@ def _stay(state: State, k: int, wait: int, motions: NDArray[np.int64], poses: ND
 
 
 @leaf
+def _is_at(pose: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    return bool(pose[0] == other[0] and pose[1] == other[1] and pose[2] == other[2])
+
+
+@leaf
 def _retrace(
     body: Body,
     rules: Rules,
     t: int,
-    first: int,
-    turn: int,
-    move: int,
     wait: int,
-    base: NDArray[np.int64],
-    at: int,
     state: State,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> int:
-    """The motion `first`; `turn` and `move` (-1: none is needed), which lead nearly to where `base` (T - t,),
-    a way that settles everything, is after its first `at` motions; then the rest of `base`.
-
-    The steps lost are made up for where `base` waits, those gained are waited for. Ends where something
-    breaks. Other arguments and result as `_follow`.
+    """Goes by `motions` (T - t,) from `state`, to where something breaks or, for a robot that can wait, all
+    is settled. Other arguments and result as `_follow`.
     """
-    steps, behind = motions.shape[0], 1 - at + (turn >= 0) + (move >= 0)
     x, y, theta = state.pose[0], state.pose[1], state.pose[2]
-    for k in range(steps):
-        if k == 0:
-            motion = first
-        elif turn >= 0:
-            motion, turn = turn, -1
-        elif move >= 0:
-            motion, move = move, -1
-        elif behind < 0:
-            motion = wait
-            behind += 1
-        else:
-            while behind > 0 and at < steps and base[at] == wait:
-                at += 1
-                behind -= 1
-            motion = base[at] if at < steps else wait
-            at += 1
-        nx, ny, ntheta = step(body, x, y, theta, motion)
-        if k == 0 and nx == x and ny == y and ntheta == theta:  # contact held it: there is nothing to undo
-            behind -= (turn >= 0) + (move >= 0)
-            turn, move = -1, -1
-        x, y, theta = nx, ny, ntheta
+    for k in range(motions.shape[0]):
+        x, y, theta = step(body, x, y, theta, motions[k])
         _arrive(rules, t + k + 1, x, y, theta, state)
-        motions[k] = motion
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, theta
         reached = outcome(state.status)
         if reached == SETTLED and wait >= 0:
@@ -260,17 +236,16 @@ def propose_all(
         if base >= 0 and not literal:
             find_sibling(body, poses, known[:ways], m, wait >= 0, sibling)
             if sibling[0] >= 0:
+                join(sibling[1], -1, motions[sibling[0]], sibling[2], wait, motions[m])
                 _begin(rules, history[t], status, run, state)
-                reached = _retrace(
-                    body, rules, t, m, sibling[1], -1, wait, motions[sibling[0]], sibling[2], state,
-                    motions[m], poses[m],
-                )  # fmt: skip
+                reached = _retrace(body, rules, t, wait, state, motions[m], poses[m])
             if reached != SETTLED:
+                turn, move = undoing[m, 0], undoing[m, 1]
+                if _is_at(poses[m, 0], history[t]):  # contact held it: there is nothing to undo
+                    turn, move = -1, -1
+                join(turn, move, motions[base], 0, wait, motions[m])
                 _begin(rules, history[t], status, run, state)
-                reached = _retrace(
-                    body, rules, t, m, undoing[m, 0], undoing[m, 1], wait, motions[base], 0, state,
-                    motions[m], poses[m],
-                )  # fmt: skip
+                reached = _retrace(body, rules, t, wait, state, motions[m], poses[m])
         if reached != SETTLED:
             _begin(rules, history[t], status, run, state)
             reached = _follow(body, rules, sight, net, t, m, wait, state, motions[m], poses[m])

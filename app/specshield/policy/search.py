@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf, merged
 from specshield.policy.beam import EASY, MAX_ROOTS, beam
+from specshield.policy.detour import copy_way, find_sibling, find_twins
 from specshield.policy.progress import forgive, replay
-from specshield.policy.siblings import copy_way, find_sibling, find_twins
 from specshield.policy.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.walk import SETTLED_ALL, STUCK, rejoin, walk
 from specshield.policy.work import Guide, Work, fill, make_work, observe

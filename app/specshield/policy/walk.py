@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, leaf
+from specshield.policy.detour import join
 from specshield.policy.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 from specshield.policy.tables import HOPELESS, goals_settled, is_broken, score, slack
 from specshield.policy.work import Guide, Work, fill, is_over, look, observe, predicate_at
@@ -214,33 +215,20 @@ def rejoin(
     poses: NDArray[np.float64],
     work: Work,
 ) -> bool:
-    """Goes on from motions[:1] by the motions `turn` and `move` (-1: none is needed), which lead nearly to
-    where `base` (T - t,), a way to every goal, is after its first `at` motions; then by the rest of `base`.
+    """Goes on from motions[:1] by `turn` and `move`, then by `base`, a way to every goal, as `join` has it.
 
-    The steps lost are made up for where `base` waits, those gained are waited for. To be there only nearly
-    may do: the result says whether every goal was settled. Other arguments as in `walk`.
+    To be on its way only nearly may do: the result says whether every goal was settled. Other arguments as in
+    `walk`.
     """
     body, rules, tables, wait = guide
-    steps = motions.shape[0]
-    behind = 1 - at + (turn >= 0) + (move >= 0)
+    join(turn, move, base, at, wait, motions)
     x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
     n, looked = 1, False
-    while n < steps and not is_over(rules, tables, t + n, work.status) and not is_broken(work.status):
-        if turn >= 0:
-            motion, turn = turn, -1
-        elif move >= 0:
-            motion, move = move, -1
-        elif behind < 0:
-            motion = wait
-            behind += 1
-        else:
-            while behind > 0 and at < steps and base[at] == wait:
-                at += 1
-                behind -= 1
-            motion = base[at] if at < steps else wait
-            at += 1
-        if motion != wait:
-            x, y, theta = step(body, x, y, theta, motion)
+    while n < motions.shape[0] and not is_over(rules, tables, t + n, work.status):
+        if is_broken(work.status):
+            break
+        if motions[n] != wait:
+            x, y, theta = step(body, x, y, theta, motions[n])
             observe(rules, t + n + 1, x, y, theta, work)
             looked = False
         else:
@@ -248,7 +236,6 @@ def rejoin(
                 look(rules, x, y, theta, work)
             looked = True
             advance(rules, t + n + 1, work.predicates, work.status, work.run)
-        motions[n] = motion
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
         n += 1
     fill(n, wait, x, y, theta, motions, poses)

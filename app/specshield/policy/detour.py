@@ -1,4 +1,4 @@
-"""First motions that lead to one place: a way found after one of them serves the others.
+"""From a first motion onto a way that is known: by undoing it, or from the same place as another's.
 
 Near a wall many motions end in the same pose; arcs of one length end in the same place, turned differently.
 """
@@ -79,3 +79,32 @@ def turn_by(body: Body, angle: float) -> int:
         if body.translate[m] == 0.0 and abs(wrap(body.rotate[m] - angle)) < ALIKE:
             return m
     return NONE
+
+
+@leaf
+def join(
+    turn: int, move: int, base: NDArray[np.int64], at: int, wait: int, motions: NDArray[np.int64]
+) -> None:
+    """Writes what follows motions[0] (T - t,): `turn` and `move` (-1: none is needed), which lead to where
+    `base` (T - t,) is after its first `at` motions, then the rest of `base`.
+
+    The steps lost are made up for where `base` waits, those gained are waited for. wait: -1 for a robot that
+    cannot, which may not gain any.
+    """
+    n, steps, behind = 1, motions.shape[0], 1 - at
+    for extra in (turn, move):
+        if extra >= 0 and n < steps:
+            motions[n] = extra
+            n += 1
+            behind += 1
+    while n < steps:
+        while behind > 0 and at < steps and base[at] == wait:
+            at += 1
+            behind -= 1
+        if behind < 0:
+            motions[n] = wait
+            behind += 1
+        else:
+            motions[n] = base[at] if at < steps else wait
+            at += 1
+        n += 1

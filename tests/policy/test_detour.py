@@ -1,18 +1,19 @@
-"""First motions that lead to one place share the ways that are found from there."""
+"""From a first motion onto a way that is known."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import pytest
 from benchmarks.states import shipped_dqn
 from benchmarks.sweep import made_robot, widened
 from tests.oracles.judge import margin
 from tests.policy.rooms import OCCUPIED, REGIONS
 
 from specshield.policy import reachability
+from specshield.policy.detour import find_sibling, find_twins, join
 from specshield.policy.environment import free_poses
-from specshield.policy.siblings import find_sibling, find_twins
 from specshield.robot import robot_from_json
 from specshield.robot.unicycle import make_body, simulate
 from specshield.shield.episode import decide, make_shield
@@ -64,6 +65,29 @@ def sibling(body, poses, motion, waits):
     out = np.empty(3, np.int64)
     find_sibling(body, poses, np.array([0]), motion, waits, out)
     return out.tolist()
+
+
+WAIT, GO, LEFT, RIGHT, ARC = range(5)
+BASE = [GO, GO, WAIT, WAIT, LEFT, WAIT, GO]
+
+
+@pytest.mark.parametrize(
+    ("turn", "move", "at", "wanted"),
+    [
+        # An arc undone by a turn: behind by two steps, which the next two waits make up for.
+        (RIGHT, -1, 0, [ARC, RIGHT, GO, GO, LEFT, WAIT, GO]),
+        # By two motions: the third step that is lost shifts the rest to the third wait.
+        (RIGHT, LEFT, 0, [ARC, RIGHT, LEFT, GO, GO, LEFT, GO]),
+        # Onto the way after its first motion, by a turn: one step behind.
+        (RIGHT, -1, 1, [ARC, RIGHT, GO, WAIT, LEFT, WAIT, GO]),
+        # From its place after two motions: one step too soon, so it waits.
+        (-1, -1, 2, [ARC, WAIT, WAIT, WAIT, LEFT, WAIT, GO]),
+    ],
+)
+def test_steps_lost_are_made_up_for_and_steps_gained_are_waited_for(turn, move, at, wanted):
+    motions = np.full(7, ARC)
+    join(turn, move, np.array(BASE), at, WAIT, motions)
+    assert motions.tolist() == wanted
 
 
 def test_every_arc_is_certified_where_the_pose_it_leads_to_is_feasible():
