@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,19 @@ def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: in
     where even that cannot be (the robot is still inside), without those. Nothing is yielded where no conjunct
     is left.
     """
+    kept, broken = left_over(formula, prefix, t)
+    if broken:
+        yield joined([*kept, *again(broken, t + 1)])
+    if kept:
+        yield joined(kept)
+
+
+def left_over(
+    formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int
+) -> tuple[list[Formula], list[Always]]:
+    """The conjuncts that can still be kept, and the broken G whose windows are not over."""
     kept: list[Formula] = []
-    again: list[Formula] = []
+    broken: list[Always] = []
     for conjunct in conjuncts(formula):
         _, high = robustness_bounds(conjunct, {name: prefix[name] for name in conjunct.names})
         if high > SATISFIED_ABOVE:
@@ -35,9 +46,16 @@ def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: in
             continue
         match conjunct:
             case Always(a, b, child) if b > t:
-                again.append(Always(max(a, t + 1), b, child))
+                broken.append(Always(a, b, child))
             case Not(Eventually(a, b, child)) if b > t:
-                again.append(Always(max(a, t + 1), b, Not(child)))
-    for parts in ([*kept, *again], kept) if again else (kept,):
-        if parts:
-            yield parts[0] if len(parts) == 1 else And(tuple(parts))
+                broken.append(Always(a, b, Not(child)))
+    return kept, broken
+
+
+def again(broken: Sequence[Always], t: int) -> list[Formula]:
+    """The broken G, enforced from step t on."""
+    return [Always(max(each.a, t), each.b, each.child) for each in broken]
+
+
+def joined(parts: Sequence[Formula]) -> Formula:
+    return parts[0] if len(parts) == 1 else And(tuple(parts))

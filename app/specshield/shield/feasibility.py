@@ -95,6 +95,12 @@ def futures(
     return Futures(np.concatenate(motions), np.concatenate(poses), proposals[0].preferred)
 
 
+def together(tried: Futures, more: Futures) -> Futures:
+    """Both, as `more` prefers."""
+    motions, poses = np.concatenate([tried.motions, more.motions]), np.concatenate([tried.poses, more.poses])
+    return Futures(motions, poses, more.preferred)
+
+
 def rho(prefix: Prefix, tried: Futures) -> Floats:
     """The robustness of each future joined to the prefix, shape (N,).
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.policy.residual import residuals
+from specshield.policy.residual import again, joined, left_over
 from specshield.policy.view import view_of
 from specshield.shield import shaping
 from specshield.shield.aim import aim
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho
-from specshield.stl import SATISFIED_ABOVE
+from specshield.shield.escape import escape
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho, together
+from specshield.stl import SATISFIED_ABOVE, Formula
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -39,20 +41,16 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
     prefix: as the whole formula sees it; tail: the witness the robot follows, one motion a byte; violated:
     whether the prefix decides so.
     """
-    task, robot, asked = shield.task, shield.task.robot, shield.config.margin
+    robot, asked = shield.task.robot, shield.config.margin
     motions = len(robot.motions)
     tried = futures(prefix, shield.body, shield.policies, tail, asked)
     whole = rho(prefix, tried)
     best = best_of(tried, whole, motions)
     feasible, lowered = _kept(best, asked)
     if violated:
-        samples = task.samples(prefix.poses, prefix.signals)
-        for formula in residuals(task.formula, samples, prefix.t):
-            part = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
-            best = best_of(tried, rho(part, tried), motions)
-            feasible, lowered = _kept(best, asked)
-            if feasible.any():
-                break
+        tried, best = _left(shield, prefix, tried, best)
+        whole = rho(prefix, tried)
+        feasible, lowered = _kept(best, asked)
     values = best.robustness
     if not violated and (shield.config.slack or lowered):
         best, feasible, lowered = aim(shield, prefix, tried, whole)
@@ -74,13 +72,46 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
     )
 
 
+def _left(shield: Shield, prefix: Prefix, tried: Futures, best: Best) -> tuple[Futures, Best]:
+    """The futures by what can still be kept of a formula that is violated, the most demanding first.
+
+    That is all but what is broken, with a broken G again from the next step, or else from the earliest step
+    at which it can hold again; without it; and that G alone.
+    """
+    task, t = shield.task, prefix.t
+    kept, broken = left_over(task.formula, task.samples(prefix.poses, prefix.signals), t)
+
+    def by(parts: Sequence[Formula]) -> Best:
+        formula = joined(parts)
+        part = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
+        return best_of(tried, rho(part, tried), len(task.robot.motions))
+
+    steps = 0
+    if broken:
+        best = by([*kept, *again(broken, t + 1)])
+        if _some(best):
+            return tried, best
+        steps, ways = escape(shield, prefix, broken)
+        if ways is not None:
+            tried = together(tried, ways)
+            best = by([*kept, *again(broken, t + steps)])
+    if kept and not _some(best):
+        best = by(kept)
+    if steps > 0 and not _some(best):
+        best = by(again(broken, t + steps))
+    return tried, best
+
+
+def _some(best: Best) -> bool:
+    return bool(best.robustness.max() > SATISFIED_ABOVE)
+
+
 def _kept(best: Best, asked: float) -> tuple[Bools, bool]:
     """Which motions keep the margin asked for, or else the largest there is; whether it was lowered."""
     feasible = best.robustness > SATISFIED_ABOVE + asked
-    highest = best.robustness.max()
-    if feasible.any() or highest <= SATISFIED_ABOVE:
+    if feasible.any() or not _some(best):
         return feasible, False
-    return best.robustness >= highest, True
+    return best.robustness >= best.robustness.max(), True
 
 
 def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, ...]:
