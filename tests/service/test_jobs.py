@@ -2,10 +2,12 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import httpx
 import pytest
+import redis
 from tests.service.world import ROBOT, START, grid_json
 from tests.serving import serving, wait_for
 
@@ -66,6 +68,10 @@ def children(pid):
 def worker_of(server):
     (pid,) = (pid for pid, command in children(server.process.pid) if b"--until-eof" in command)
     return pid
+
+
+def redis_of(data_dir):
+    return redis.Redis(unix_socket_path=str(data_dir / "store" / "socket"))
 
 
 def test_a_policy_is_trained_and_serves(client):
@@ -146,3 +152,15 @@ def test_nothing_trains_on_without_its_server(tmp_path):
         found = httpx.get(f"{server.url}/v1/policies/{policy['id']}").json()
         assert found["status"] == "failed"
         assert "ask for it again" in found["error"]
+
+
+def test_an_idle_worker_waits_for_work_longer_than_for_an_answer(tmp_path):
+    with (
+        serving(tmp_path, SPECSHIELD_WORKER="true", SPECSHIELD_STORE_TIMEOUT="0.5") as server,
+        httpx.Client(base_url=server.url, timeout=20.0) as client,
+    ):
+        wait_for(lambda: redis_of(tmp_path).exists("specshield:worker:reachability"), 60.0)
+        worker = worker_of(server)
+        time.sleep(4.0)  # eight time limits
+        reach(client, ask(client, method="reachability", options={}), "ready")
+        assert worker_of(server) == worker

@@ -216,3 +216,31 @@ def test_a_server_that_fails_says_no_more_than_that(tmp_path):
         assert "JSONDecodeError" not in response.text
         wait_for(lambda: "JSONDecodeError" in server.log.read_text(), 5.0)
         assert client.get("/readyz").status_code == 200
+
+
+def test_a_store_that_hangs_holds_nobody_longer_than_the_limit(tmp_path):
+    limit = 0.5
+    with (
+        serving(tmp_path, SPECSHIELD_STORE_TIMEOUT=str(limit)) as server,
+        httpx.Client(base_url=server.url, timeout=30.0) as client,
+    ):
+        session = begin(client)
+        first = step(client, session, 0)
+        policy = {"map_id": "case1", "spec": {"formula": "F[0,9] Office"}}
+        hung = store_pid(tmp_path)
+        os.kill(hung, signal.SIGSTOP)
+        try:
+            for ask in (
+                lambda: client.get("/readyz"),
+                lambda: step(client, session, 1),
+                lambda: client.get("/v1/sessions"),
+                lambda: client.post("/v1/policies", json=policy),
+            ):
+                start = time.monotonic()
+                response = ask()
+                assert (response.status_code, response.json()["type"]) == (503, "store-unavailable")
+                assert time.monotonic() - start < limit + 1.0
+        finally:
+            os.kill(hung, signal.SIGCONT)
+        assert step(client, session, 0).content == first.content
+        assert client.get("/readyz").status_code == 200

@@ -39,14 +39,16 @@ class Training:
 
 
 class Jobs:
-    """Every method raises StoreError where the store cannot be reached."""
+    """Every method raises StoreError where the store cannot be reached in time."""
 
     def __init__(self, url: str, settings: Settings) -> None:
         self.redis: Any = redis.Redis.from_url(
             url,
+            socket_timeout=settings.store_timeout,
             socket_connect_timeout=settings.store_timeout,
-            retry=Retry(ExponentialBackoff(cap=0.2, base=0.02), 3),
-            retry_on_error=[redis.ConnectionError, redis.TimeoutError],
+            # A lost connection is tried again; a store that does not answer would hold the caller once a try.
+            retry=Retry(ExponentialBackoff(cap=0.2, base=0.02), 3, (redis.ConnectionError,)),
+            retry_on_error=[redis.ConnectionError],
         )
         self._timeout = settings.training_timeout
         self._write = self.redis.register_script(WRITE)

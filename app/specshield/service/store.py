@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import anyio
 import redis.asyncio as redis
 from redis.asyncio.retry import Retry
 from redis.backoff import ExponentialBackoff
@@ -62,19 +63,28 @@ class Store:
             connection_pool=pool
         )  # redis-py's types admit str where bytes come back
         self._append = self.redis.register_script(APPEND)
-        self._ttl = ttl
+        self._timeout, self._ttl = timeout, ttl
 
     async def aclose(self) -> None:
         await self.redis.aclose()
         await self.redis.connection_pool.disconnect()
 
+    @asynccontextmanager
+    async def _reaching(self) -> AsyncIterator[None]:
+        """One time limit for all of it, with waits for a connection and tries; what fails is a StoreError."""
+        try:
+            with anyio.fail_after(self._timeout):
+                yield
+        except (redis.RedisError, OSError) as error:
+            raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+
     async def ping(self) -> None:
-        async with reaching():
+        async with self._reaching():
             await self.redis.ping()
 
     async def create(self, id: str, config: bytes, change: Change) -> None:
         """Raises SessionExists. `config` has to be unlike any other, so that a retry knows its own."""
-        async with reaching():
+        async with self._reaching():
             begun = await self._write(id, b"", change, config)
             if (
                 begun or await self.redis.hget(_keys(id)[0], "config") == config
@@ -87,7 +97,7 @@ class Store:
 
     async def append(self, id: str, version: bytes, change: Change) -> bool:
         """All of the change, or nothing and False where `version` is no longer the latest."""
-        async with reaching():
+        async with self._reaching():
             return await self._write(id, version, change, b"")
 
     async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bool:
@@ -107,7 +117,7 @@ class Store:
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """The session, with what step t left; None where there is none. One round trip."""
         session, history, steps = _keys(id)
-        async with reaching(), self.redis.pipeline(transaction=False) as pipe:
+        async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
             # In this order a write in between is harmless: rows past what the state counts are not looked at,
             # and a step that is there is the answer, whatever the state says.
             pipe.hmget(session, "config", "state", "version")
@@ -121,12 +131,12 @@ class Store:
 
     async def steps(self, id: str) -> dict[int, bytes]:
         """What every decided step left."""
-        async with reaching():
+        async with self._reaching():
             return {int(t): step for t, step in (await self.redis.hgetall(_keys(id)[2])).items()}
 
     async def delete(self, id: str) -> bool:
         """Erase all of it. False where there was nothing."""
-        async with reaching():
+        async with self._reaching():
             found = await self.redis.unlink(*_keys(id))
             await self.redis.zrem(INDEX, id)
         return bool(found)
@@ -134,8 +144,8 @@ class Store:
     async def page(self, after: str | None, limit: int) -> tuple[list[tuple[bytes, bytes]], str | None]:
         """Up to `limit` of (config, state) in order of id, and the id to go on after, None at the end."""
         listed: list[tuple[bytes, bytes]] = []
-        async with reaching():
-            while len(listed) < limit:
+        while len(listed) < limit:  # once, but for ids of sessions that have expired
+            async with self._reaching():
                 low = "-" if after is None else f"({after}"
                 ids = await self.redis.zrangebylex(INDEX, low, "+", 0, limit - len(listed))
                 if not ids:
@@ -146,7 +156,7 @@ class Store:
 
     async def count(self) -> int:
         """How many sessions there are; some may have expired."""
-        async with reaching():
+        async with self._reaching():
             return int(await self.redis.zcard(INDEX))
 
     async def _configs(self, ids: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
@@ -158,15 +168,6 @@ class Store:
         if expired:
             await self.redis.zrem(INDEX, *expired)
         return [(config, state) for config, state in found if config is not None]
-
-
-@asynccontextmanager
-async def reaching() -> AsyncIterator[None]:
-    """Whatever the store's client raises becomes a StoreError."""
-    try:
-        yield
-    except (redis.RedisError, OSError) as error:
-        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
 
 
 def _keys(id: str) -> list[str]:

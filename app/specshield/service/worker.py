@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import redis
 from rq import Worker
 from rq.job import Job
 from rq.serializers import JSONSerializer
@@ -28,27 +29,32 @@ log = logging.getLogger("specshield")
 def serve(settings: Settings, until_eof: bool, others: Sequence[str] = ()) -> None:
     """Work until told to stop, or until standard input ends: the server that started this one is gone.
 
-    others: queues of jobs that are no training runs and look after themselves.
+    others: queues of jobs that are no training runs and look after themselves. Raises StoreError where the
+    store has failed the worker for good.
     """
     if settings.redis_url is None:
         embedded = EmbeddedStore(settings.data_dir)
         embedded.join()
         os.environ["REDIS_URL"] = embedded.url  # for the runs
-    jobs = Jobs(os.environ.get("REDIS_URL") or str(settings.redis_url), settings)
+    url = os.environ.get("REDIS_URL") or str(settings.redis_url)
+    jobs = Jobs(url, settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
     with _regularly(lambda: jobs.worker_lives(methods.available())):
-        _Worker(jobs, others).work(logging_level="WARNING")
+        _Worker(url, jobs, others).work(logging_level="WARNING")
+    raise StoreError("the worker cannot go on; what rq has logged says why", expected="a store that answers")
 
 
 class _Worker(Worker):
     """rq's worker, which on SIGTERM ends the run at once: what it has learned is in its checkpoint."""
 
-    def __init__(self, jobs: Jobs, others: Sequence[str]) -> None:
+    def __init__(self, url: str, jobs: Jobs, others: Sequence[str]) -> None:
         self._training = [queue_of(method) for method in methods.available()]
         super().__init__(
             [*self._training, *others],
-            connection=jobs.redis,
+            # Not that of `jobs`: rq waits for work longer than any answer of the store may take, and sets the
+            # time limit of these connections, before the first of them is made, to fit.
+            connection=redis.Redis.from_url(url, socket_timeout=None),
             serializer=JSONSerializer,
             work_horse_killed_handler=self._killed,
             worker_ttl=60,
