@@ -15,7 +15,7 @@ from pathlib import Path
 
 import httpx
 
-READY_WITHIN = 180.0  # seconds; the first start of an installation compiles the kernels
+READY_WITHIN = 300.0  # seconds; the first start of an installation compiles the kernels
 
 
 @dataclass

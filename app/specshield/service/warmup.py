@@ -1,4 +1,4 @@
-"""Compiles every kernel a decision needs, on a world of a few cells, before the server says it is ready."""
+"""Compiles what a decision needs, on a world of a few cells, before the server says it is ready."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from specshield.policy.network import make_network
 from specshield.policy.observation import observation_size
 from specshield.policy.policy import Policy
 from specshield.policy.progress import make_rules
+from specshield.policy.reachability import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.unicycle import make_body
 from specshield.shield import episode
-from specshield.shield.decision import Shield, make_shield
+from specshield.shield.decision import make_shield
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -25,19 +26,24 @@ START = (1.0, 1.0, 0.0)
 
 
 def warm_up() -> None:
-    """Seconds at the very first start of an installation; afterwards the kernels come from numba's cache."""
-    shield = _shield()
-    episode.start(shield, START)
+    """A minute at the very first start of an installation; afterwards the kernels come from numba's cache.
+
+    What only a planner's or a look-ahead session needs is compiled when the first of them is made.
+    """
+    task = _task()
+    learned = Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))
     logits = np.zeros(len(STRETCH.actions))
-    first = episode.decide(shield, [START], logits)
-    episode.decide(shield, [START, first.next_poses[0].tolist()], logits, carry=first.carry)
+    for policy in (learned, synthesise(task)):
+        shield = make_shield([policy])
+        episode.start(shield, START)
+        first = episode.decide(shield, [START], logits)
+        episode.decide(shield, [START, first.next_poses[0].tolist()], logits, carry=first.carry)
 
 
-def _shield() -> Shield:
+def _task() -> Task:
     occupied = np.zeros((20, 20), bool)
     occupied[0] = True
-    task = make_task(OccupancyGrid(occupied, 0.1), STRETCH, FORMULA, REGIONS)
-    return make_shield([Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))])
+    return make_task(OccupancyGrid(occupied, 0.1), STRETCH, FORMULA, REGIONS)
 
 
 def _sizes(task: Task) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import httpx
 
-READY_WITHIN = 180.0  # [s] the first start of an installation compiles the kernels
+READY_WITHIN = 300.0  # [s] the first start of an installation compiles the kernels
 
 
 @contextmanager
