@@ -17,7 +17,7 @@ from specshield.shield.desirability import NEVER, desirability, solve
 from specshield.shield.lookahead import prepare
 from specshield.shield.planes import make_planes
 from specshield.shield.shaping import log_softmax, restrict
-from specshield.shield.surrogate import FEATURES, chart, end_chance, follow, is_blocked, make_goals
+from specshield.shield.surrogate import FEATURES, WANDER, end_chance, follow, is_blocked, make_goals
 
 WORLD = Cells(
     "F[0,4] A and F[5,9] B and G[0,9] not C",
@@ -63,14 +63,14 @@ def exact(r, e):
 def solved():
     """D on the lattice for a random model of the cells, which are the lattice's own; and the model."""
     r, e = model(np.random.default_rng(5))
-    planes = make_planes(WORLD.body, make_rules(WORLD.task), HORIZON)
+    planes = make_planes(WORLD.body, make_rules(WORLD.task), HORIZON, pitch=0.2)
     headings, cells = planes.valid.shape
     assert headings == 4
     motions, ends = np.zeros((MOTIONS, headings, cells), np.float32), np.zeros((headings, cells), np.float32)
     for s, (i, j, h) in enumerate(STATES):
         at = (j + planes.pad) * planes.width + i + planes.pad
         motions[:, h, at], ends[h, at] = np.log(r[s]), e[s]
-    return planes, solve(WORLD.body, planes, 0, motions, ends), r, e
+    return planes, solve(WORLD.body, planes, motions, ends, 0.0), r, e
 
 
 def test_desirability_is_exact_where_the_lattice_is(solved):
@@ -81,7 +81,7 @@ def test_desirability_is_exact_where_the_lattice_is(solved):
             pose = WORLD.pose(*state)
             if not planes.valid[state[2]][(state[1] + planes.pad) * planes.width + state[0] + planes.pad]:
                 continue
-            found = desirability(WORLD.body, planes, table, 0, t, mask, *pose)
+            found = desirability(WORLD.body, planes, table, t, mask, *pose)
             if settled(mask, s, t) != mask or not np.isfinite(wanted[t, mask][s]):
                 continue
             assert found == pytest.approx(wanted[t, mask][s], rel=0.03, abs=0.03)
@@ -103,7 +103,7 @@ def test_following_it_costs_what_the_best_path_does(solved):
             then = settled(mask, after, t + 1)
             if then is not None and np.isfinite(wanted[t + 1, then][after]):
                 feasible[m] = True
-                left[m] = desirability(WORLD.body, planes, table, 0, t + 1, then, *WORLD.pose(*STATES[after]))
+                left[m] = desirability(WORLD.body, planes, table, t + 1, then, *WORLD.pose(*STATES[after]))
         chosen = restrict(log_softmax(np.log(r[s]) - left), feasible)
         total = 0.0
         for m in np.flatnonzero(chosen > 0.0):
@@ -129,6 +129,7 @@ def test_following_it_costs_what_the_best_path_does(solved):
     assert checked >= 8
 
 
+SHARP_STYLE = (2.8, 2.8, -2.8, -1.0)
 TASK = flat("F[0,30] West and F[30,60] East and G[0,60] not Hole")
 
 
@@ -148,16 +149,15 @@ def drive(speak, steps=25, start=(-0.4, 2.4, 0.2)):
 
 
 def seeks(goal):
-    """What the surrogate itself would say with this goal and a sharpness of its own."""
+    """What the surrogate itself would say with this goal, or WANDER, and a sharpness of its own."""
     ahead = prepare(TASK)
-    course = chart(ahead.goals, np.array([goal]), np.ones(1))
 
     def speak(t, pose, random):
         nexts, motions = np.empty((len(TASK.robot.motions), 3)), len(TASK.robot.motions)
         successors(ahead.body, pose, nexts)
         blocked = np.array([is_blocked(ahead.body, m, *pose, after) for m, after in enumerate(nexts)])
-        log_r, scratch = np.empty(motions), np.empty((motions, FEATURES))
-        end = follow(ahead.body, course, np.array([2.8, 2.8, -2.8, -1.0]), *pose, blocked, scratch, log_r)
+        log_r, scratch, style = np.empty(motions), np.empty((motions, FEATURES)), np.array(SHARP_STYLE)
+        end = follow(ahead.body, ahead.goals, goal, style, *pose, blocked, scratch, log_r)
         of = TASK.robot.motion_of
         shares = np.bincount(of[~TASK.robot.terminal])
         return np.where(TASK.robot.terminal, np.log(max(end, 1e-4)), log_r[of] - np.log(shares[of]))
@@ -172,18 +172,35 @@ def test_it_learns_where_a_model_goes():
     belief = given[-1][0]
     row, column = np.argwhere(ahead.goals.distance[goal] == 0)[0]
     off = ahead.goals.distance[:, row, column] / 100.0  # metres from each goal to the true one
-    assert belief.probabilities() @ off < 0.25 * off.mean()
-    assert belief.weight > 0.9
+    *goals, wander = belief.probabilities()
+    assert goals @ off < 0.25 * off.mean()
+    assert wander < 0.1
+    assert belief.trust > 0.9
     assert belief.style[0] == pytest.approx(2.8, rel=0.3)
     assert max(np.ptp(added) for _, added in given) > 1.0
 
 
-def test_with_a_model_that_wants_nothing_it_vanishes():
-    """Fixed likings and noise: habits predict such a model better than any goal does."""
-    wants = np.random.default_rng(3).normal(0, 1.5, len(TASK.robot.actions))
-    wants[TASK.robot.motion_of == TASK.robot.motions.index((0.0, 0.0))] -= 2.0
-    _, _, given = drive(lambda t, pose, random: wants + random.normal(0, 0.3, len(wants)), 40)
-    assert all(belief.weight < 0.1 for belief, _ in given[15:])
+def test_it_learns_that_a_model_goes_nowhere():
+    _, _, given = drive(seeks(WANDER))
+    belief = given[-1][0]
+    assert belief.probabilities()[-1] > 0.9
+    assert belief.trust > 0.9
+    assert max(np.ptp(added) for _, added in given) > 1.0
+
+
+@pytest.mark.parametrize("drift", [False, True])
+def test_with_a_model_that_wants_nothing_it_vanishes(drift):
+    """Likings and noise: habits predict such a model better than any goal does, and than wandering."""
+    random, idle = np.random.default_rng(3), TASK.robot.motion_of == TASK.robot.motions.index((0.0, 0.0))
+    wants = random.normal(0, 1.5, len(idle))
+
+    def speak(t, pose, _):
+        noise = random.normal(0, 0.3, len(idle))
+        wants[:] = 0.95 * wants + noise if drift else wants
+        return wants + (0.0 if drift else noise) - 2.0 * idle
+
+    _, _, given = drive(speak, 40)
+    assert all(belief.trust < 0.2 for belief, _ in given[32:])
     assert all(np.ptp(added) < 2.0 for _, added in given[20:])
 
 

@@ -1,11 +1,12 @@
 """What the rule will still cost a surrogate of the model: its desirability function, solved backwards.
 
-    D_t(s, p) = -(1 - e(s)) log sum_a r(a | s) exp(-D_{t+1}(f(s, a), p'))     [nats]
+    D_t(s, p) = c(p) - (1 - e(s)) log sum_a r(a | s) exp(-D_{t+1}(f(s, a), p'))     [nats]
 
-r: the surrogate's motions, given that it does not end; e: the chance that it does, after which the rule costs
-nothing; p: the goals of the formula that are settled. exp(-D) is the probability that the surrogate itself
-would keep the rule, and following r exp(-D) costs D in KL over the whole path: the least there is (Todorov,
-2009). On a coarse lattice; the feasible set keeps the rule, D only orders what is in it.
+r: the surrogate's motions, given that it does not end; e: the chance that it does, after which the rule
+costs nothing; p: the goals of the formula that are settled; c: the price of a step while some are not.
+Without a price exp(-D) is the probability that the surrogate itself would keep the rule, and following r
+exp(-D) costs D in KL over the whole path: the least there is (Todorov, 2009). On a coarse lattice; the
+feasible set keeps the rule, D only orders what is in it.
 """
 
 from __future__ import annotations
@@ -29,47 +30,37 @@ NO_CODE = 65535
 
 
 @kernel
-def solve(body: Body, planes: Planes, since: int, motions: Singles, ends: Singles) -> NDArray[np.uint16]:
-    """D from step `since` on, as codes [slots, H, N]. motions [M, H, N]: log r; ends [H, N]: e."""
+def solve(body: Body, planes: Planes, motions: Singles, ends: Singles, price: float) -> NDArray[np.uint16]:
+    """D as codes [kept, H, rows]. motions [M, H, N]: log r; ends [H, N]: e; price: c, a step [nats]."""
     headings, cells = planes.valid.shape
     edge = planes.pad * planes.width + planes.pad
     horizon, sets = planes.slot.shape[0] - 2, planes.slot.shape[1]
-    skipped = _skipped(planes, since)
-    table = np.empty((planes.slot.max() + 1 - skipped, headings, cells), np.uint16)
+    table = np.empty((planes.kept.max() + 1, headings, planes.row.max() + 1), np.uint16)
     following = np.full((sets, headings, cells), NEVER, np.float32)  # D at t + 1
     current = np.full((sets, headings, cells), NEVER, np.float32)
     ahead = np.empty((headings, cells), np.float32)
     inside = cells - 2 * edge
     cost = np.empty((motions.shape[0], inside), np.float32)
     least, total = np.empty(inside, np.float32), np.empty(inside, np.float32)
-    for t in range(horizon, since - 1, -1):
+    for t in range(horizon, -1, -1):
         for mask in range(sets):
-            here = current[mask]
+            here, slot = current[mask], planes.slot[t, mask]
             here[:] = NEVER
-            if planes.slot[t, mask] < 0:
+            if slot < 0:
                 continue
+            due = np.float32(price if mask != sets - 1 else 0.0)
             if t == horizon:
                 if mask == sets - 1:
                     here[:] = 0.0
             else:
                 _gather(planes, t + 1, mask, following, ahead)
                 for h in range(headings):
-                    _back(body, planes, h, edge, motions, ends, ahead, cost, least, total, here)
-            known = planes.possible.shape[0] > 0
-            possible = planes.possible[planes.slot[t, mask]] if known else planes.valid
-            _encode(possible, here, table[planes.slot[t, mask] - skipped])
+                    _back(body, planes, h, edge, motions, ends, ahead, due, cost, least, total, here)
+            _bar(planes.possible[slot] if planes.possible.shape[0] > 0 else planes.valid, here)
+            if planes.kept[t, mask] != planes.kept[t + 1, mask]:
+                _encode(planes.row, here, table[planes.kept[t, mask]])
         following, current = current, following
     return table
-
-
-@leaf
-def _skipped(planes: Planes, since: int) -> int:
-    """How many slots lie before a step."""
-    for t in range(since, planes.slot.shape[0]):
-        for mask in range(planes.slot.shape[1]):
-            if planes.slot[t, mask] >= 0:
-                return int(planes.slot[t, mask])
-    return 0
 
 
 @kernel
@@ -99,6 +90,7 @@ def _back(
     motions: Singles,
     ends: Singles,
     ahead: Singles,
+    due: np.float32,
     cost: Singles,
     least: Singles,
     total: Singles,
@@ -131,7 +123,7 @@ def _back(
         _add(planes.free[m, h, edge:last], ahead[h, edge:last], motions[m, h, edge:last], cost[m], least)
     for m in range(motions.shape[0]):
         _sum(cost[m], least, total)
-    _close(least, total, ends[h, edge:last], out[h, edge:last])
+    _close(least, total, ends[h, edge:last], due, out[h, edge:last])
 
 
 @kernel
@@ -193,45 +185,58 @@ def _sum(cost: Singles, least: Singles, total: Singles) -> None:
 
 
 @kernel
-def _close(least: Singles, total: Singles, ends: Singles, out: Singles) -> None:
+def _close(least: Singles, total: Singles, ends: Singles, due: np.float32, out: Singles) -> None:
     for c in range(out.shape[0]):
         y = (total[c] - np.float32(1.0)) / (total[c] + np.float32(1.0))  # log z = 2 artanh((z - 1) / (z + 1))
         s = y * y
         log = y * (np.float32(2.0) + s * (np.float32(2 / 3) + s * (np.float32(0.4) + s * np.float32(2 / 7))))
-        value = (np.float32(1.0) - ends[c]) * (least[c] - log)
+        value = due + (np.float32(1.0) - ends[c]) * (least[c] - log)
         out[c] = value if least[c] < np.float32(0.5) * NEVER else NEVER
 
 
 @kernel
-def _encode(possible: NDArray[np.uint8], values: Singles, out: NDArray[np.uint16]) -> None:
-    top = np.float32((NO_CODE - 1) / CODES)
+def _bar(possible: NDArray[np.uint8], values: Singles) -> None:
     for h in range(possible.shape[0]):
         for c in range(possible.shape[1]):
             if not possible[h, c]:
                 values[h, c] = NEVER
-            value = max(min(values[h, c], top), np.float32(0.0))
-            out[h, c] = np.uint16(NO_CODE) if values[h, c] >= NEVER else np.uint16(value * np.float32(CODES))
+
+
+@kernel
+def _encode(row: NDArray[np.int64], values: Singles, out: NDArray[np.uint16]) -> None:
+    top = np.float32((NO_CODE - 1) / CODES)
+    for c in range(row.shape[0]):
+        if row[c] >= 0:
+            for h in range(values.shape[0]):
+                value = max(min(values[h, c], top), np.float32(0.0))
+                code = np.uint16(NO_CODE) if values[h, c] >= NEVER else np.uint16(value * np.float32(CODES))
+                out[h, row[c]] = code
 
 
 @leaf
 def desirability(
-    body: Body,
-    planes: Planes,
-    table: NDArray[np.uint16],
-    since: int,
-    t: int,
-    mask: int,
-    x: float,
-    y: float,
-    theta: float,
+    body: Body, planes: Planes, table: NDArray[np.uint16], t: int, mask: int, x: float, y: float, theta: float
 ) -> float:
-    """D at a pose at step t with the goals of `mask` settled [nats]; NEVER where no corner has any.
-
-    since: the table's first step.
-    """
-    if mask < 0 or planes.slot[t, mask] < 0:
+    """D at a pose at step t with the goals of `mask` settled [nats]; NEVER where no corner has any."""
+    if mask < 0 or planes.kept[t, mask] < 0:
         return float(NEVER)
-    headings, k = planes.valid.shape[0], planes.slot[t, mask] - _skipped(planes, since)
+    after, before = t, t - 1
+    while planes.kept[after + 1, mask] == planes.kept[t, mask]:
+        after += 1
+    while before >= 0 and planes.kept[before, mask] == planes.kept[t, mask]:
+        before -= 1
+    later = _at(body, planes, table[planes.kept[t, mask]], x, y, theta)
+    if t == after or before < 0 or planes.kept[before, mask] < 0:
+        return later
+    sooner = _at(body, planes, table[planes.kept[before, mask]], x, y, theta)
+    share = (t - before) / (after - before)
+    return later if later >= NEVER else share * later + (1.0 - share) * sooner
+
+
+@leaf
+def _at(body: Body, planes: Planes, table: NDArray[np.uint16], x: float, y: float, theta: float) -> float:
+    """Bilinear in a table [H, rows]."""
+    headings = table.shape[0]
     v, u, h = coordinates(body, planes.pitch, headings, x, y, theta)
     j, i, low = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
     q, p, f = v - j, u - i, h - low
@@ -239,11 +244,11 @@ def desirability(
     for dj in range(2):
         for di in range(2):
             c = (j + dj + planes.pad) * planes.width + i + di + planes.pad
-            if c < 0 or c >= planes.valid.shape[1]:
+            if c < 0 or c >= planes.row.shape[0] or planes.row[c] < 0:
                 continue
             for dh in range(2):
                 w = (q if dj else 1.0 - q) * (p if di else 1.0 - p) * (f if dh else 1.0 - f)
-                code = table[k, (low + dh) % headings, c]
+                code = table[(low + dh) % headings, planes.row[c]]
                 if w > 1e-6 and code != NO_CODE:
                     total += w * code / CODES
                     weights += w

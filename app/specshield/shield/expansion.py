@@ -1,4 +1,4 @@
-"""D at the next poses, by exact steps of the surrogate first: beside a wall the lattice knows little."""
+"""D at the next poses, by exact steps of the surrogates first: beside a wall the lattice knows little."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, va
 from specshield.robot.unicycle import Body, step
 from specshield.shield.desirability import NEVER, desirability
 from specshield.shield.planes import Planes
-from specshield.shield.surrogate import FEATURES, Course, follow, is_blocked
+from specshield.shield.surrogate import FEATURES, Goals, follow, is_blocked
 
 Floats = NDArray[np.float64]
 
@@ -23,65 +23,68 @@ DEPTH = 2  # exact steps before the lattice is asked
 def expand_all(
     body: Body,
     rules: Rules,
-    course: Course,
+    goals: Goals,
     planes: Planes,
-    table: NDArray[np.uint16],
-    since: int,
+    tables: NDArray[np.uint16],
+    leads: NDArray[np.int64],
+    asked: NDArray[np.int64],
     style: Floats,
+    price: float,
     t: int,
     mask: int,
-    x: float,
-    y: float,
-    theta: float,
+    pose_t: Floats,
     out: Floats,
 ) -> None:
-    """D after each motion from x_t, out (M,). mask: the goals settled at t; since: the table's first step.
+    """D after each motion from x_t, out (K, M), for the K tables asked for.
 
-    A tree of poses: level d holds the M^d poses at t + d, the children of node n at M n to M n + M - 1.
+    tables [B, kept, H, rows], leads [B]: the goal that each is for, or WANDER. mask: the goals of the
+    formula settled at t. A tree of poses: level d holds the M^d poses at t + d, the children of its node n
+    being nodes M n to M n + M - 1 of the next.
     """
-    motions, horizon = out.shape[0], planes.slot.shape[0] - 2
+    motions, horizon = out.shape[1], planes.slot.shape[0] - 2
     levels = min(DEPTH + 1, horizon - t)
     start = np.zeros(levels + 2, np.int64)
     for d in range(levels + 1):
         start[d + 1] = start[d] + motions**d
-    pose, settled = np.empty((start[-1], 3)), np.empty(start[-1], np.int64)
-    log_r, going_on = np.empty(start[-1]), np.empty(start[-1])
-    cost, blocked = np.empty(start[-1]), np.empty(motions, np.bool_)
-    features, reaction = np.empty((motions, FEATURES)), np.empty(motions)
+    pose, settled = np.empty((start[-1], 3)), np.full(start[-1], -1)
+    blocked = np.zeros((start[-1], motions), np.bool_)
     values, stack, read = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
-    pose[0, 0], pose[0, 1], pose[0, 2], settled[0] = x, y, theta, mask
+    pose[0], settled[0] = pose_t, mask
     for d in range(levels):
         for n in range(start[d], start[d + 1]):
-            first = start[d + 1] + (n - start[d]) * motions
+            if settled[n] < 0:
+                continue
             u, v, w = pose[n]
             for m in range(motions):
-                child = first + m
-                settled[child] = -1
-                if settled[n] >= 0:
-                    pose[child, 0], pose[child, 1], pose[child, 2] = step(body, u, v, w, m)
-                    blocked[m] = is_blocked(body, m, u, v, w, pose[child])
-                    read_predicates(
-                        rules, pose[child, 0], pose[child, 1], pose[child, 2], values, stack, read
-                    )
-                    settled[child] = _settle(rules, planes, t + d + 1, settled[n], read)
-            if settled[n] >= 0:
-                going_on[n] = 1.0 - follow(body, course, style, u, v, w, blocked, features, reaction)
-                log_r[first : first + motions] = reaction
-    for n in range(start[levels], start[levels + 1]):
-        u, v, w = pose[n]
-        cost[n] = desirability(body, planes, table, since, t + levels, settled[n], u, v, w)
-    for d in range(levels - 1, 0, -1):
-        for n in range(start[d], start[d + 1]):
-            first = start[d + 1] + (n - start[d]) * motions
-            least, total = float(NEVER), 0.0
-            for child in range(first, first + motions):
-                if cost[child] < NEVER:
-                    least = min(least, cost[child] - log_r[child])
-            for child in range(first, first + motions):
-                if cost[child] < NEVER:
-                    total += math.exp(least - cost[child] + log_r[child])
-            cost[n] = going_on[n] * (least - math.log(total)) if total > 0.0 else float(NEVER)
-    out[:] = cost[start[1] : start[2]]
+                child = start[d + 1] + (n - start[d]) * motions + m
+                pose[child, 0], pose[child, 1], pose[child, 2] = step(body, u, v, w, m)
+                blocked[n, m] = is_blocked(body, m, u, v, w, pose[child])
+                read_predicates(rules, pose[child, 0], pose[child, 1], pose[child, 2], values, stack, read)
+                settled[child] = _settle(rules, planes, t + d + 1, settled[n], read)
+    cost, log_r, features = np.empty(start[-1]), np.empty(motions), np.empty((motions, FEATURES))
+    for k in range(asked.shape[0]):
+        for n in range(start[levels], start[levels + 1]):
+            u, v, w = pose[n]
+            cost[n] = desirability(body, planes, tables[asked[k]], t + levels, settled[n], u, v, w)
+        for d in range(levels - 1, 0, -1):
+            for n in range(start[d], start[d + 1]):
+                cost[n] = float(NEVER)
+                if settled[n] < 0:
+                    continue
+                u, v, w = pose[n]
+                ends = follow(body, goals, leads[asked[k]], style, u, v, w, blocked[n], features, log_r)
+                first = start[d + 1] + (n - start[d]) * motions
+                least, total = float(NEVER), 0.0
+                for m in range(motions):
+                    if cost[first + m] < NEVER:
+                        least = min(least, cost[first + m] - log_r[m])
+                for m in range(motions):
+                    if cost[first + m] < NEVER:
+                        total += math.exp(least - cost[first + m] + log_r[m])
+                if total > 0.0:
+                    due = price if settled[n] != planes.slot.shape[1] - 1 else 0.0
+                    cost[n] = due + (1.0 - ends) * (least - math.log(total))
+        out[k] = cost[start[1] : start[2]]
 
 
 @leaf

@@ -1,9 +1,10 @@
 """Look-ahead shaping: inside S_t, weigh what the model wants by what it will cost the model later.
 
-Projection lets the model put a visit off until it is forced, step after step. A surrogate of the model,
-fitted to the logits of the session, says what the rule will still cost from each next pose: D
-(desirability.py). Weighing by exp(-D) spreads the cost over the path as the closest path distribution would.
-Only the preference inside S_t changes: safety rests on S_t alone.
+Projection lets the model put a visit off until it is forced, step after step. Stand-ins for the model, one
+for each of some places that it may be going to and one that wanders, have each a table of what the rule will
+still cost from every pose: D (desirability.py), solved once a task. Weighing by exp(-D), D the mean over what
+the session's logits say that the model is, spreads the cost over the path as the closest path distribution
+would. Only the preference inside S_t changes: safety rests on S_t alone.
 """
 
 from __future__ import annotations
@@ -22,30 +23,41 @@ from specshield.policy.progress import SETTLED, Rules, make_rules, replay, signa
 from specshield.policy.reachability import ReachabilityPolicy, synthesise
 from specshield.robot.unicycle import Body, make_body, successors
 from specshield.shield import belief as beliefs
-from specshield.shield.belief import Belief, Plan
+from specshield.shield.belief import STYLE, Belief
 from specshield.shield.desirability import NEVER, solve
 from specshield.shield.expansion import expand_all
 from specshield.shield.planes import Planes, make_planes
-from specshield.shield.surrogate import FEATURES, Course, Goals, chart, follow, is_blocked, make_goals
+from specshield.shield.surrogate import FEATURES, WANDER, Goals, follow, is_blocked, make_goals
 from specshield.task import Task
 
 Floats = NDArray[np.float64]
-Codes = NDArray[np.uint16]
+Integers = NDArray[np.int64]
 
-TABLES = 8  # solved, kept by a process: 20 MB each on the cases
-NEGLIGIBLE = 0.01  # a weight not worth the work
+PRICE = 0.4  # [nats] of a step while the rule is pending: the model's own task waits
+LEAD_GAP = 1.0  # [m] along free space between the places that have a table
+WORK = 200_000_000  # entries solved for a task, at most, where that leaves a few places
+MOST, FEWEST = 64, 8  # places
+LEADERS = 8  # tables asked in a decision
+NEGLIGIBLE = 0.02  # a probability, or trust, not worth the work
 WORST = 10.0  # [nats] more than the worst action that has a D, for those that have none
 
 
 @dataclass(frozen=True, eq=False)
 class LookAhead:
-    """A task as the look-ahead sees it, prepared once."""
+    """A task as the look-ahead sees it, prepared once.
+
+    leads [B]: the goals that have a table of D and, last, WANDER; lead_of [G + 1]: which of them stands for
+    each goal, and for wandering. tables [B, kept, H, rows].
+    """
 
     task: Task
     body: Body
     rules: Rules
     goals: Goals
     planes: Planes
+    leads: Integers
+    lead_of: Integers
+    tables: NDArray[np.uint16]
 
     def begin(self) -> Belief:
         return beliefs.begin(len(self.goals.distance), len(self.task.robot.motions))
@@ -55,8 +67,8 @@ class LookAhead:
     ) -> tuple[Belief, Floats]:
         """What is believed after the model's log_prior [A] at x_t, and what to add to it inside S_t, [A].
 
-        history [t + 1, 3] with t < T; signals {name: [t + 1]}. The addition is -weight * D of the next pose,
-        at most 0; 0 for a terminal action and where nothing is known.
+        history [t + 1, 3] with t < T; signals {name: [t + 1]}. The addition is -trust * D of the next pose, D
+        above the least: at most 0, and 0 for a terminal action and where nothing is known.
         """
         robot, pose = self.task.robot, history[-1]
         x, y, theta = (float(v) for v in pose)
@@ -69,11 +81,11 @@ class LookAhead:
         said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(nexts)) / going_on.sum()
         blocked = np.array([is_blocked(self.body, m, x, y, theta, after) for m, after in enumerate(nexts)])
         end = float(prior[robot.terminal].sum())
-        belief = beliefs.observe(belief, self.body, self.goals, len(history) - 1, pose, blocked, said, end)
-        if belief.weight < NEGLIGIBLE:
+        belief = beliefs.observe(belief, self.body, self.goals, pose, blocked, said, end)
+        if belief.trust < NEGLIGIBLE:
             return belief, np.zeros(len(prior))
         costs = self._costs(belief, history, signals)
-        return belief, np.where(robot.terminal, 0.0, -belief.weight * costs[robot.motion_of])
+        return belief, np.where(robot.terminal, 0.0, -belief.trust * costs[robot.motion_of])
 
     def _costs(self, belief: Belief, history: Floats, signals: Mapping[str, Floats]) -> Floats:
         """D after each motion [M], above the least."""
@@ -82,23 +94,25 @@ class LookAhead:
         status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
         replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
         mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
-        assert belief.plan is not None
-        plan, costs = belief.plan, np.empty(len(self.task.robot.motions))
-        course, table = _solved(self, plan)
-        style = np.array(plan.style)
-        x, y, theta = (float(v) for v in history[-1])
+        weights = np.bincount(self.lead_of, belief.probabilities(), len(self.leads))
+        asked = np.argsort(-weights, kind="stable")[:LEADERS]
+        asked = asked[weights[asked] >= NEGLIGIBLE]
+        costs = np.empty((len(asked), len(self.task.robot.motions)))
         expand_all(
-            self.body, rules, course, self.planes, table, plan.since, style, t, mask, x, y, theta, costs
-        )
-        known = costs < NEVER
+            self.body, rules, self.goals, self.planes, self.tables, self.leads, asked, STYLE, PRICE, t, mask,
+            history[-1], costs,
+        )  # fmt: skip
+        known = np.all(costs < NEVER, axis=0)
         if not known.any():
-            return np.zeros(len(costs))
-        costs[~known] = costs[known].max() + WORST
-        costs -= costs.min()
-        return costs
+            return np.zeros(costs.shape[1])
+        # a model twice as sharp costs twice as much to bend
+        sharp = np.where(self.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
+        total = (weights[asked] / weights[asked].sum() * sharp) @ np.where(known, costs, 0.0)
+        result: Floats = np.where(known, total - total[known].min(), np.ptp(total[known]) + WORST)
+        return result
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=8)
 def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
     """The look-ahead for a task; `policy`: one made for it, if there is any.
 
@@ -112,26 +126,40 @@ def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
             path="shaping", got="lookahead", expected="'projection'",
         )  # fmt: skip
     planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
-    return LookAhead(task, body, rules, goals, planes)
+    entries = int((planes.slot >= 0).sum()) * planes.valid.size
+    places, lead_of = _leads(goals, min(max(WORK // entries, FEWEST), MOST))
+    leads = np.append(places, WANDER)
+    shape = (len(leads), int(planes.kept.max()) + 1, len(planes.valid), int(planes.row.max()) + 1)
+    tables = np.empty(shape, np.uint16)
+    motions = np.zeros((len(task.robot.motions), *planes.valid.shape), np.float32)
+    ends = np.zeros(planes.valid.shape, np.float32)
+    for table, lead in zip(tables, leads, strict=True):
+        _react_everywhere(body, goals, planes, int(lead), STYLE, motions, ends)
+        table[:] = solve(body, planes, motions, ends, PRICE)
+    return LookAhead(task, body, rules, goals, planes, leads, np.append(lead_of, len(places)), tables)
 
 
-@lru_cache(maxsize=TABLES)
-def _solved(ahead: LookAhead, plan: Plan) -> tuple[Course, Codes]:
-    """The course of a plan, and D for a model on it."""
-    chosen, weights = np.array([g for g, _ in plan.goals]), np.array([p for _, p in plan.goals])
-    course = chart(ahead.goals, chosen, weights)
-    shape = ahead.planes.valid.shape
-    motions = np.zeros((len(ahead.task.robot.motions), *shape), np.float32)
-    ends = np.zeros(shape, np.float32)
-    _react_everywhere(ahead.body, course, ahead.planes, np.array(plan.style), motions, ends)
-    return course, solve(ahead.body, ahead.planes, plan.since, motions, ends)
+def _leads(goals: Goals, most: int) -> tuple[Integers, Integers]:
+    """At most `most` goals that lie apart, [B], and which of them is nearest to each goal, [G]."""
+    cells = np.array([np.argwhere(distance == 0)[0] for distance in goals.distance])
+    between = goals.distance[:, cells[:, 0], cells[:, 1]].astype(np.float64) / 100.0
+    gap = LEAD_GAP
+    while True:
+        chosen: list[int] = []
+        for g in range(len(cells)):
+            if np.all(between[chosen, g] >= gap):
+                chosen.append(g)
+        if len(chosen) <= most:
+            return np.array(chosen), np.argmin(between[chosen], axis=0)
+        gap *= 1.1
 
 
 @kernel
 def _react_everywhere(
     body: Body,
-    course: Course,
+    goals: Goals,
     planes: Planes,
+    goal: int,
     style: Floats,
     motions: NDArray[np.float32],
     ends: NDArray[np.float32],
@@ -148,6 +176,6 @@ def _react_everywhere(
             x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
             for m in range(motions.shape[0]):
                 blocked[m] = planes.free[m, h, c] == 0.0
-            ends[h, c] = follow(body, course, style, x, y, theta, blocked, features, log_r)
+            ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, features, log_r)
             for m in range(motions.shape[0]):
                 motions[m, h, c] = log_r[m]

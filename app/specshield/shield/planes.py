@@ -25,9 +25,10 @@ from specshield.policy.tables import Tables, slack
 from specshield.robot.unicycle import Body, in_collision, step
 from specshield.shield.surrogate import is_blocked
 
-PITCH = 0.2  # [m]
+PITCH = 0.4  # [m]: as fine as the stand-ins deserve
 MAX_HEADINGS = 24
-MAX_ENTRIES = 40_000_000  # of a table of D: 80 MB
+MAX_ENTRIES = 40_000_000  # poses times steps and sets of settled goals
+KEPT = 500_000  # of them, in a table of D
 
 
 class Planes(NamedTuple):
@@ -36,9 +37,11 @@ class Planes(NamedTuple):
     pad, width: of a plane, in cells. free [M, H, N]: 1 where a motion is not stopped short. holds, keeps [H,
     N]: bit g where goal g's, bit k where obligation k's predicate is true. goal [G]: the obligations that are
     goals; first, last [G]: the steps at which a visit settles them (of a dwell, its beginning). due, open [T
-    + 2]: bits of the always that hold at a step, of the goals that can be settled. slot [T + 2, 2^G]: the
-    table of each step and set of settled goals, -1 where there is none. possible [slots, H, N]: 1 where the
-    rule can still be kept, as a policy's tables say; of no slots where there are none to say so.
+    + 2]: bits of the always that hold at a step, of the goals that can be settled. slot [T + 2, 2^G]: numbers
+    each step and set of settled goals that can be had, -1 for others. kept [T + 2, 2^G]: where a table of D
+    has them, a few steps sharing what holds at the last of them; row [N]: where it has a cell, -1 where no
+    pose is free. possible [slots, H, N]: 1 where the rule can still be kept, as a policy's tables say; of no
+    slots where there are none to say so.
     """
 
     pitch: float
@@ -54,6 +57,8 @@ class Planes(NamedTuple):
     due: NDArray[np.int32]
     open: NDArray[np.int32]
     slot: NDArray[np.int64]
+    kept: NDArray[np.int64]
+    row: NDArray[np.int64]
     possible: NDArray[np.uint8]
 
 
@@ -70,11 +75,11 @@ def make_planes(
     dwell = rules.kind[goal] == EVENTUALLY_ALWAYS
     first = rules.a[goal] + np.where(dwell, rules.c2[goal], 0)
     last = np.where(dwell, rules.c1[goal] + rules.c2[goal], rules.b[goal])
-    slot = _slots(first, last, horizon)
+    slot = _slots(first, last, horizon, 1)
     if (slot.max() + 1) * headings * cells > MAX_ENTRIES:
         raise Unsupported(
             "the task is too large for look-ahead", path="shaping",
-            got=f"{slot.max() + 1} tables of {headings} x {cells} poses",
+            got=f"{slot.max() + 1} times {headings} x {cells} poses",
             expected=f"at most {MAX_ENTRIES} entries; or shaping 'projection'",
         )  # fmt: skip
     times = np.arange(horizon + 2)
@@ -87,25 +92,29 @@ def make_planes(
     planes = Planes(
         pitch, pad, width, np.zeros(shape, np.uint8), np.zeros((len(body.translate), *shape), np.float32),
         np.zeros(shape, np.int32), np.zeros(shape, np.int32), goal, first, last,
-        due.astype(np.int32), opened.astype(np.int32), slot,
+        due.astype(np.int32), opened.astype(np.int32), slot, slot, np.full(cells, -1),
         np.zeros((0, *shape), np.uint8),
     )  # fmt: skip
     _survey(body, rules, planes)
+    rooms = planes.valid.any(axis=0)
+    planes.row[rooms] = np.arange(rooms.sum())
+    kept = (slot.max() + 1) * headings * max(int(rooms.sum()), 1)
+    planes = planes._replace(kept=_slots(first, last, horizon, math.ceil(kept / KEPT)))
     if tables is None:
         return planes
-    possible = np.zeros((slot.max() + 1, *shape), np.uint8)
+    possible = np.zeros((planes.slot.max() + 1, *shape), np.uint8)
     _foresee(body, rules, tables, planes, possible)
     return planes._replace(possible=possible)
 
 
-def _slots(first: NDArray[np.int64], last: NDArray[np.int64], horizon: int) -> NDArray[np.int64]:
-    """The sets of settled goals that can be had at each step, numbered."""
+def _slots(first: NDArray[np.int64], last: NDArray[np.int64], horizon: int, every: int) -> NDArray[np.int64]:
+    """The sets of settled goals that can be had at each step, numbered; `every` steps share a number."""
     settled = np.arange(1 << len(first))[:, None] >> np.arange(len(first)) & 1 == 1
     slot, n = np.full((horizon + 2, len(settled)), -1), 0
     for t in range(horizon + 1):
         for mask in np.flatnonzero(np.all(np.where(settled, first <= t, last > t), axis=1)):
-            slot[t, mask] = n
-            n += 1
+            slot[t, mask] = slot[t - 1, mask] if t % every and slot[t - 1, mask] >= 0 else n
+            n = max(n, slot[t, mask] + 1)
     return slot
 
 

@@ -1,8 +1,9 @@
-"""A cheap stand-in for the foundation model: it goes somewhere, by the way along free space, and ends there.
+"""Cheap stand-ins for the foundation model: one that goes somewhere and ends there, and one that wanders.
 
-The logit of a motion is linear in what it saves: metres towards the goal, and turning towards the way there.
-Where to, and how sharply, is what a session learns of its model (belief.py). Motions are conditional on not
-ending.
+The logit of a motion of the first is linear in what it saves: metres towards the goal, along free space, and
+turning towards the way there. The second goes ahead where it can, else turns, and hardly ever backs up or
+stands still, as whatever searches. Which of them the model is like, where it goes and how sharply is what a
+session learns (belief.py). Motions are conditional on not ending.
 """
 
 from __future__ import annotations
@@ -26,10 +27,13 @@ MAX_GOALS = 300
 GAP = 0.5  # [m] between goals
 WAY_PITCH = 0.1  # [m]
 MAX_CELLS = 20_000  # of the grid that ways are kept on
-AHEAD = 5  # cells along the way: what the robot steers for
+STEER = 5  # cells along the way: what the robot steers for
 UNIT = 127  # of a direction's components, as stored
 FAR = 65535  # [cm] no way
 END_WITHIN, END_SLOPE, END_CHANCE = 1.0, 0.07, 0.25  # [m], [m], a step: an end near the goal
+WANDER = -1  # in place of a goal
+AHEAD, TURN, OTHER = 3.3, 2.0, -2.0  # logits of one that wanders: the longest move ahead, the largest turn
+WANDER_END = 0.01  # a step
 
 
 class Goals(NamedTuple):
@@ -42,17 +46,6 @@ class Goals(NamedTuple):
     pitch: float
     distance: NDArray[np.uint16]
     way: NDArray[np.int8]
-
-
-class Course(NamedTuple):
-    """Where the model is going, as far as known: the mean of the goals' ways, and of their chances of an end.
-
-    way [h, w, 2]: of a length below 1 where the goals part. ends [h, w]: the chance of an end, a step.
-    """
-
-    pitch: float
-    way: NDArray[np.float32]
-    ends: NDArray[np.float32]
 
 
 def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
@@ -100,7 +93,7 @@ def _to_go(
 
 @kernel
 def _steer(to_go: Floats, way: NDArray[np.int8]) -> None:
-    """The direction from each cell to the one AHEAD cells down the steepest way."""
+    """The direction from each cell to the one STEER cells down the steepest way."""
     height, width = to_go.shape
     after = np.empty(height * width, np.int64)
     for j in range(height):
@@ -117,7 +110,7 @@ def _steer(to_go: Floats, way: NDArray[np.int8]) -> None:
             after[j * width + i] = at
     for start in range(height * width):
         at = start
-        for _ in range(AHEAD):
+        for _ in range(STEER):
             at = after[at]
         dv, du = at // width - start // width, at % width - start % width
         length = max(math.hypot(du, dv), 1e-9)
@@ -129,21 +122,6 @@ def _steer(to_go: Floats, way: NDArray[np.int8]) -> None:
 def end_chance(distance: int) -> float:
     """The chance that the model ends at this distance from its goal [cm], if it has come there."""
     return END_CHANCE / (1.0 + math.exp(min((distance / 100.0 - END_WITHIN) / END_SLOPE, 50.0)))
-
-
-@kernel
-def chart(goals: Goals, chosen: NDArray[np.int64], weights: Floats) -> Course:
-    """The course towards the chosen goals; weights sum to 1."""
-    _, height, width = goals.distance.shape
-    way, ends = np.zeros((height, width, 2), np.float32), np.zeros((height, width), np.float32)
-    for n in range(chosen.shape[0]):
-        for j in range(height):
-            for i in range(width):
-                if goals.distance[chosen[n], j, i] < 200.0 * END_WITHIN:
-                    ends[j, i] += weights[n] * end_chance(goals.distance[chosen[n], j, i])
-                for k in range(2):
-                    way[j, i, k] += weights[n] * goals.way[chosen[n], j, i, k] / UNIT
-    return Course(goals.pitch, way, ends)
 
 
 @leaf
@@ -158,7 +136,8 @@ def cell_of(body: Body, pitch: float, height: int, width: int, x: float, y: floa
 @leaf
 def follow(
     body: Body,
-    course: Course,
+    goals: Goals,
+    goal: int,
     style: Floats,
     x: float,
     y: float,
@@ -167,16 +146,45 @@ def follow(
     features: Floats,
     out: Floats,
 ) -> float:
-    """log r of each motion at a pose, out (M,); the chance that the model ends there. features: scratch.
+    """log r of each motion at a pose, out (M,); the chance that the model ends there. goal: or WANDER.
 
-    Where goals part, the mean of their log r: what the KL from a model that has one of them is on average.
+    style (FEATURES,): the logit of each feature. blocked (M,): motions stopped short. features: scratch.
     """
-    row, column = cell_of(body, course.pitch, course.ends.shape[0], course.ends.shape[1], x, y)
-    wu, wv = course.way[row, column, 0], course.way[row, column, 1]
-    strength = min(math.hypot(wu, wv), 1.0)
+    if goal == WANDER:
+        _wander(body, blocked, out)
+        return WANDER_END
+    row, column = cell_of(body, goals.pitch, goals.distance.shape[1], goals.distance.shape[2], x, y)
+    wu, wv = goals.way[goal, row, column, 0], goals.way[goal, row, column, 1]
     describe(body, wu, wv, theta, blocked, features)
-    react(features, style, strength, out)
-    return float(course.ends[row, column])
+    for m in range(out.shape[0]):
+        out[m] = 0.0
+        for k in range(FEATURES):
+            out[m] += style[k] * features[m, k]
+    _normalise(out)
+    return end_chance(goals.distance[goal, row, column])
+
+
+@leaf
+def _wander(body: Body, blocked: NDArray[np.bool_], out: Floats) -> None:
+    stride, turn = 1e-9, 1e-9
+    for m in range(out.shape[0]):
+        stride, turn = max(stride, abs(body.translate[m])), max(turn, abs(body.rotate[m]))
+    for m in range(out.shape[0]):
+        move, rotation = body.translate[m], body.rotate[m]
+        if move > 0.0:
+            out[m] = 0.0 if blocked[m] else AHEAD * move / stride
+        else:
+            out[m] = OTHER if move < 0.0 or rotation == 0.0 else TURN * abs(rotation) / turn
+    _normalise(out)
+
+
+@leaf
+def _normalise(out: Floats) -> None:
+    total = 0.0
+    for m in range(out.shape[0]):
+        total += math.exp(out[m])
+    for m in range(out.shape[0]):
+        out[m] -= math.log(total)
 
 
 @leaf
@@ -200,22 +208,6 @@ def describe(body: Body, wu: float, wv: float, theta: float, blocked: NDArray[np
             out[m, PROGRESS] = move / stride * math.cos(bearing)
             after = abs((bearing - rotation + math.pi) % (2.0 * math.pi) - math.pi)
             out[m, TURNING] = (abs(bearing) - after) / turn if rotation != 0.0 else 0.0
-
-
-@leaf
-def react(features: Floats, style: Floats, strength: float, out: Floats) -> None:
-    """The mean log-probability of each motion, out (M,). style (FEATURES,): the logit of each feature.
-
-    strength: the length of the mean way, 1 where all goals agree.
-    """
-    total = 0.0
-    for m in range(features.shape[0]):
-        going = style[PROGRESS] * features[m, PROGRESS] + style[TURNING] * features[m, TURNING]
-        other = style[BLOCKED] * features[m, BLOCKED] + style[IDLE] * features[m, IDLE]
-        total += math.exp(going + other)
-        out[m] = strength * going + other
-    for m in range(features.shape[0]):
-        out[m] -= math.log(total)
 
 
 @leaf
