@@ -148,6 +148,11 @@ def test_the_main_task_stays_over(client, begin, step):
 
 def test_the_last_step_is_max_steps(client, begin, step):
     session = begin(max_steps=2)
+    for t in (3, 100_000):
+        refused = problem(step(session, t, ahead(3)), 422, "invalid-input")
+        assert (refused["path"], refused["got"], refused["expected"]) == ("t", t, "at most 2")
+        assert "max_steps" in refused["detail"]
+    assert problem(step(session, 2, ahead(2)[2:]), 409, "history-gap")["expected_t"] == 1
     for t in range(3):
         answer = step(session, t, ahead(t)[-1:]).json()
     assert answer["finished"]

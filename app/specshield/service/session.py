@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from specshield.errors import SessionFinished, StepConflict
+from specshield.errors import InputError, SessionFinished, StepConflict
 from specshield.service import files, history
 from specshield.service.schemas import StepRequest
 from specshield.service.store import Record
@@ -93,9 +93,13 @@ def describe(config: Mapping[str, Any], state: State) -> dict[str, Any]:
 
 def check_step(session: Session, request: StepRequest) -> None:
     """What a step not decided before has to be."""
-    state, t = session.state, request.t
-    if state.finished or t > session.config["max_steps"]:
+    state, t, last = session.state, request.t, session.config["max_steps"]
+    if state.finished:
         raise over(session, t)
+    if t > last:
+        raise InputError(
+            f"step {t} is past the session's max_steps", path="t", got=t, expected=f"at most {last}"
+        )
     if t < state.next_t:
         raise StepConflict(
             f"the session is past step {t}, which was not decided",
@@ -167,5 +171,5 @@ def over(session: Session, t: int) -> SessionFinished:
         f"session {session.id!r} is over",
         path="t",
         got=t,
-        expected=f"a step before {session.state.next_t}, to read it again",
+        expected="a step already decided, to read it again",
     )
