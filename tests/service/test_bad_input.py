@@ -10,6 +10,8 @@ import pytest
 from PIL import Image
 from tests.service.world import LOGITS, ROBOT, SPEC, START, ahead, grid_json, policy_files
 
+from specshield.service.schemas import Problem
+
 YAML = b"resolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
 PGM = b"P5\n4 3\n255\n" + bytes([254] * 12)
 
@@ -338,6 +340,21 @@ def test_steps(client, begin, step, fields, type, path):
     session = begin()
     problem(step(session, **{"t": 0, "poses": [START], "logits": LOGITS, **fields}), 422, type, path)
     assert client.get(f"/v1/sessions/{session['id']}").json() == session
+
+
+def test_a_long_list_of_errors_stays_a_list(client, begin):
+    """20 logits that are none and a long name: every entry whole, each of bounded size."""
+    logits = ",".join(["NaN"] * 20)
+    content = f'{{"{"x" * 5000}": 1, "t": 0, "poses": [[1, 1.5, 0]], "logits": [{logits}]}}'
+    path = f"/v1/sessions/{begin()['id']}/steps"
+    response = client.post(path, content=content, headers={"Content-Type": "application/json"})
+    found = Problem.model_validate(problem(response, 422, "invalid-logits", "logits[0]")).errors
+    assert [error.path for error in found] == [f"logits[{i}]" for i in range(20)]
+    assert all(error.got == "nan" and error.expected for error in found)
+    response = client.post("/v1/policies", files=policy_files() | {"card": b"{}"})
+    listed = Problem.model_validate(problem(response, 422, "invalid-input", "card.map_id")).errors
+    assert len(listed) == 8
+    assert len(client.post("/v1/specs/validate", json={"formula": "x > 1", "y" * 5000: 1}).text) < 2000
 
 
 @pytest.mark.parametrize("chunked", [False, True])

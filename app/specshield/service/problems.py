@@ -61,7 +61,8 @@ def document(error: SpecshieldError) -> dict[str, Any]:
         body["got"] = plain(error.got)
     if error.expected is not None:
         body["expected"] = error.expected
-    return body | {name: plain(value) for name, value in error.details.items()}
+    # `errors` stays the list it is: its entries were cut when they were made.
+    return body | {name: value if name == "errors" else plain(value) for name, value in error.details.items()}
 
 
 def plain(value: Any, room: int = 400) -> Any:
@@ -92,7 +93,7 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any) -> InputError
         reason = found[0].get("ctx", {}).get("error", "")
         return InputError(f"the body is not JSON: {reason}", expected="a JSON object")
     listed = [
-        {"path": _path(item, body), "got": plain(item.get("input")), "expected": _expected(item)}
+        {"path": _path(item, body)[:200], "got": plain(item.get("input")), "expected": _expected(item)}
         for item in found[:20]
     ]
     first = listed[0]
