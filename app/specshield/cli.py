@@ -167,7 +167,7 @@ def report(
 
 
 def train(
-    case: Annotated[str, typer.Option(help="A case of maps/.")],
+    case: Annotated[str, typer.Option(help="A case of maps/, as 1 or case1.")],
     method: Annotated[
         str, typer.Option(help="How the policy is made: reachability, planner or dqn.")
     ] = "reachability",

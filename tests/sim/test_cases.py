@@ -5,6 +5,7 @@ import pytest
 
 from specshield import errors
 from specshield.sim.cases import MAPS, load_case, shipped
+from specshield.sim.experiment import experiments
 from specshield.stl import parse
 
 
@@ -27,6 +28,11 @@ def test_the_policies_shipped_for_a_case_are_for_its_task_and_open_95_percent_of
     assert card["map_id"] == case.task.grid.content_hash
     assert card["spec"] == case.spec
     assert card["metrics"]["feasible_start"] >= 0.95
+
+
+def test_a_case_may_be_called_by_its_number():
+    assert load_case("1").name == "case1"
+    assert [each.case for each in experiments("2", None, "learned", "none", 0)] == ["case2"]
 
 
 def test_an_unknown_case_is_told_with_those_there_are():

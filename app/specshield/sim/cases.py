@@ -77,9 +77,14 @@ def shipped(case: Case, method: str) -> Proposer:
     return load_policy(folder / "policy.safetensors", card, case.task)
 
 
+def case_name(said: str) -> str:
+    """Of a case that may be called by its number: 1 is case1."""
+    return f"case{said}" if said.isdigit() else said
+
+
 def load_case(name: str, folder: Path = MAPS) -> Case:
-    """The case of that name in `folder`. Raises NotFound."""
-    names = case_names(folder)
+    """The case of that name, or number, in `folder`. Raises NotFound."""
+    name, names = case_name(name), case_names(folder)
     if name not in names:
         raise NotFound(
             f"there is no case {name!r}", path="case", got=name, expected=f"one of {', '.join(names)}"

@@ -14,7 +14,7 @@ from specshield.policy.reachability import synthesise
 from specshield.robot.unicycle import Body, make_body
 from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
-from specshield.sim.cases import Case, load_case, shipped
+from specshield.sim.cases import Case, case_name, load_case, shipped
 from specshield.sim.decoding import HardDecoding, RobustDecoding
 from specshield.sim.disturbance import believed, check
 from specshield.sim.houses import load_house_case
@@ -120,8 +120,7 @@ class Setting:
 
 def experiments(case: str, house: str | None, model: str, noise: str, seed: int) -> list[Experiment]:
     """One a noise, of those that `noise` joins by commas. case: a case's name, or its number."""
-    name = f"case{case}" if case.isdigit() else case
-    return [Experiment(name, house, model, each, seed) for each in noise.split(",")]
+    return [Experiment(case_name(case), house, model, each, seed) for each in noise.split(",")]
 
 
 def available(case: str) -> list[str]:

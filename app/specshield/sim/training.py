@@ -31,7 +31,7 @@ def train(
     every evaluation; `resume` takes that up after a kill.
     """
     loaded = load_case(case)
-    out = out or MODELS / (case if method == "reachability" else f"{case}-{method}")
+    out = out or MODELS / (loaded.name if method == "reachability" else f"{loaded.name}-{method}")
     if method == "dqn":
         weights, card = _learn(loaded, seed, updates, _options(options), out / "checkpoint", resume)
     elif method == "reachability":
