@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from specshield.errors import MapError
-from specshield.world.procthor import load_house, start_pose
+from specshield.world.procthor import load_house
 from specshield.world.regions import Union, signed_distance
 
 HOUSES = Path(__file__).parents[3] / "shared/data/houses"
@@ -163,13 +163,6 @@ def test_rooms_of_one_kind_are_numbered_and_joined():
     assert signed_distance(rooms["Bedroom_2"], [2, 2]) == -2.0
 
 
-@pytest.mark.parametrize(("yaw", "theta"), [(0, math.pi / 2), (90, 0), (180, -math.pi / 2), (270, math.pi)])
-def test_headings(yaw, theta):
-    plan = house()
-    plan["metadata"]["agent"]["rotation"]["y"] = yaw
-    assert start_pose(plan) == pytest.approx((1.0, 2.0, theta))
-
-
 def broken(path, value):
     plan = house(
         doors=[door(1.0, 2.0)], objects=[thing("Bed", 2.0, 2.0, 0.25, children=[thing("Lamp", 2, 2, 1.5)])]
@@ -237,7 +230,9 @@ def test_procthor_houses(number, sizes):
     grid, rooms = load_house(copy.deepcopy(plan), sizes, 0.05)
     assert set(rooms) == {"Bedroom", "Bathroom", "Kitchen", "LivingRoom"}
 
-    x, y, theta = start_pose(plan)
+    agent = plan["metadata"]["agent"]  # where ProcTHOR starts the robot; map (x, y) is house (x, z)
+    x, y = agent["position"]["x"], agent["position"]["z"]
+    theta = math.pi / 2 - math.radians(agent["rotation"]["y"])
     centre = grid.to_grid([x - 0.109 * math.cos(theta), y - 0.109 * math.sin(theta)])
     corners = np.argwhere(grid.occupied)[:, ::-1] * grid.resolution
     apart = np.linalg.norm(

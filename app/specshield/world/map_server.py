@@ -158,6 +158,13 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[NDArray[np.float64], 
     """(shade, opacity) in [0, 1], each [height, width]. The size is checked before anything is decoded."""
     try:
         picture = Image.open(io.BytesIO(image), formats=["PPM", "PNG"])
+    except Image.DecompressionBombError as error:
+        raise MapError(
+            "the image is too large",
+            path="image",
+            got=f"{len(image)} bytes, {error}",
+            expected=f"at most {MAX_SIDE} x {MAX_SIDE} pixels",
+        ) from error
     except Exception as error:  # decoders raise whatever the bytes lead to
         raise MapError(
             "the image has no header of a PGM or PNG",

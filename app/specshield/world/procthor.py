@@ -6,7 +6,6 @@ out: what hangs higher than STANDS_BELOW, and what is not fixed (`kinematic: fal
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -50,15 +49,6 @@ def load_house(house: Any, asset_sizes: Any, resolution: float) -> tuple[Occupan
     for centre, spans in _furniture(house, asset_sizes):
         canvas.cover(centre, spans)
     return OccupancyGrid(canvas.occupied, resolution, (*canvas.corner, 0.0)), _rooms(polygons)
-
-
-def start_pose(house: Any) -> tuple[float, float, float]:
-    """(x, y, theta) of the house's `metadata.agent`, theta in (-pi, pi]."""
-    agent = checks.member(checks.member(house, "metadata", ""), "agent", "metadata")
-    x, _, z = _vector(checks.member(agent, "position", "metadata.agent"), "metadata.agent.position")
-    _, yaw, _ = _vector(checks.member(agent, "rotation", "metadata.agent"), "metadata.agent.rotation")
-    theta = math.radians((90.0 - yaw) % 360.0)
-    return x, z, theta - 2 * math.pi if theta > math.pi else theta
 
 
 def _polygons(house: Any) -> list[tuple[str, Polygon]]:
