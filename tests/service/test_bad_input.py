@@ -124,8 +124,9 @@ def test_maps_as_files(client, unchanged, metadata, image, path):
     problem(client.post("/v1/maps", files=files), 422, "invalid-map", path)
 
 
-def test_a_map_over_the_limit_in_cells(client, unchanged):
-    files = {"metadata": ("map.yaml", YAML), "image": ("map.png", png(4001, 4001))}
+@pytest.mark.parametrize("side", [4001, 20_000])  # the second is over the image library's own limit
+def test_a_map_over_the_limit_in_cells(client, unchanged, side):
+    files = {"metadata": ("map.yaml", YAML), "image": ("map.png", png(side, side))}
     answer = problem(client.post("/v1/maps", files=files), 422, "invalid-map")
     assert "4000" in answer["expected"]
 
@@ -201,7 +202,10 @@ def test_maps_and_policies_that_are_not_there(client, unchanged):
     problem(client.get("/v1/maps/..%2f..%2fetc%2fpasswd"), 404, "not-found")
     problem(client.get("/v1/maps/" + "a" * 65), 422, "invalid-input", "map_id")
     problem(client.get("/v1/maps", params={"limit": 0}), 422, "invalid-input", "limit")
-    problem(client.put("/v1/maps"), 405, "method-not-allowed")
+    for path, methods in (("/v1/maps", "GET, POST"), ("/v1/sessions/x", "DELETE, GET"), ("/livez", "GET")):
+        response = client.put(path)
+        assert problem(response, 405, "method-not-allowed")["expected"] == methods
+        assert response.headers["allow"] == methods
     problem(client.post("/v1/specs/validate", json={"formula": "x > 1", "map_id": "none"}), 404, "not-found")
 
 

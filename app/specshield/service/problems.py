@@ -12,6 +12,7 @@ from typing import Any
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
@@ -140,6 +141,15 @@ def _held(value: Any, part: str | int) -> Any:
     return _ABSENT
 
 
+def _allowed(request: Request) -> str:
+    """The methods of a path: Starlette names those of one route, and a path may have several."""
+    asked = [{**request.scope, "method": method} for method in ("DELETE", "GET", "PATCH", "POST", "PUT")]
+    routes = request.app.routes
+    return ", ".join(
+        scope["method"] for scope in asked if any(r.matches(scope)[0] is Match.FULL for r in routes)
+    )
+
+
 def install(app: FastAPI) -> None:
     """Every way an answer can go wrong ends in `response`."""
 
@@ -161,10 +171,10 @@ def install(app: FastAPI) -> None:
                 errors.NotFound(f"there is no {path} here", got=path, expected="a path listed at /docs")
             )
         if error.status_code == 405:
-            allowed = (error.headers or {}).get("Allow", "another method")
+            allowed = _allowed(request)
             message = f"{request.method} is not for {path}"
             return response(
-                errors.MethodNotAllowed(message, got=request.method, expected=allowed), error.headers
+                errors.MethodNotAllowed(message, got=request.method, expected=allowed), {"Allow": allowed}
             )
         return response(InputError(str(error.detail)))
 
