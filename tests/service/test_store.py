@@ -197,12 +197,15 @@ def test_the_key_opens_what_it_should(tmp_path):
     ):
         for path in ("/livez", "/readyz", "/docs", "/openapi.json"):
             assert client.get(path).status_code == 200
-        for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "s3cret"}):
+        for given in (None, "Bearer wrong", "s3cret", "Basic s3cret", "Bearer", "Bearer s3cret s3cret"):
+            headers = {} if given is None else {"Authorization": given}
             for path in ("/v1/sessions", "/metrics", "/v1/nothing"):
                 response = client.get(path, headers=headers)
                 assert (response.status_code, response.json()["type"]) == (401, "unauthorized")
                 assert response.headers["www-authenticate"] == "Bearer"
-        assert client.get("/v1/sessions", headers={"Authorization": "Bearer s3cret"}).status_code == 200
+        for scheme in ("Bearer", "bearer", "BEARER"):
+            headers = {"Authorization": f"{scheme} s3cret"}
+            assert client.get("/v1/sessions", headers=headers).status_code == 200
 
 
 def test_a_server_that_fails_says_no_more_than_that(tmp_path):

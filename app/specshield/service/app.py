@@ -21,13 +21,13 @@ from specshield.service.embedded import EmbeddedStore
 from specshield.service.jobs import Jobs
 from specshield.service.keeper import follow_parent
 from specshield.service.maps import Maps
-from specshield.service.middleware import Guard, Observe
+from specshield.service.middleware import Guard, Observe, guarded
 from specshield.service.policies import Policies
 from specshield.service.routes import maps, policies, sessions, specs, system
 from specshield.service.schemas import Problem
 from specshield.service.sessions import Sessions
 from specshield.service.settings import Settings
-from specshield.service.state import Server
+from specshield.service.state import Server, problem_documents
 from specshield.service.store import Store
 from specshield.service.warmup import warm_up
 
@@ -137,5 +137,12 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             "key": {"type": "http", "scheme": "bearer", "description": "Where the server asks for one."}
         }
         schema["security"] = [{}, {"key": []}]
+        for path, methods in schema["paths"].items():  # what the middleware may answer
+            for operation in methods.values():
+                said = {"_401": "The server asks for a key, and this is not it."} if guarded(path) else {}
+                if "requestBody" in operation:
+                    said["_413"] = "The body is over the limit."
+                added = problem_documents(**said)
+                operation["responses"] |= {str(status): told for status, told in added.items()}
         app.openapi_schema = schema
     return app.openapi_schema

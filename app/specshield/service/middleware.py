@@ -61,16 +61,16 @@ class Guard:
 
     def __init__(self, app: ASGIApp, api_key: str | None, max_body: int, max_upload: int) -> None:
         self.app, self._max_body, self._max_upload = app, max_body, max_upload
-        self._key = None if api_key is None else _hash(f"Bearer {api_key}")
+        self._key = None if api_key is None else _hash(api_key)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
         path, headers = scope["path"], Headers(scope=scope)
-        if self._key is not None and (path.startswith("/v1/") or path == "/metrics"):
-            given = headers.get("authorization", "")
-            if not hmac.compare_digest(_hash(given), self._key):
+        if self._key is not None and guarded(path):
+            scheme, _, given = headers.get("authorization", "").partition(" ")
+            if scheme.lower() != "bearer" or not hmac.compare_digest(_hash(given.strip()), self._key):
                 error = Unauthorized("an API key is needed", path="Authorization", expected="Bearer <key>")
                 await problems.response(error)(scope, receive, send)
                 return
@@ -104,6 +104,11 @@ class Guard:
                 raise
         if read > limit and not answered:
             await too_large(scope, receive, send)
+
+
+def guarded(path: str) -> bool:
+    """Whether a path needs the key, where there is one."""
+    return path.startswith("/v1/") or path == "/metrics"
 
 
 def _hash(text: str) -> bytes:

@@ -46,6 +46,10 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="Items a page.")]
 
 def problems(**said: str) -> dict[int | str, dict[str, Any]]:
     """The problem documents a route may answer: problems(_409="history-gap, ...")."""
+    return problem_documents(_422="Bad input: the field, what it held, what is valid.", **said)
+
+
+def problem_documents(**said: str) -> dict[int | str, dict[str, Any]]:
+    """Those alone that are said."""
     content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    said = {"_422": "Bad input: the field, what it held, what is valid.", **said}
     return {int(status[1:]): {"description": text, "content": content} for status, text in said.items()}

@@ -30,7 +30,7 @@ MapId = Annotated[
     status_code=201,
     response_model=MapResponse,
     summary="Send a map",
-    responses=problems(_413="The body is over the limit.", _429="The server keeps no more maps."),
+    responses=problems(_429="The server keeps no more maps."),
     openapi_extra=uploads.request_body(
         "A map_server map as two files, or JSON: a ProcTHOR house or a nav_msgs/OccupancyGrid.",
         UPLOAD,

@@ -32,9 +32,8 @@ PolicyId = Annotated[
     summary="Ask for a policy, or send one",
     responses=problems(
         _404="No such map.",
-        _413="The body is over the limit.",
         _429="The server keeps no more policies.",
-        _503="`training-unavailable`: no worker is there to train.",
+        _503="`training-unavailable`: no worker is there to train; or the store is away.",
     ),
     openapi_extra=uploads.request_body(
         "What to train, as JSON; or a policy trained elsewhere, as two files.",
@@ -129,7 +128,7 @@ async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 10
     "/{policy_id}",
     response_model=PolicyResponse,
     summary="Read a policy",
-    responses=problems(_404="No such policy."),
+    responses=problems(_404="No such policy.", _503="The store is away."),
 )
 async def read(policy_id: PolicyId, server: ServerState) -> Any:
     """How far it is, and what was measured."""
@@ -141,7 +140,9 @@ async def read(policy_id: PolicyId, server: ServerState) -> Any:
     status_code=204,
     summary="Cancel or remove a policy",
     responses=problems(
-        _404="No such policy.", _409="`in-use`: a session still asks it, or it came with the server."
+        _404="No such policy.",
+        _409="`in-use`: a session still asks it, or it came with the server.",
+        _503="The store is away.",
     ),
 )
 async def delete(policy_id: PolicyId, server: ServerState) -> Response:
