@@ -247,8 +247,9 @@ class Sessions:
     ) -> Session:
         """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
 
-        `threshold` is delta (only 1 carries the guarantee), `margin` and `slack` the robustness [m]
-        and the steps to keep in hand.
+        `threshold` is delta; the guarantee is for 1 with evaluation "feasibility", the defaults. With
+        "robustness" it is the mean robustness [m] asked for, of which 1 is often too much. `margin` and
+        `slack` are the robustness [m] and the steps to keep in hand.
         InfeasibleStart where no action has a satisfying future, unless `allow_infeasible`.
         """
         flow = core.create_session(

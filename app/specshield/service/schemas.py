@@ -295,7 +295,8 @@ class SessionRequest(Strict):
     threshold: float = Field(
         1.0,
         gt=0.0,
-        description="delta, the least expected J of a step. Only 1 carries a guarantee: 0.99^150 is 0.22.",
+        description="delta, the least expected J of a step. The guarantee is for 1 with evaluation "
+        "`feasibility`: 0.99^150 is 0.22. With `robustness` it is in metres and guarantees nothing.",
     )
     margin: float = Field(
         0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
@@ -307,7 +308,11 @@ class SessionRequest(Strict):
         description="Steps to keep in hand: each F of the conjunction is met so much earlier, if it can be.",
     )
     evaluation: Literal["feasibility", "robustness"] = Field(
-        "feasibility", description="J is 1 or 0 (the rule can be kept or not), or the robustness itself."
+        "feasibility",
+        description="What J is: 1 or 0, for whether the rule can be kept (`feasibility`), or the robustness "
+        "itself (`robustness`). The latter keeps no more than its mean at `threshold`, so actions that break "
+        "the rule may keep some probability; where no action reaches the threshold, as often with 1 m, the "
+        "answer is a `fallback`: choose one that fits the rule.",
     )
     shaping: Literal["projection", "lookahead"] = Field("projection", description="How the prior is bent.")
     max_steps: int | None = Field(
