@@ -8,9 +8,12 @@ import sys
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from specshield.errors import SpecshieldError
+
+if TYPE_CHECKING:
+    from specshield.service.settings import Settings
 
 try:
     import typer
@@ -42,7 +45,9 @@ def main() -> None:
             "fastapi_offline",
             "uvicorn",
             "numba",
+            "pydantic",
             "pydantic_settings",
+            "redis",
             "rq",
         ):
             sys.exit(NEEDS_SERVER)
@@ -68,6 +73,7 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
+    _settings()  # what is wrong with them is said here, in one line
     # Of one process uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
     metrics = tempfile.TemporaryDirectory(prefix="specshield-metrics-") if workers > 1 else nullcontext()
     with metrics as folder:
@@ -89,19 +95,18 @@ def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
 ) -> None:
     """Make the policies and do the runs that are asked for, until stopped; policies that learn need torch."""
-    from specshield.service.settings import Settings
     from specshield.service.worker import serve as work
     from specshield.sim.jobs import QUEUE
 
-    work(Settings(), until_eof, [QUEUE])
+    work(_settings(), until_eof, [QUEUE])
 
 
 def openapi() -> None:
     """Print the API's description."""
     from specshield.service.app import create_app
-    from specshield.service.settings import Settings
+    from specshield.service.settings import read_settings
 
-    print(json.dumps(create_app(Settings()).openapi(), indent=1, sort_keys=True))
+    print(json.dumps(create_app(read_settings()).openapi(), indent=1, sort_keys=True))
 
 
 def demo(
@@ -181,6 +186,19 @@ def train(
     from specshield.sim import training
 
     raise typer.Exit(training.train(case, method, seed, updates, option or [], out, resume))
+
+
+def _settings() -> Settings:
+    """The settings, and a data folder that will do. Raises InputError and StoreError."""
+    from specshield.service.embedded import EmbeddedStore
+    from specshield.service.files import check_writable
+    from specshield.service.settings import read_settings
+
+    settings = read_settings()
+    check_writable(settings.data_dir, "SPECSHIELD_DATA_DIR")
+    if settings.redis_url is None:
+        EmbeddedStore(settings.data_dir)  # knows how long its path may be
+    return settings
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
-"""The command without its parts."""
+"""The command without its parts, and with settings that cannot be."""
 
+import os
 import subprocess
 import sys
 
@@ -32,3 +33,64 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
     assert run.returncode == 1
     assert told in run.stderr
     assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "environment", "told", "expected"),
+    [
+        (
+            "serve",
+            {"SPECSHIELD_MAX_SESSIONS": "abc"},
+            "SPECSHIELD_MAX_SESSIONS is not valid: 'abc'",
+            "integer",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_STORE_TIMEOUT": "0"},
+            "SPECSHIELD_STORE_TIMEOUT is not valid: '0'",
+            "greater than 0",
+        ),
+        ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
+        (
+            "serve",
+            {"REDIS_URL": "redis://:secret@host:port"},
+            "REDIS_URL is not valid",
+            "redis://127.0.0.1:6379/0",
+        ),
+        (
+            "worker",
+            {"SPECSHIELD_DATA_DIR": "{folder}/file"},
+            "SPECSHIELD_DATA_DIR cannot be used",
+            "a folder to write",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_DATA_DIR": "{folder}/file/in"},
+            "SPECSHIELD_DATA_DIR cannot be used",
+            "a folder to wr",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_DATA_DIR": "{folder}/" + "x" * 90},
+            "data folder's path is too long",
+            "87 bytes",
+        ),
+    ],
+)
+def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environment, told, expected):
+    (tmp_path / "file").touch()
+    given = {name: value.replace("{folder}", str(tmp_path)) for name, value in environment.items()}
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
+    run = subprocess.run(
+        [sys.executable, "-m", "specshield.cli", command],
+        env={**kept, **given},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert told in line
+    assert expected in line.partition("; expected ")[2]
+    assert "secret" not in line

@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from specshield.errors import LimitReached
+from specshield.errors import InputError, LimitReached
 
 HASH = re.compile(r"[0-9a-f]{64}")
 V = TypeVar("V")
@@ -22,6 +22,21 @@ V = TypeVar("V")
 
 def ids(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir() if HASH.fullmatch(entry.name))
+
+
+def check_writable(folder: Path, name: str) -> None:
+    """Raises InputError where the folder, which is there or is made, takes no files. name: of its setting."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{name} cannot be used: {folder}: {error.strerror}",
+            path=name,
+            got=str(folder),
+            expected="a folder to write to",
+        ) from error
 
 
 def read_json(path: Path) -> Any:

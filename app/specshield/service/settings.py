@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from pydantic import AliasChoices, Field, SecretStr
+from pydantic import AliasChoices, Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+from redis import ConnectionPool
+
+from specshield.errors import InputError
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 
@@ -59,6 +62,16 @@ class Settings(BaseSettings):
     )
     training_timeout: int = Field(default=6 * 3600, ge=1, description="Longest training run [s].")
 
+    @field_validator("redis_url")
+    @classmethod
+    def _is_a_store(cls, url: str | None) -> str | None:
+        try:
+            if url is not None:
+                ConnectionPool.from_url(url)  # opens nothing yet
+        except ValueError:
+            raise ValueError("a URL as redis://127.0.0.1:6379/0, rediss://... or unix:///path") from None
+        return url
+
     def environment(self) -> dict[str, str]:
         """The environment that gives a child process these same settings."""
         values = {f"SPECSHIELD_{name.upper()}": value for name, value in self if value is not None}
@@ -69,3 +82,19 @@ class Settings(BaseSettings):
             values["SPECSHIELD_API_KEY"] = self.api_key.get_secret_value()
         values["SPECSHIELD_DATA_DIR"] = self.data_dir.resolve()
         return {**os.environ, **{name: str(value) for name, value in values.items()}}
+
+
+def read_settings() -> Settings:
+    """Those of this process's environment. Raises InputError, which names the variable at fault."""
+    try:
+        return Settings()
+    except ValidationError as invalid:
+        wrong = invalid.errors(include_url=False)[0]
+        field = str(wrong["loc"][0]).lower()
+        name = "REDIS_URL" if field == "redis_url" else f"SPECSHIELD_{field.upper()}"
+        shown = "" if field == "redis_url" else f": {wrong['input']!r}"  # a URL may hold a password
+        raise InputError(
+            f"{name} is not valid{shown}",
+            path=name,
+            expected=wrong["msg"].removeprefix("Value error, ").removeprefix("Input should be "),
+        ) from None
