@@ -200,7 +200,7 @@ def test_with_a_model_that_wants_nothing_it_vanishes(drift):
         return wants + (0.0 if drift else noise) - 2.0 * idle
 
     _, _, given = drive(speak, 40)
-    assert all(belief.trust < 0.2 for belief, _ in given[32:])
+    assert all(belief.trust < 0.2 for belief, _ in given[30:])
     assert all(np.ptp(added) < 2.0 for _, added in given[20:])
 
 

@@ -25,7 +25,8 @@ SURE = 3.0  # observations that STYLE counts for
 KEEP = 0.97  # of the charges from one step to the next: models change their minds
 TRACK = 0.95  # of the record of predictions, likewise
 HABITS = 0.1  # how fast the running average of the model's motions follows
-DOUBT = 7.0  # [nats] by which habits may predict better, over the last 1 / (1 - TRACK) steps
+DOUBT = 6.0  # [nats] by which habits may predict better, over the last 1 / (1 - TRACK) steps
+WARY = 3.0  # of them before anything is seen
 SHARP = 20.0  # a KL is charged for a whole distribution, which tells more than one draw from it would
 POSSIBLE = 0.03  # of the leading goal's probability: goals below that are left out
 FLOOR = 0.03  # of the surrogate's mass is spread over all motions: no observation rules a goal out
@@ -81,7 +82,7 @@ class Belief:
 def begin(goals: int, motions: int) -> Belief:
     """Before the first observation."""
     habit = np.full(motions, 1.0 / motions)
-    return Belief(np.zeros(goals + 1), SURE * np.eye(FEATURES), SURE * STYLE, habit, 0.0)
+    return Belief(np.zeros(goals + 1), SURE * np.eye(FEATURES), SURE * STYLE, habit, WARY)
 
 
 def observe(
@@ -104,7 +105,9 @@ def observe(
     x, y, theta = (float(v) for v in pose)
     _charge(body, goals, belief.style, x, y, theta, blocked, said, log_said, end, charges)
     usual = float(said @ (log_said - np.log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
+    sided = _sided(body, said)  # one that wanders turns to either side, and which is no error
     excess = TRACK * belief.excess + float(belief.probabilities() @ charges) - usual
+    excess -= float(belief.probabilities()[-1]) * sided
     cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
     lead, features = int(np.argmin(cost[:-1])), np.empty((len(said), FEATURES))
     row, column = cell_of(body, goals.pitch, goals.distance.shape[1], goals.distance.shape[2], x, y)
@@ -121,6 +124,14 @@ def observe(
         (1.0 - HABITS) * belief.habit + HABITS * said,
         excess,
     )
+
+
+def _sided(body: Body, said: Floats) -> float:
+    """The KL of the motions said from the same with no side preferred to the other [nats]."""
+    alike = body.translate[:, None] == body.translate
+    mirrored = alike & (np.abs(body.rotate[:, None] + body.rotate) < 1e-9)
+    even = np.where(mirrored.any(axis=0), 0.5 * (said + mirrored @ said), said)
+    return float(said @ np.log(said / even))
 
 
 @kernel
