@@ -12,8 +12,20 @@ from specshield.policy.policy import read_tensors
 from specshield.robot import STRETCH
 from specshield.sim.cases import MODELS
 from specshield.sim.learned.measure import alone
-from specshield.sim.learned.model import CARD, FLOOR, FOLDER, WEIGHTS, load_learned, target_of
-from specshield.sim.learned.network import FEATURES, KINDS, NOTHING, SHAPES, WINDOW, Network, check
+from specshield.sim.learned.model import CARD, FOLDER, WEIGHTS, load_learned, target_of
+from specshield.sim.learned.network import (
+    FEATURES,
+    FLOOR,
+    KINDS,
+    NOTHING,
+    SHAPES,
+    WINDOW,
+    Network,
+    check,
+    decoded,
+    features,
+)
+from specshield.sim.learned.reckoning import Reckoning
 from specshield.sim.learned.transformer import Transformer, export
 from specshield.sim.model import make_model, softmax
 from specshield.sim.robot import SimulatedRobot
@@ -35,33 +47,75 @@ def random_network():
 @pytest.fixture(scope="module")
 def inputs():
     random = np.random.default_rng(0)
-    return random.normal(size=(STEPS, FEATURES)).astype(np.float32), random.integers(0, NOTHING + 1, STEPS)
+    x = random.normal(size=(STEPS, FEATURES)).astype(np.float32)
+    place = np.cumsum(random.normal(scale=0.2, size=(STEPS, 3)), axis=0).astype(np.float32)
+    return x, place, random.integers(0, NOTHING + 1, STEPS)
 
 
-def full_pass(network, x, last, kind):
+def full_pass(network, *steps, kind):
     with torch.no_grad():
-        return network(torch.from_numpy(x)[None], torch.from_numpy(last)[None], torch.tensor([kind]))[
-            0
-        ].numpy()
+        return network(*(torch.from_numpy(each)[None] for each in steps), torch.tensor([kind]))[0].numpy()
 
 
 def test_step_by_step_is_the_full_pass(random_network, inputs):
     """Beyond the window too, where old keys are written over; and again after a reset."""
-    x, last = inputs
-    expected, network = full_pass(random_network, x, last, 2), Network(export(random_network))
+    x, place, last = inputs
+    expected, network = full_pass(random_network, *inputs, kind=2), Network(export(random_network))
     for _ in range(2):
         network.reset()
-        steps = np.array([network.step(x[t], int(last[t]), 2) for t in range(STEPS)])
-        assert np.abs(steps - expected).max() < 1e-4
+        steps = np.array([network.step(x[t], place[t], int(last[t]), 2) for t in range(STEPS)])
+        assert np.abs(steps - expected).max() < 2e-4
+
+
+def test_practising_takes_the_same_steps(random_network, inputs):
+    expected = full_pass(random_network, *inputs, kind=2)
+    random_network.begin(1, STEPS)
+    kind = np.array([2])
+    steps = [random_network.logits(t, *(each[t : t + 1] for each in inputs), kind)[0] for t in range(STEPS)]
+    assert np.abs(np.array(steps) - expected).max() < 2e-4
 
 
 def test_what_comes_later_changes_nothing(random_network, inputs):
-    x, last = inputs
-    before, later = full_pass(random_network, x, last, 0), x.copy()
+    x, place, last = inputs
+    before, later = full_pass(random_network, *inputs, kind=0), x.copy()
     later[200:] += 1.0
-    after = full_pass(random_network, later, last, 0)
+    after = full_pass(random_network, later, place, last, kind=0)
     assert np.array_equal(before[:200], after[:200])
     assert not np.allclose(before[200:], after[200:])
+
+
+def test_where_it_began_changes_nothing(random_network, inputs):
+    """Only the way between two places counts: the same episode moved and turned as a whole."""
+    x, place, last = inputs
+    c, s = np.cos(0.7), np.sin(0.7)
+    moved = place @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (3.0, -2.0, 0.7)
+    assert full_pass(random_network, x, moved.astype(np.float32), last, kind=1) == pytest.approx(
+        full_pass(random_network, *inputs, kind=1), abs=1e-3
+    )
+
+
+def test_it_counts_where_it_has_come_from_its_actions_alone():
+    reckoning, ranges = Reckoning(1), np.full((1, 36), 2.0)
+    forward, right, left = (STRETCH.action_names.index(name) for name in ("m", "r", "l"))
+    for k, action in enumerate((NOTHING, forward, left, left, left, forward, right)):
+        reckoning.count(ranges + 0.1 * k, np.array([action]))
+    assert reckoning.place[0] == pytest.approx([0.2, 0.2, np.pi / 3])
+    assert not reckoning.futile.any()
+    for n in (1, 2):  # nothing changes in the scan: it has not moved
+        reckoning.count(ranges + 0.6, np.array([forward]))
+        assert reckoning.place[0] == pytest.approx([0.2, 0.2, np.pi / 3])
+        assert reckoning.futile[0, forward] == reckoning.futile.sum() == n
+    tired = decoded(np.zeros((1, 20), np.float32), np.array([forward]), reckoning.futile, 0.5)[0]
+    assert (tired[forward], tired[left], tired[STRETCH.action_names.index("b")]) == (-8.0, 0.0, -4.0)
+    reckoning.count(ranges, np.array([left]))
+    assert not reckoning.futile.any()
+
+
+def test_a_scan_is_as_from_the_heading_it_began_with():
+    senses = np.concatenate([np.random.default_rng(0).uniform(0.1, 6.0, 36), np.zeros(3)])
+    ahead, turned = features(senses, np.array(0.0)), features(senses, np.array(np.radians(30.0)))
+    assert turned[41:77] == pytest.approx(np.roll(ahead[:36], 3), abs=1e-5)  # to the left, three rays on
+    assert np.array_equal(ahead[:41], turned[:41])
 
 
 def test_the_last_action_and_the_past_matter(case):

@@ -8,8 +8,8 @@ from specshield.sim.learned.expert import END, IDLE
 from specshield.sim.learned.floor_plans import HABITS, random_house
 from specshield.sim.learned.network import KINDS
 from specshield.sim.learned.practice import Practice, make_apartments, sample
-from specshield.sim.learned.train import Settings, train
-from specshield.sim.learned.transformer import export, restore
+from specshield.sim.learned.train import ALONE, Settings, practise, train
+from specshield.sim.learned.transformer import Transformer, export, restore
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,21 @@ def test_interference_overrules_the_robot(houses):
     assert np.array_equal(practice.pose, before)
     practice.execute(np.full(40, 1))
     assert (practice.last == 1).all()
+
+
+def test_what_the_network_or_a_shield_drove_is_not_learned_from(houses):
+    practice = Practice(make_apartments(houses), 60, np.random.default_rng(3))
+    expert = practise(Transformer(), practice, 60, 0.0, np.random.default_rng(4))
+    left_alone = ~(practice.held | practice.steered)
+    assert 10 < left_alone.sum() < 50
+    assert expert.counts[left_alone, 0].all()
+    for i in np.nonzero(left_alone)[0]:
+        assert expert.counts[i, : expert.length[i]].all()
+    assert not expert.counts[~left_alone].all(axis=1).any()
+    mixed = practise(Transformer(), practice, 60, 1.0, np.random.default_rng(4))
+    learned, at_once = mixed.counts.sum(axis=1), ~mixed.counts[:, 0]
+    assert (learned <= 60 - ALONE[0])[at_once].all()
+    assert 15 < at_once.sum() < 60
 
 
 def test_a_training_learns_and_its_seed_decides_it(houses):

@@ -59,6 +59,7 @@ IN_THE_MIDDLE = {
     "LivingRoom": ((0.8, 1.3), (0.7, 1.2), 0.7),
     "Office": ((0.6, 0.8), (0.5, 0.7), 0.5),
 }
+STRAY = (0.4, 0.2)  # the chances of a chair or two anywhere: they leave niches in which there is no turning
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,8 @@ def random_house(random: np.random.Generator) -> House:
 
 
 def _furnished(random: np.random.Generator) -> House | None:
-    width, height = (round(random.uniform(7.5, 11.0), 1) for _ in range(2))
-    boxes = _cut((0.0, 0.0, width, height), int(random.integers(4, 8)), random)
+    width, height = (round(random.uniform(7.5, 12.0), 1) for _ in range(2))
+    boxes = _cut((0.0, 0.0, width, height), int(random.integers(4, 9)), random)
     walls = [
         (i, j, wall) for i in range(len(boxes)) for j in range(i) if (wall := _shared(boxes[i], boxes[j]))
     ]
@@ -236,6 +237,13 @@ def _furniture(room: Box, kind: str, doors: list[Box], random: np.random.Generat
                 w, d = random.uniform(*one), random.uniform(*other)
                 at_x, at_y = random.uniform(x0, x1), random.uniform(y0, y1)
                 if place("table", (at_x, at_y, at_x + w, at_y + d), 0.75):
+                    break
+    for chance in STRAY:
+        if random.random() < chance:
+            for _ in range(6):
+                w, d = random.uniform(0.3, 0.9, 2)
+                at_x, at_y = random.uniform(x0, x1), random.uniform(y0, y1)
+                if place("chair", (at_x, at_y, at_x + w, at_y + d), 0.0):
                     break
     return pieces
 

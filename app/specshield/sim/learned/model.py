@@ -1,8 +1,9 @@
 """The learned foundation model: it imitates shortest paths, as SPOC does, and knows no rule and no region.
 
 Egocentric only: a range scan, whether and where the target is seen, what it is told to find, and the action
-that was executed last, its own or not. What it remembers is its own. The weights that are shipped
-were trained in generated apartments alone; the card says how, and what was measured.
+that was executed last, its own or not. What it remembers is its own, and so is its count of where it has come
+since it began (reckoning.py). The weights that are shipped were trained in generated apartments alone; the
+card says how, and what was measured.
 """
 
 from __future__ import annotations
@@ -20,13 +21,11 @@ from numpy.typing import NDArray
 from specshield.errors import NotFound, PolicyError
 from specshield.policy.tensors import read_tensors
 from specshield.sim.cases import MODELS
-from specshield.sim.learned.network import KINDS, NOTHING, Array, Network, check, features
+from specshield.sim.learned.network import KINDS, NOTHING, Array, Network, check, decoded, features
+from specshield.sim.learned.reckoning import Reckoning
 from specshield.sim.robot import SimulatedRobot
 
 FOLDER, WEIGHTS, CARD = "fm", "model.safetensors", "model.json"  # in models/
-FLOOR = 16.0  # [nats] below the best logit is as unlikely as an action gets
-RELUCTANCE = 2.0  # [nats] to undo what was executed last: without it, it turns to and fro where it is unsure
-OPPOSITE = {0: 3, 3: 0, 1: 2, 2: 1, 6: 7, 7: 6}  # of the Stretch tokens m, b, r, l, ls, rs
 
 
 class LearnedModel:
@@ -34,23 +33,25 @@ class LearnedModel:
 
     def __init__(self, weights: Mapping[str, Array], target: str, temperature: float) -> None:
         self._network, self._kind, self._temperature = Network(weights), KINDS.index(target), temperature
+        self._reckoning = Reckoning(1)
 
     def reset(self, random: np.random.Generator) -> None:
         """Forgets the last episode. The model itself draws nothing."""
         self._network.reset()
+        self._reckoning = Reckoning(1)
 
     def logits(self, robot: SimulatedRobot) -> NDArray[np.float64]:
         """Finite logits (A,) of what to do next."""
         senses = robot.sense()
         seen = (float(senses.seen), senses.distance, senses.bearing)
         last = NOTHING if senses.last_action is None else senses.last_action
-        raw = self._network.step(features(np.array([*senses.ranges, *seen])), last, self._kind)
-        logits = raw.astype(np.float64)
-        if last in OPPOSITE:
-            logits[OPPOSITE[last]] -= RELUCTANCE
-        logits /= self._temperature
-        floored: NDArray[np.float64] = np.maximum(logits, logits.max() - FLOOR)
-        return floored
+        lasts = np.array([last])
+        self._reckoning.count(senses.ranges[None], lasts)
+        place = self._reckoning.place[0]
+        x = features(np.array([*senses.ranges, *seen]), place[2])
+        raw = self._network.step(x, place, last, self._kind)
+        out: NDArray[np.float64] = decoded(raw[None], lasts, self._reckoning.futile, self._temperature)[0]
+        return out
 
 
 def load_learned(instruction: str, folder: Path = MODELS / FOLDER) -> LearnedModel:

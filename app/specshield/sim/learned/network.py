@@ -1,8 +1,10 @@
 """The learned model's network without torch: a causal transformer, one step at a time, in NumPy.
 
-A step's input is what the robot senses, what it looks for, and the action that was executed last. Pre-norm
-blocks; attention over the last WINDOW steps, less to those longer ago (ALiBi: Press et al., 2022), so that
-nothing depends on the time as such; keys and values are kept from step to step.
+A step's input is what the robot senses, what it looks for, the action that was executed last, and where it
+has come to by its own count of its actions (reckoning.py). Pre-norm blocks; attention over the last WINDOW
+steps, less to those longer ago (ALiBi: Press et al., 2022) and, of some heads, to those farther away; beside
+their values it gives the way to where they were. Nothing depends on the time or the place as such. Keys and
+values are kept from step to step.
 """
 
 from __future__ import annotations
@@ -22,17 +24,28 @@ KINDS = ("bowl", "pan", "laptop", "pillow", "remote", "soap")
 ACTIONS = len(STRETCH.actions)
 NOTHING = ACTIONS  # the last action of a robot that has done nothing yet
 INPUTS = RAYS + 3  # ranges, seen, distance, bearing
-FEATURES = RAYS + 5
+FEATURES = 2 * RAYS + 7
 UNITS, LAYERS, WINDOW = 128, 3, 256
-SLOPES = (2.0**-2, 2.0**-4, 2.0**-6, 2.0**-8)  # of each head: what a step longer ago takes off its attention
+SLOPES = (2.0**-2, 2.0**-4, 2.0**-7, 2.0**-9)  # of each head: what a step longer ago takes off its attention
+FAR = (0.0, 0.0, 0.25, 2.0)  # of each head: what a metre between here and there takes off it
+SPAN = 5.0  # [m] a way to what is remembered is given as a share of this
+
+TEMPERATURE = 0.7  # as it is trained to drive, and shipped
+FLOOR = 16.0  # [nats] below the best logit is as unlikely as an action gets
+RELUCTANCE = 2.0  # [nats] to undo what was executed last: without it, it turns to and fro where it is unsure
+PATIENCE = 2.0  # [nats] to do once more what has changed nothing; as often as TIRED at most
+TIRED = 4
+OPPOSITE = np.array([3, 2, 1, 0, -1, -1, 7, 6, *[-1] * (ACTIONS - 7)])  # of each last action, -1 for none
 
 Array = NDArray[np.float32]
 
 
-def features(senses: NDArray[np.floating]) -> Array:
+def features(senses: NDArray[np.floating], heading: NDArray[np.floating]) -> Array:
     """What the network is given: ranges on a scale from 0 to 1, finest nearby, and where the target is seen.
 
-    senses [..., INPUTS]: ranges [m], seen (0 or 1), distance [m], bearing [rad]. Result [..., FEATURES].
+    The ranges are given once more as from the heading it began with, and its heading beside them: what it
+    sees of a place is then like what it saw there before. senses [..., INPUTS]: ranges [m], seen (0 or 1),
+    distance [m], bearing [rad]. heading [...]: as it counts it [rad]. Result [..., FEATURES].
     """
     seen, distance, bearing = senses[..., RAYS], senses[..., RAYS + 1], senses[..., RAYS + 2]
     ranges = np.log1p(senses[..., :RAYS] / 0.25) / np.log1p(REACH / 0.25)
@@ -40,7 +53,28 @@ def features(senses: NDArray[np.floating]) -> Array:
         [np.ones_like(seen), distance / SIGHT, np.exp(-distance), np.cos(bearing), np.sin(bearing)], -1
     )
     target *= seen[..., None]
-    return np.concatenate([ranges, target], axis=-1).astype(np.float32)
+    ray = np.arange(RAYS) - heading[..., None] * (RAYS / (2.0 * np.pi))
+    low = np.floor(ray)
+    share = ray - low
+    first = low.astype(np.int64) % RAYS
+    turned = (1.0 - share) * np.take_along_axis(ranges, first, -1) + share * np.take_along_axis(
+        ranges, (first + 1) % RAYS, -1
+    )
+    compass = np.stack([np.cos(heading), np.sin(heading)], -1)
+    return np.concatenate([ranges, target, turned, compass], axis=-1).astype(np.float32)
+
+
+def decoded(
+    raw: Array, last: NDArray[np.int64], futile: NDArray[np.int64], temperature: float
+) -> NDArray[np.float64]:
+    """The logits that are drawn from, [N, A]. raw [N, A]; last [N]; futile [N, A + 1]: as reckoned."""
+    logits = raw - PATIENCE * np.minimum(futile[:, :ACTIONS], TIRED)
+    undo = OPPOSITE[last]
+    some = np.nonzero(undo >= 0)[0]
+    logits[some, undo[some]] -= RELUCTANCE
+    logits /= temperature
+    floored: NDArray[np.float64] = np.maximum(logits, logits.max(axis=1, keepdims=True) - FLOOR)
+    return floored
 
 
 def _shapes() -> dict[str, tuple[int, ...]]:
@@ -52,7 +86,7 @@ def _shapes() -> dict[str, tuple[int, ...]]:
     }  # fmt: skip
     for i in range(LAYERS):
         for name, inputs, outputs in (
-            ("qkv", UNITS, 3 * UNITS), ("out", UNITS, UNITS),
+            ("qkv", UNITS, 3 * UNITS), ("out", UNITS + 2 * len(SLOPES), UNITS),
             ("up", UNITS, 4 * UNITS), ("down", 4 * UNITS, UNITS),
         ):  # fmt: skip
             shapes[f"{i}.{name}.w"], shapes[f"{i}.{name}.b"] = (inputs, outputs), (outputs,)
@@ -94,6 +128,7 @@ class Network:
             (LAYERS, heads, WINDOW, UNITS // heads), np.float32
         )  # step t in slot t % WINDOW
         self._values = np.zeros_like(self._keys)
+        self._places = np.zeros((WINDOW, 2), np.float32)
         # Of slot s when step t is in slot r: -slope * ((r - s) % WINDOW), as a row to cut from.
         ago = (WINDOW - 1 - np.arange(2 * WINDOW - 1)) % WINDOW
         self._bias = (-np.array(SLOPES)[:, None] * ago).astype(np.float32)
@@ -102,12 +137,18 @@ class Network:
     def reset(self) -> None:
         self._t = 0
 
-    def step(self, x: Array, last: int, kind: int) -> Array:
-        """Logits (ACTIONS,) of the next step. x (FEATURES,); last, kind: tokens."""
+    def step(self, x: Array, place: NDArray[np.floating], last: int, kind: int) -> Array:
+        """Logits (ACTIONS,) of the next step. x (FEATURES,); place (3,), as counted; last, kind: tokens."""
         w, heads = self._w, len(SLOPES)
         slot, held = self._t % WINDOW, min(self._t + 1, WINDOW)
         bias = self._bias[:, WINDOW - 1 - slot : WINDOW - 1 - slot + held]
         scale = np.float32((UNITS // heads) ** -0.5)
+        self._places[slot] = place[:2]
+        ways = self._places[:held] - self._places[slot]
+        cos, sin = np.cos(place[2]), np.sin(place[2])
+        ways = ways @ np.array([[cos, -sin], [sin, cos]], np.float32)  # as from the robot
+        bias = bias - np.array(FAR, np.float32)[:, None] * np.hypot(ways[:, 0], ways[:, 1])
+        ways /= SPAN
         h = np.maximum(x @ w["sense1.w"] + w["sense1.b"], 0.0) @ w["sense2.w"] + w["sense2.b"]
         h = h + w["last"][last] + w["kind"][kind]
         for i in range(LAYERS):
@@ -118,6 +159,7 @@ class Network:
             attention = np.exp(attention - attention.max(axis=1, keepdims=True))
             attention /= attention.sum(axis=1, keepdims=True)
             a = (attention[:, None] @ self._values[i, :, :held]).reshape(UNITS)
+            a = np.concatenate([a, (attention @ ways).reshape(-1)])
             h = h + a @ w[f"{i}.out.w"] + w[f"{i}.out.b"]
             n = _norm(h, w[f"{i}.norm2.w"], w[f"{i}.norm2.b"])
             up = np.maximum(n @ w[f"{i}.up.w"] + w[f"{i}.up.b"], 0.0)

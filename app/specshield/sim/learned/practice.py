@@ -1,8 +1,8 @@
 """Many robots at once that practise finding targets in apartments: what they sense, and what the expert says.
 
 The expert takes shortest paths: to the target once the robot has seen it; before, to the nearest room that
-has not been looked at yet, where the target's own room counts as nearer than it is. What it says follows from
-what the robot has seen, so it can be imitated by one that has no map.
+has been in sight but not been looked at yet, rather one ahead than one behind. What it says follows from what
+the robot has seen, so it can be imitated by one that has no map.
 
 In some episodes the robot is interfered with, as a shield would: held where it is, or steered towards
 something else for tens of steps, or its actions fail at random. The expert says what to do from where it is.
@@ -21,7 +21,7 @@ from specshield.compiled import kernel, leaf
 from specshield.robot import STRETCH
 from specshield.robot.unicycle import Body, in_collision, make_body, step
 from specshield.sim.apartments import Box
-from specshield.sim.learned.expert import END, END_WITHIN, IDLE, OFF, advise, ways
+from specshield.sim.learned.expert import END, END_WITHIN, IDLE, OFF, advise, bearing_of_way, ways
 from specshield.sim.learned.floor_plans import House
 from specshield.sim.learned.network import ACTIONS, INPUTS, KINDS, NOTHING
 from specshield.sim.senses import FIELD_OF_VIEW, RAYS, SIGHT, cast, scan, see
@@ -31,8 +31,9 @@ ROOMS = 8  # of a house, at most
 PATCH = 5  # [cells] side of the squares in which is kept what has been looked at
 LOOKED_AT = 0.7  # share of a room's floor that is enough
 THERE = 0.35  # [m] from a room's middle: turn and look
-OWN_ROOM = 2.0  # [m] that the target's room counts nearer
+UNNOTICED = 100.0  # [m] more than any way: rooms of which nothing has been in sight come last
 STAY = 0.5  # [m] nearer that another room has to be for a change of mind
+TURN = 1.5  # [m] that a radian to turn counts: it goes on with the way on which it is
 
 
 class Apartments(NamedTuple):
@@ -116,6 +117,7 @@ class Practice:
         self.advice = np.zeros((robots, ACTIONS), np.float32)
         self.detour = np.zeros((robots, ACTIONS), np.float32)
         self.looked_at = np.zeros((robots, patches, patches), np.uint8)
+        self.noticed = np.zeros((robots, ROOMS), np.uint8)  # a part of the room has been in sight
         self.goal = np.zeros(robots, np.int64)  # an index into `ways`
 
     def reset(self, chances: Sequence[float]) -> None:
@@ -137,17 +139,18 @@ class Practice:
         kinds = random.choice(3, n, p=[0.5, 0.1, 0.4])
         self.held, self.steered = kinds == 1, kinds == 2
         self.begin = random.integers(0, 40, n) + np.array([[0], [80]])
-        self.length = random.integers(5, 60, (2, n))
+        self.length = random.integers(5, 80, (2, n))
         self.slips = random.choice([0.0, 0.03, 0.15], n, p=[0.5, 0.3, 0.2])
         self.looked_at[:] = 0
+        self.noticed[:] = 0
         self.goal[:] = -1
         self._look()
 
     def execute(self, actions: NDArray[np.int64]) -> None:
         """Each robot's wish (N,), where nothing interferes; an `end` counts where the expert ends too."""
         random, n = self.random, len(actions)
-        during = ((self.t >= self.begin) & (self.t < self.begin + self.length)).any(axis=0)
-        ended = (actions == END) & (self.advice[:, END] > 0.5) & ~(during & (self.held | self.steered))
+        during = self.interfered
+        ended = (actions == END) & (self.advice[:, END] > 0.5) & ~during
         executed = np.where(actions == END, IDLE, actions)
         executed = np.where(during & self.steered, sample(self.detour, random), executed)
         executed = np.where(during & self.held, IDLE, executed)
@@ -159,10 +162,18 @@ class Practice:
         self.t += 1
         self._look()
 
+    @property
+    def interfered(self) -> NDArray[np.bool_]:
+        """[N] whether it is held or steered at this step."""
+        during: NDArray[np.bool_] = (
+            (self.t >= self.begin) & (self.t < self.begin + self.length) & (self.held | self.steered)
+        ).any(axis=0)
+        return during
+
     def _look(self) -> None:
         _look(
             self.apartments, STRETCH.representative, self.house, self.kind, self.other, self.done, self.pose,
-            self.looked_at, self.goal, self.senses, self.advice, self.detour,
+            self.looked_at, self.noticed, self.goal, self.senses, self.advice, self.detour,
         )  # fmt: skip
 
 
@@ -223,12 +234,46 @@ def _mark(body: Body, x: float, y: float, theta: float, looked_at: NDArray[np.ui
             gone += 0.5 * patch
 
 
+@leaf
+def _notice(
+    body: Body,
+    x: float,
+    y: float,
+    theta: float,
+    ranges: NDArray[np.float64],
+    room_of: NDArray[np.int8],
+    noticed: NDArray[np.uint8],
+) -> None:
+    """Marks the rooms that the scan reaches into."""
+    patch = PATCH * body.resolution
+    for k in range(ranges.shape[0]):
+        angle = theta + 2.0 * math.pi * k / ranges.shape[0]
+        c, s, gone = math.cos(angle), math.sin(angle), 0.0
+        while gone < ranges[k]:
+            room = room_of[math.floor((y + gone * s) / patch), math.floor((x + gone * c) / patch)]
+            if room >= 0:
+                noticed[room] = 1
+            gone += 0.5 * patch
+
+
 @kernel
 def _next_room(
-    a: Apartments, house: int, kind: int, goal: int, row: int, col: int, looked_at: NDArray[np.uint8]
+    a: Apartments,
+    house: int,
+    kind: int,
+    goal: int,
+    x: float,
+    y: float,
+    theta: float,
+    looked_at: NDArray[np.uint8],
+    noticed: NDArray[np.uint8],
 ) -> int:
-    """The room to look at next, as an index into `ways`; the target where its room has been looked at."""
-    first = a.targets.shape[1]
+    """The room to look at next, as an index into `ways`; the target where its room has been looked at.
+
+    One of which something has been in sight, if there is any: the way that is shortest, turns included.
+    """
+    first, own = a.targets.shape[1], _body(a, house)
+    row, col = math.floor(y / own.resolution), math.floor(x / own.resolution)
     count = np.zeros(a.floor.shape[1], np.int64)
     for i in range(looked_at.shape[0]):
         for j in range(looked_at.shape[1]):
@@ -241,9 +286,10 @@ def _next_room(
             return kind
         if enough:
             continue
-        cost = a.ways[house, first + r, row, col] % OFF
-        if r == a.home[house, kind]:
-            cost -= OWN_ROOM
+        way = a.ways[house, first + r]
+        cost = way[row, col] % OFF + TURN * abs(bearing_of_way(own, way, x, y, theta))
+        if noticed[r] == 0:
+            cost += UNNOTICED
         if first + r == goal:
             cost -= STAY
         if cost < best:
@@ -261,6 +307,7 @@ def _look(
     done: NDArray[np.bool_],
     pose: NDArray[np.float64],
     looked_at: NDArray[np.uint8],
+    noticed: NDArray[np.uint8],
     goal: NDArray[np.int64],
     senses: NDArray[np.float32],
     advice: NDArray[np.float32],
@@ -278,10 +325,11 @@ def _look(
         senses[n, RAYS], senses[n, RAYS + 1], senses[n, RAYS + 2] = 1.0 if seen else 0.0, distance, bearing
         row, col = math.floor(y / own.resolution), math.floor(x / own.resolution)
         _mark(own, x, y, theta, looked_at[n])
+        _notice(own, x, y, theta, ranges, a.room_of[i], noticed[n])
         if seen:
             goal[n] = kind[n]
         elif goal[n] != kind[n]:
-            goal[n] = _next_room(a, i, kind[n], goal[n], row, col, looked_at[n])
+            goal[n] = _next_room(a, i, kind[n], goal[n], x, y, theta, looked_at[n], noticed[n])
         near = seen and distance < END_WITHIN
         there = goal[n] != kind[n] and a.ways[i, goal[n], row, col] < THERE
         advise(own, representative, a.ways[i, goal[n]], x, y, theta, near, there, advice[n])

@@ -1,8 +1,10 @@
 """Training of the learned foundation model: imitation of shortest paths, in rounds.
 
-Each round the robots practise in random apartments, each driven by the expert or by what has been learned so
-far (DAgger: Ross et al., 2011), and the network learns the expert's answers to all that they met, of this
-round and of recent ones.
+Each round the robots practise in random apartments, of this round and of recent ones the network learns what
+the expert did. In a share of the episodes the network drives first, and where it has got to the expert takes
+over: the network learns to go on from where its own mistakes lead. What the expert would have done in their
+midst is not learned (as in DAgger: Ross et al., 2011). The expert knows the map: what it is up to often shows
+in its last actions alone, and a network that does not find them in its past learns to waver.
 """
 
 from __future__ import annotations
@@ -16,33 +18,37 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import softmax
 from torch import nn
 from torch.nn import functional
 
 from specshield.sim.learned.expert import END
 from specshield.sim.learned.floor_plans import House, random_house
-from specshield.sim.learned.network import ACTIONS, FEATURES, KINDS, features
+from specshield.sim.learned.network import ACTIONS, FEATURES, KINDS, TEMPERATURE, decoded, features
 from specshield.sim.learned.practice import Practice, make_apartments, sample
+from specshield.sim.learned.reckoning import Reckoning
 from specshield.sim.learned.transformer import Transformer
+from specshield.sim.senses import RAYS
 
 CHANCES = (0.25, 0.25, *([0.125] * (len(KINDS) - 2)))  # of each kind: two of them are kept in kitchens
 
-
+ALONE = (10, 250)  # steps that it drives before the expert takes over,
+LATEST = 80  # half of the time from the first on, else from one before this
 WRONG_END = 3.0  # what an `end` at the wrong place costs, beside the imitation
 
 
 @dataclass(frozen=True)
 class Settings:
-    houses: int = 250
-    rounds: int = 380
+    houses: int = 400
+    rounds: int = 400
     robots: int = 64  # episodes a round
-    steps: int = 256  # of an episode, at most
+    steps: int = 320  # of an episode, at most
     passes: int = 2  # over as many episodes as a round has, drawn from the recent ones
     recent: int = 20  # rounds
     batch: int = 8  # episodes
     learning_rate: float = 1e-3
     given: float = 0.25  # share of the episodes in given apartments, where there are any
-    own: float = 0.8  # share of the episodes that the network drives itself, from a third of the rounds on
+    own: float = 0.5  # share of the episodes that the network drives first, from a third of the rounds on
 
     def to_json(self) -> dict[str, float]:
         return asdict(self)
@@ -50,37 +56,53 @@ class Settings:
 
 @dataclass
 class Episodes:
-    """Of one round: x [N, T, FEATURES] float32, last [N, T], kind [N], advice [N, T, A], length [N]."""
+    """Of one round: x [N, T, FEATURES], place [N, T, 3], last [N, T], kind [N], advice [N, T, A], length [N].
+
+    counts [N, T]: what is learned from, the steps that the expert drove.
+    """
 
     x: NDArray[np.float32]
+    place: NDArray[np.float32]
     last: NDArray[np.int64]
     kind: NDArray[np.int64]
     advice: NDArray[np.float32]
+    counts: NDArray[np.bool_]
     length: NDArray[np.int64]
 
 
 def practise(
     network: Transformer, practice: Practice, steps: int, own: float, random: np.random.Generator
 ) -> Episodes:
-    """One round: each robot is driven by the network with chance `own`, else by the expert."""
+    """One round: the expert drives, and with chance `own` the network does for a while before."""
     practice.reset(CHANCES)
     n = len(practice.pose)
-    driven = random.random(n) < own
+    begin = np.where(random.random(n) < 0.5, 0, random.integers(0, LATEST, n))
+    until = np.where(random.random(n) < own, begin + random.integers(*ALONE, n), 0)
     out = Episodes(
-        np.zeros((n, steps, FEATURES), np.float32), np.zeros((n, steps), np.int64), practice.kind.copy(),
-        np.zeros((n, steps, ACTIONS), np.float32), np.full(n, steps),
+        np.zeros((n, steps, FEATURES), np.float32), np.zeros((n, steps, 3), np.float32),
+        np.zeros((n, steps), np.int64), practice.kind.copy(), np.zeros((n, steps, ACTIONS), np.float32),
+        np.zeros((n, steps), np.bool_), np.full(n, steps),
     )  # fmt: skip
-    busy = np.nonzero(driven)[0]  # whom the network drives, and who is not done
+    busy = np.nonzero(until)[0]  # whom the network will have driven, and who is not done
     network.begin(len(busy), steps)
+    reckoning = Reckoning(n)
     for t in range(steps):
-        out.x[:, t], out.last[:, t] = features(practice.senses), practice.last
+        reckoning.count(practice.senses[:, :RAYS], practice.last)
+        out.place[:, t], out.last[:, t] = reckoning.place, practice.last
+        out.x[:, t] = features(practice.senses, reckoning.place[:, 2])
         out.advice[:, t] = practice.advice
         wish = practice.advice.copy()
-        if t % 16 == 0 and practice.done[busy].any():
-            network.keep(torch.from_numpy(~practice.done[busy]))
-            busy = busy[~practice.done[busy]]
+        if t % 8 == 0 and len(busy):
+            these = ~practice.done[busy] & (until[busy] > t)
+            network.keep(torch.from_numpy(these))
+            busy = busy[these]
+        driven = (t >= begin) & (t < until)
+        out.counts[:, t] = ~driven & ~practice.interfered
         if len(busy):
-            wish[busy] = network.distribution(t, out.x[busy, t], practice.last[busy], practice.kind[busy])
+            last = practice.last[busy]
+            raw = network.logits(t, out.x[busy, t], out.place[busy, t], last, practice.kind[busy])
+            its = softmax(decoded(raw, last, reckoning.futile[busy], TEMPERATURE), axis=1)
+            wish[busy] = np.where(driven[busy, None], its, wish[busy])
         before = practice.done.copy()
         practice.execute(sample(wish, random))
         out.length[practice.done & ~before] = t + 1
@@ -177,15 +199,18 @@ def _batches(
 def _learn(network: Transformer, optimizer: torch.optim.Optimizer, batch: Batch) -> float:
     """One update on some episodes; the loss, in nats a step."""
     longest = max(int(e.length[i]) for e, i in batch)
-    x, last, advice = (
+    x, place, last, advice = (
         torch.from_numpy(np.stack([getattr(e, name)[i, :longest] for e, i in batch]))
-        for name in ("x", "last", "advice")
+        for name in ("x", "place", "last", "advice")
     )
     kind = torch.tensor([int(e.kind[i]) for e, i in batch])
     length = torch.tensor([int(e.length[i]) for e, i in batch])
     valid = torch.arange(longest)[None] < length[:, None]
+    valid &= torch.from_numpy(np.stack([e.counts[i, :longest] for e, i in batch]))
+    if not valid.any():
+        return 0.0
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        logits = network(x, last, kind)
+        logits = network(x, place, last, kind)
     logp = functional.log_softmax(logits.float()[valid], -1)
     advice = advice[valid]
     loss = -(advice * logp).sum(-1).mean()

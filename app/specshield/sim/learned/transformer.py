@@ -9,15 +9,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import nn
-from torch.nn import functional
 
 from specshield.sim.learned.network import (
     ACTIONS,
+    FAR,
     FEATURES,
     KINDS,
     LAYERS,
     NOTHING,
     SLOPES,
+    SPAN,
     UNITS,
     WINDOW,
     Array,
@@ -40,12 +41,15 @@ class Transformer(nn.Module):
         out: torch.Tensor = self.sense2(torch.relu(self.sense1(x))) + self.last(last) + self.kind(kind)
         return out
 
-    def forward(self, x: torch.Tensor, last: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
-        """x [B, T, FEATURES], last [B, T], kind [B]; logits [B, T, A]."""
+    def forward(
+        self, x: torch.Tensor, place: torch.Tensor, last: torch.Tensor, kind: torch.Tensor
+    ) -> torch.Tensor:
+        """x [B, T, FEATURES], place [B, T, 3], last [B, T], kind [B]; logits [B, T, A]."""
         h = self.embed(x, last, kind[:, None])
-        bias = biases(x.shape[1])
+        far = torch.cdist(place[..., :2], place[..., :2])
+        bias = biases(x.shape[1]) - torch.tensor(FAR)[:, None, None] * far[:, None]
         for block in self.blocks:
-            h = block(h, bias)
+            h = block(h, place, bias)
         out: torch.Tensor = self.head(self.norm(h))
         return out
 
@@ -53,25 +57,33 @@ class Transformer(nn.Module):
         """Empties the cache."""
         shape = (robots, len(SLOPES), steps, UNITS // len(SLOPES))
         self.cache = [(torch.zeros(shape), torch.zeros(shape)) for _ in self.blocks]
+        self.places = torch.zeros(robots, steps, 2)
         self.bias = biases(steps)
 
     def keep(self, these: torch.Tensor) -> None:
         """Goes on with some of the robots: bool [B]."""
         self.cache = [(keys[these], values[these]) for keys, values in self.cache]
+        self.places = self.places[these]
 
     @torch.no_grad()
-    def distribution(
-        self, t: int, x: Array, last: NDArray[np.int64], kind: NDArray[np.int64]
-    ) -> NDArray[np.float32]:
-        """Probabilities [B, A] of step t; x [B, FEATURES]."""
-        out: NDArray[np.float32] = self.step(t, *map(torch.from_numpy, (x, last, kind))).softmax(-1).numpy()
+    def logits(
+        self, t: int, x: Array, place: Array, last: NDArray[np.int64], kind: NDArray[np.int64]
+    ) -> Array:
+        """Logits [B, A] of step t; x [B, FEATURES], place [B, 3]."""
+        out: Array = self.step(t, *map(torch.from_numpy, (x, place, last, kind))).numpy()
         return out
 
-    def step(self, t: int, x: torch.Tensor, last: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
-        """Logits [B, A] of step t; x [B, FEATURES]."""
+    def step(
+        self, t: int, x: torch.Tensor, place: torch.Tensor, last: torch.Tensor, kind: torch.Tensor
+    ) -> torch.Tensor:
+        """Logits [B, A] of step t; x [B, FEATURES], place [B, 3]."""
         h = self.embed(x, last, kind)
+        self.places[:, t] = place[:, :2]
+        ways = egocentric(self.places[:, : t + 1] - place[:, None, :2], place[:, None, 2])
+        far = torch.hypot(ways[..., 0], ways[..., 1])
+        bias = self.bias[:, t, : t + 1] - torch.tensor(FAR)[:, None] * far[:, None]
         for block, (keys, values) in zip(self.blocks, self.cache, strict=True):
-            h = cast(Block, block).step(t, h, keys, values, self.bias[:, t, : t + 1])
+            h = cast(Block, block).step(t, h, keys, values, ways / SPAN, bias)
         out: torch.Tensor = self.head(self.norm(h))
         return out
 
@@ -80,30 +92,47 @@ class Block(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.norm1, self.norm2 = nn.LayerNorm(UNITS), nn.LayerNorm(UNITS)
-        self.qkv, self.out = nn.Linear(UNITS, 3 * UNITS), nn.Linear(UNITS, UNITS)
+        self.qkv, self.out = nn.Linear(UNITS, 3 * UNITS), nn.Linear(UNITS + 2 * len(SLOPES), UNITS)
         self.up, self.down = nn.Linear(UNITS, 4 * UNITS), nn.Linear(4 * UNITS, UNITS)
 
-    def forward(self, h: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    def forward(self, h: torch.Tensor, place: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
         b, t, d = h.shape
         q, k, v = self.qkv(self.norm1(h)).view(b, t, 3, len(SLOPES), -1).permute(2, 0, 3, 1, 4)
-        a = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias)
-        h = h + self.out(a.transpose(1, 2).reshape(b, t, d))
+        weights = ((q @ k.transpose(-1, -2)) * q.shape[-1] ** -0.5 + bias).softmax(-1)
+        a = (weights.to(v.dtype) @ v).transpose(1, 2).reshape(b, t, d)
+        there = (weights @ place[:, None, :, :2]).transpose(1, 2)  # [B, T, heads, 2]
+        ways = egocentric(there - place[:, :, None, :2], place[:, :, None, 2]) / SPAN
+        h = h + self.out(torch.cat([a, ways.reshape(b, t, -1).to(a.dtype)], -1))
         return h + self._mlp(h)
 
     def step(
-        self, t: int, h: torch.Tensor, keys: torch.Tensor, values: torch.Tensor, bias: torch.Tensor
+        self,
+        t: int,
+        h: torch.Tensor,
+        keys: torch.Tensor,
+        values: torch.Tensor,
+        ways: torch.Tensor,
+        bias: torch.Tensor,
     ) -> torch.Tensor:
         b, d = h.shape
         q, k, v = self.qkv(self.norm1(h)).view(b, 3, len(SLOPES), -1).unbind(1)
         keys[:, :, t], values[:, :, t] = k, v
         weights = (keys[:, :, : t + 1] @ q[..., None])[..., 0] / q.shape[-1] ** 0.5 + bias
-        a = weights.softmax(-1)[:, :, None] @ values[:, :, : t + 1]
-        h = h + self.out(a.reshape(b, d))
+        weights = weights.softmax(-1)[:, :, None]
+        a = weights @ values[:, :, : t + 1]
+        there = weights @ ways[:, None]
+        h = h + self.out(torch.cat([a.reshape(b, d), there.reshape(b, -1)], -1))
         return h + self._mlp(h)
 
     def _mlp(self, h: torch.Tensor) -> torch.Tensor:
         out: torch.Tensor = self.down(torch.relu(self.up(self.norm2(h))))
         return out
+
+
+def egocentric(ways: torch.Tensor, heading: torch.Tensor) -> torch.Tensor:
+    """Ways [..., 2] as from the robot: ahead, to the left."""
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    return torch.stack([cos * ways[..., 0] + sin * ways[..., 1], cos * ways[..., 1] - sin * ways[..., 0]], -1)
 
 
 def biases(steps: int) -> torch.Tensor:
