@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from specshield import errors
-from specshield.client import AsyncShieldClient, ShieldClient
+from specshield.client import AsyncShieldClient, Decision, ShieldClient
 
 pytest.importorskip("specshield.service.app", reason="needs the service")
+from specshield.service.schemas import StepResponse
 
 
 @pytest.fixture
@@ -71,6 +72,15 @@ def test_the_loop_of_the_readme_keeps_the_rule(client, case):
         if decision.spec_status == "pending":
             assert decision.execute != end
             assert decision.completion_action is not None
+    client.sessions.delete(session.id)
+
+
+def test_nothing_of_an_answer_is_lost(client):
+    assert set(StepResponse.model_fields) <= {field.name for field in dataclasses.fields(Decision)}
+    session, pose = begin(client)
+    assert session.step(pose, model(session, 0)).in_collision is False
+    xmin, ymin, _, _ = client.maps.get("case1").bounds
+    assert session.step((xmin, ymin, 0.0), model(session, 0)).in_collision is True
     client.sessions.delete(session.id)
 
 

@@ -114,6 +114,37 @@ def test_a_closed_port_is_a_transport_error(use):
         use(url, validate)
 
 
+@pytest.mark.parametrize("url", ["127.0.0.1:8000", "localhost", "http://", "ftp://robot", "http://a:b", ""])
+def test_an_address_that_is_none_is_refused_at_once(use, url):
+    with pytest.raises(errors.InputError) as caught:
+        use(url, validate)
+    assert (caught.value.path, caught.value.got) == ("base_url", url)
+
+
+@pytest.mark.parametrize("key", ["ключ", "abc\n", " abc", ""])
+def test_a_key_that_cannot_be_sent_is_refused_at_once(use, key):
+    handler, seen = failing()
+    with pytest.raises(errors.InputError) as caught:
+        use(handler, validate, api_key=key)
+    assert caught.value.path == "api_key"
+    assert seen == []
+
+
+def test_a_closed_client_says_so():
+    with ShieldClient("http://robot.test") as client:
+        pass
+    with pytest.raises(errors.TransportError, match="closed"):
+        validate(client)
+
+    async def after():
+        async with AsyncShieldClient("http://robot.test") as client:
+            pass
+        await validate(client)
+
+    with pytest.raises(errors.TransportError, match="closed"):
+        asyncio.run(after())
+
+
 def test_what_goes_over_the_wire(use):
     handler, seen = failing()
     use(handler, validate, api_key="secret", timeout=0.25)

@@ -35,6 +35,7 @@ def decided(t, action, status="pending", **members):
         "kl": 0.1,
         "reason": None,
         "finished": False,
+        "in_collision": False,
         "next_poses": [[0.2, 0, 0], [-0.2, 0, 0], [0, 0, 0]],
         "residual": None,
         "witness": [M, M],

@@ -102,6 +102,12 @@ def test_bad_logits_are_refused_before_anything_is_sent(bad):
     assert caught.value.expected
 
 
+def test_the_path_of_a_bad_logit_is_the_servers():
+    with pytest.raises(errors.LogitsError) as caught:
+        wire.logit_values([0.0, math.nan])
+    assert caught.value.path == "logits[1]"
+
+
 @pytest.mark.parametrize("bad", [(0, 0), (0, 0, 0, 0), (0, 0, math.nan), (0, 0, None), (0, 0, "north"), None])
 def test_bad_poses_are_refused(bad):
     with pytest.raises(errors.PoseError):
@@ -128,23 +134,35 @@ def test_bodies_take_arrays_and_refuse_what_json_cannot_hold():
         wire.encode({"data": np.array([0, 100, -1], dtype=np.int8), "centre": (np.float64(0.5), 1)})
     )
     assert body == {"data": [0, 100, -1], "centre": [0.5, 1]}
-    with pytest.raises(errors.InputError):
-        wire.encode({"x": math.nan})
-    with pytest.raises(errors.InputError):
-        wire.encode({"x": object()})
+    deep = []
+    for _ in range(100_000):
+        deep = [deep]
+    for bad in (math.nan, [1, math.inf], object(), deep):
+        with pytest.raises(errors.InputError) as caught:
+            wire.encode({"fine": 1.0, "x": bad})
+        assert (caught.value.path, bool(caught.value.expected)) == ("x", True)
 
 
 def test_content_is_bytes_a_text_or_a_file(tmp_path: Path):
     (tmp_path / "map.yaml").write_text("resolution: 0.05")
     assert (
-        wire.content(tmp_path / "map.yaml")
-        == wire.content("resolution: 0.05")
-        == wire.content(b"resolution: 0.05")
+        wire.content(tmp_path / "map.yaml", "metadata")
+        == wire.content("resolution: 0.05", "metadata")
+        == wire.content(b"resolution: 0.05", "metadata")
     )
+    with pytest.raises(errors.InputError, match=r"none\.pgm") as caught:
+        wire.content(tmp_path / "none.pgm", "image")
+    assert caught.value.path == "image"
 
 
 def test_an_id_cannot_leave_its_place_in_the_path():
     assert wire.path("maps", "../policies?x=1", "image.png") == "/v1/maps/..%2Fpolicies%3Fx%3D1/image.png"
+
+    for id in ("", ".", "..", None):
+        with pytest.raises(errors.InputError) as caught:
+            wire.path("sessions", id)
+        assert caught.value.path == "id"
+    assert wire.path("maps", "\ud800") == "/v1/maps/%3F"
 
 
 def test_server_timing():

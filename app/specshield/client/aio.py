@@ -15,7 +15,7 @@ from specshield.client import core
 from specshield.client.core import Flow, Wait
 from specshield.client.models import Decision, Map, Policy, SessionInfo, Spec, TrajectoryItem, Verdict
 from specshield.client.state import SessionState
-from specshield.client.transport import allowed, arguments, failure, headers, reply
+from specshield.client.transport import address, allowed, arguments, check_open, failure, headers, reply
 from specshield.client.wire import TRIES, Content, Failure, Logits, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
@@ -38,7 +38,9 @@ class AsyncShieldClient:
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
-        self._http = httpx.AsyncClient(base_url=base_url, headers=headers(api_key), transport=transport)
+        self._http = httpx.AsyncClient(
+            base_url=address(base_url), headers=headers(api_key), transport=transport
+        )
         self.specs = AsyncSpecs(self._run)
         self.maps = AsyncMaps(self._run)
         self.policies = AsyncPolicies(self._run)
@@ -66,6 +68,7 @@ class AsyncShieldClient:
             return cast(T, stop.value)
 
     async def _perform(self, request: Request) -> Reply | Failure:
+        check_open(self._http)
         start, limit = time.monotonic(), allowed(request, self._timeout)
         try:
             response = await self._http.request(**arguments(request, self._timeout))

@@ -123,8 +123,8 @@ def validate(
 
 def upload_map(metadata: Content, image: Content) -> Flow[Map]:
     files = {
-        "metadata": ("map.yaml", content(metadata), "application/yaml"),
-        "image": ("map", content(image), "application/octet-stream"),
+        "metadata": ("map.yaml", content(metadata, "metadata"), "application/yaml"),
+        "image": ("map", content(image, "image"), "application/octet-stream"),
     }
     return build(Map, (yield from call(Request("POST", path("maps"), files=files, slow=True))))
 
@@ -166,10 +166,10 @@ def create_policy(
 
 def upload_policy(weights: Content, card: Content | Mapping[str, Any]) -> Flow[Policy]:
     files = {
-        "weights": ("policy.safetensors", content(weights), "application/octet-stream"),
+        "weights": ("policy.safetensors", content(weights, "weights"), "application/octet-stream"),
         "card": (
             "card.json",
-            encode(card) if isinstance(card, Mapping) else content(card),
+            encode(card) if isinstance(card, Mapping) else content(card, "card"),
             "application/json",
         ),
     }

@@ -103,6 +103,7 @@ class Decision:
     kl: float | None
     reason: str | None
     finished: bool
+    in_collision: bool  # x_t touches an obstacle
     next_poses: tuple[Pose, ...]
     residual: Residual | None
     witness: tuple[int, ...] | None  # the actions that follow `action` to the horizon

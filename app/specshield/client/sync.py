@@ -14,7 +14,7 @@ from specshield.client import core
 from specshield.client.core import Flow, Wait
 from specshield.client.models import Decision, Map, Policy, SessionInfo, Spec, TrajectoryItem, Verdict
 from specshield.client.state import SessionState
-from specshield.client.transport import allowed, arguments, failure, headers, reply
+from specshield.client.transport import address, allowed, arguments, check_open, failure, headers, reply
 from specshield.client.wire import TRIES, Content, Failure, Logits, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
@@ -42,7 +42,7 @@ class ShieldClient:
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
-        self._http = httpx.Client(base_url=base_url, headers=headers(api_key), transport=transport)
+        self._http = httpx.Client(base_url=address(base_url), headers=headers(api_key), transport=transport)
         self.specs = Specs(self._run)
         self.maps = Maps(self._run)
         self.policies = Policies(self._run)
@@ -70,6 +70,7 @@ class ShieldClient:
             return cast(T, stop.value)
 
     def _perform(self, request: Request) -> Reply | Failure:
+        check_open(self._http)
         start, limit = time.monotonic(), allowed(request, self._timeout)
         try:
             response = self._http.request(**arguments(request, self._timeout))

@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import httpx
 
 from specshield.client.wire import Failure, Reply, Request
-from specshield.errors import TransportError, TransportTimeout
+from specshield.errors import InputError, TransportError, TransportTimeout
 
 PREPARING = 30.0  # s at least for what prepares something: a map, a policy, a session
 
 
+def address(base_url: str) -> httpx.URL:
+    """InputError unless it is the address of a server."""
+    try:
+        url = httpx.URL(base_url)
+    except httpx.InvalidURL:
+        url = httpx.URL("")
+    if url.scheme not in ("http", "https") or not url.host:
+        raise InputError(
+            "not the address of a server",
+            path="base_url",
+            got=base_url,
+            expected="http://host:port or https://host:port",
+        )
+    return url
+
+
 def headers(api_key: str | None) -> dict[str, str]:
+    """InputError for a key that no header can carry."""
+    if api_key is not None and not re.fullmatch(r"[!-~]([ -~]*[!-~])?", api_key):
+        raise InputError(
+            "the key cannot be sent", path="api_key", expected="ASCII without control characters"
+        )
     return {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
 
 
@@ -32,6 +54,11 @@ def arguments(request: Request, timeout: float) -> dict[str, Any]:
         "headers": None if request.body is None else {"Content-Type": "application/json"},
         "timeout": httpx.Timeout(allowed(request, timeout), connect=timeout),
     }
+
+
+def check_open(http: httpx.Client | httpx.AsyncClient) -> None:
+    if http.is_closed:
+        raise TransportError("the client is closed", expected="a client that is not")
 
 
 def reply(response: httpx.Response, seconds: float, timeout: float) -> Reply:

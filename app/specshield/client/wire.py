@@ -83,15 +83,36 @@ def post(*segments: str, body: Mapping[str, Any], slow: bool = False, tries: int
 
 
 def path(*segments: str) -> str:
-    return "/v1/" + "/".join(quote(segment, safe="") for segment in segments)
+    """InputError for an id that would lead elsewhere: an empty one, `.` or `..`."""
+    for segment in segments:
+        if not isinstance(segment, str) or segment in ("", ".", ".."):
+            raise InputError("not an id", path="id", got=segment, expected="an id as the server gives them")
+    return "/v1/" + "/".join(quote(segment, safe="", errors="replace") for segment in segments)
 
 
 def encode(body: Mapping[str, Any]) -> bytes:
     """JSON; arrays become lists. InputError for what JSON cannot hold (NaN, infinity, other objects)."""
     try:
-        return json.dumps(body, allow_nan=False, separators=(",", ":"), default=_listed).encode()
-    except (TypeError, ValueError) as error:
-        raise InputError(f"cannot be sent as JSON: {error}") from error
+        return _json(body)
+    except (TypeError, ValueError, RecursionError) as error:
+        name = next((name for name, value in body.items() if not _is_json(value)), "body")
+        raise InputError(
+            f"{name}: cannot be sent as JSON: {error}",
+            path=name,
+            expected="finite numbers, texts, lists and objects of them",
+        ) from error
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":"), default=_listed).encode()
+
+
+def _is_json(value: Any) -> bool:
+    try:
+        _json(value)
+    except (TypeError, ValueError, RecursionError):
+        return False
+    return True
 
 
 def _listed(value: Any) -> Any:
@@ -100,10 +121,15 @@ def _listed(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is not JSON")
 
 
-def content(source: Content) -> bytes:
-    """The bytes of a file (a path object), of a text, or as given."""
+def content(source: Content, where: str) -> bytes:
+    """The bytes of a file (a path object), of a text, or as given. InputError where a file cannot be read."""
     if isinstance(source, os.PathLike):
-        return Path(source).read_bytes()
+        try:
+            return Path(source).read_bytes()
+        except OSError as error:
+            raise InputError(
+                f"{where}: {error}", path=where, got=str(source), expected="a file that can be read"
+            ) from error
     return source.encode() if isinstance(source, str) else source
 
 
@@ -122,7 +148,7 @@ def logit_values(logits: Logits) -> list[float | None]:
         if math.isnan(value) or value == math.inf:
             raise LogitsError(
                 f"logit {i} is {value}",
-                path=f"logits.{i}",
+                path=f"logits[{i}]",
                 got=str(value),
                 expected="a finite number, -inf or None",
             )
