@@ -358,6 +358,7 @@ def test_a_long_list_of_errors_stays_a_list(client, begin):
     response = client.post("/v1/policies", files=policy_files() | {"card": b"{}"})
     listed = Problem.model_validate(problem(response, 422, "invalid-input", "card.map_id")).errors
     assert len(listed) == 8
+    assert all(error.path.startswith("card.") for error in listed)
     assert len(client.post("/v1/specs/validate", json={"formula": "x > 1", "y" * 5000: 1}).text) < 2000
 
 

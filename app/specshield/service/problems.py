@@ -88,13 +88,20 @@ def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -
     return Response(json.dumps(document(error)), status, extra, media_type=MEDIA_TYPE)
 
 
-def from_validation(found: Sequence[Mapping[str, Any]], body: Any) -> InputError:
-    """One error for everything a schema refused: the first in its own words, all of them in `errors`."""
+def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = "") -> InputError:
+    """One error for everything a schema refused: the first in its own words, all of them in `errors`.
+
+    below: the field that the body is, where it is one part of what was sent.
+    """
     if found[0]["type"] == "json_invalid":
         reason = found[0].get("ctx", {}).get("error", "")
         return InputError(f"the body is not JSON: {reason}", expected="a JSON object")
     listed = [
-        {"path": _path(item, body)[:200], "got": plain(item.get("input")), "expected": _expected(item)}
+        {
+            "path": ".".join(filter(None, (below, _path(item, body)[:200]))),
+            "got": plain(item.get("input")),
+            "expected": _expected(item),
+        }
         for item in found[:20]
     ]
     first = listed[0]

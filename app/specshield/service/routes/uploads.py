@@ -39,8 +39,7 @@ def parse(adapter: TypeAdapter[T], content: bytes, below: str = "") -> T:
         return adapter.validate_json(content)
     except ValidationError as invalid:
         found = [{**item, "loc": ("body", *item["loc"])} for item in invalid.errors(include_url=False)]
-        error = from_validation(found, _body(content))
-        raise error.at(below) if below else error from None
+        raise from_validation(found, _body(content), below) from None
 
 
 def _body(content: bytes) -> Any:
