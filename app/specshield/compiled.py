@@ -1,19 +1,36 @@
-"""How kernels are compiled: cached on disk, without the interpreter's lock, never fastmath."""
+"""How kernels are compiled: cached on disk, without the interpreter's lock, never fastmath.
+
+numba keeps what it compiled under the file of the function alone. A kernel made of others would go on with
+what they were before they changed, and an upgrade with old code: so each module's kernels have a folder of
+their own, named after its source and that of all it imports from here.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
+import shutil
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
 
 njit: Any = numba.njit  # its types leave out the option below
+config: Any = numba.config
 F = TypeVar("F", bound=Callable[..., Any])
+PACKAGE = Path(__file__).parent
+IMPORTED = re.compile(
+    r"^ *(?:from|import) +(specshield[\w.]*)(?: +import +(\([^)]*\)|[^\n]*))?", re.MULTILINE
+)
+BASE = config.CACHE_DIR or (str(PACKAGE / "__pycache__") if os.access(PACKAGE, os.W_OK) else "")
 
 
 def kernel(function: F) -> F:
     """A compiled function that may allocate."""
-    compiled: F = njit(cache=True, nogil=True)(function)
+    compiled: F = _cached(function, {"nogil": True})
     return compiled
 
 
@@ -43,8 +60,56 @@ def merged(function: F) -> F:
 
 
 def _leaf(function: F, **options: bool) -> F:
+    fast = {"nogil": True, "error_model": "numpy", **options}
     try:
-        compiled: F = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, **options)(function)
+        compiled: F = _cached(function, {**fast, "_nrt": False})
     except (KeyError, TypeError):
-        compiled = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        compiled = _cached(function, fast)
     return compiled
+
+
+def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    before = config.CACHE_DIR
+    if BASE and function.__module__.startswith("specshield."):
+        config.CACHE_DIR = _folder(function.__module__) or before
+    try:
+        return njit(cache=True, **options)(function)
+    finally:
+        config.CACHE_DIR = before
+
+
+@cache
+def _folder(module: str) -> str | None:
+    """Where a module's kernels are kept, None where it cannot be; what was kept of an older source goes."""
+    found, to_see = set[Path](), [module]
+    while to_see:
+        file = _file(to_see.pop())
+        if file is not None and file not in found:
+            found.add(file)
+            to_see += _read(file)[1]
+    digest = hashlib.sha256(b"".join(_read(file)[0] for file in sorted(found))).hexdigest()[:16]
+    own = Path(BASE) / module / digest
+    if not own.exists():
+        for old in own.parent.glob("*"):
+            shutil.rmtree(old, ignore_errors=True)
+        try:
+            own.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return None
+    return str(own)
+
+
+@cache
+def _read(file: Path) -> tuple[bytes, list[str]]:
+    """A file's hash, and the modules (and members of modules) of this package that it imports."""
+    content, names = file.read_bytes(), list[str]()
+    for module, members in IMPORTED.findall(content.decode()):
+        names += [module, *(f"{module}.{member}" for member in re.findall(r"\w+", members))]
+    return hashlib.sha256(content).digest(), names
+
+
+@cache
+def _file(module: str) -> Path | None:
+    path = PACKAGE.joinpath(*module.split(".")[1:])
+    options = (path.with_suffix(".py"), path / "__init__.py")
+    return next((file for file in options if file.is_file()), None)
