@@ -20,9 +20,9 @@ from tests.serving import wait_for
 
 from specshield.errors import InputError, NotFound, StoreError
 from specshield.service.embedded import EmbeddedStore
-from specshield.sim import calibration
+from specshield.sim import calibration, results
 from specshield.sim.cases import load_case
-from specshield.sim.evaluation import evaluate
+from specshield.sim.evaluation import evaluate, read
 from specshield.sim.experiment import Experiment
 from specshield.sim.houses import HOUSES, RULE
 from specshield.sim.jobs import QUEUE
@@ -83,6 +83,16 @@ def test_processes_and_a_second_go_make_the_same_records(serial, tmp_path):
     assert same(evaluate(EXPERIMENT, 2, METHODS, tmp_path)) == same(serial[:4])
     with pytest.raises(InputError):
         evaluate(Experiment("case1", seed=6), 1, METHODS, tmp_path)
+
+
+def test_a_method_named_twice_is_run_once_and_counts_once(serial, tmp_path):
+    again = evaluate(EXPERIMENT, RUNS, ["unmodified", "ours@0.03/8", "unmodified"], tmp_path)
+    assert same(again) == same(serial)
+    path = tmp_path / "runs.jsonl"
+    assert len(path.read_text().splitlines()) == RUNS * len(METHODS)
+    path.write_text(path.read_text() * 2)
+    assert same(read(tmp_path)) == same(serial)
+    assert [one["runs"] for one in results.write(tmp_path)["methods"]] == [RUNS, RUNS]
 
 
 def test_a_margin_is_calibrated_on_other_runs_and_kept(monkeypatch, tmp_path):

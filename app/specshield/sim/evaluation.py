@@ -28,12 +28,13 @@ def evaluate(
     redis_url: str | None = None,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> list[Record]:
-    """The records of `runs` runs by each method, by run and then by method.
+    """The records of `runs` runs by each method, by run and then by method; one named twice counts once.
 
     folder: finished runs are kept there as they come, those that are there already are not made again.
     processes: 1 is this one. redis_url: where job workers take the runs from instead. on_progress: how many
     runs are finished. Raises InputError where `folder` holds another experiment.
     """
+    methods = list(dict.fromkeys(methods))
     done = {} if folder is None else _open(folder, experiment)
     missing = {i: left for i in range(runs) if (left := [name for name in methods if (i, name) not in done])}
     on_progress(runs - len(missing))
@@ -100,11 +101,11 @@ def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]
     return {(record.run, record.method): record for record in read(folder)}
 
 
-def read(folder: Path) -> Iterator[Record]:
-    """The records kept in a folder."""
+def read(folder: Path) -> list[Record]:
+    """The records kept in a folder, one a run and method: the last."""
     with open(folder / "runs.jsonl") as lines:
-        for line in lines:
-            yield Record.from_json(json.loads(line))
+        records = [Record.from_json(json.loads(line)) for line in lines]
+    return list({(record.run, record.method): record for record in records}.values())
 
 
 def _keep(folder: Path, records: Sequence[Record]) -> None:

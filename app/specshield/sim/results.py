@@ -49,7 +49,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
 def write(folder: Path) -> dict[str, Any]:
     """Writes results.json and table.md beside the records of an experiment."""
     experiment = Experiment.from_json(json.loads((folder / "experiment.json").read_text()))
-    figures = results(experiment, list(read(folder)))
+    figures = results(experiment, read(folder))
     (folder / "results.json").write_text(json.dumps(figures, indent=1) + "\n")
     (folder / "table.md").write_text(table(figures) + "\n")
     return figures

@@ -72,7 +72,7 @@ def write_up(folder: Path, page: Path) -> None:
         )  # fmt: skip
     beside = page.with_suffix("")
     drawn = {
-        kept: figures.draw(_case(results), list(read(kept)), beside / results["case"])
+        kept: figures.draw(_case(results), read(kept), beside / results["case"])
         for kept, results in found.items()
         if results["experiment"]["noise"] == "none"
     }
