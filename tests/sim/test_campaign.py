@@ -79,6 +79,14 @@ def test_the_table_and_the_json_say_what_happened(campaign):
     json.dumps([episode.to_json() for episode in campaign.shielded])
 
 
+def test_a_pair_that_ended_at_once_is_counted(campaign):
+    at_once, later = (
+        dataclasses.replace(campaign.shielded[0], main_done=True, ended_at=end) for end in (0, 7)
+    )
+    pairs = dataclasses.replace(campaign, shielded=[later, at_once, at_once], unshielded=[at_once] * 3)
+    assert report.summary(pairs)["with_shield"]["extra_steps"] == 0.0  # of 7, 0 and 0
+
+
 def test_a_broken_rule_is_noticed(campaign):
     broken = dataclasses.replace(campaign.shielded[0], spec_status="violated")
     assert not dataclasses.replace(campaign, shielded=[broken]).kept

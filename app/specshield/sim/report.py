@@ -10,6 +10,7 @@ import numpy as np
 
 from specshield.sim.campaign import Campaign
 from specshield.sim.episodes import Episode
+from specshield.sim.statistics import extra_steps
 
 MODES = ("shaped", "completion", "prior", "fallback", "violated")
 
@@ -22,10 +23,8 @@ def summary(campaign: Campaign) -> dict[str, Any]:
     spread: of the decisions made while the rule was pending and the main task ran, the share that was
     `shaped` and left the model more than one action. round_trip_ms, server_ms: of one decision.
     """
-    shielded, pairs = campaign.shielded, zip(campaign.shielded, campaign.unshielded, strict=True)
-    extra = [
-        s.ended_at - u.ended_at for s, u in pairs if s.main_done and u.main_done and s.ended_at and u.ended_at
-    ]
+    shielded = campaign.shielded
+    extra = extra_steps(zip(shielded, campaign.unshielded, strict=True))
     kl = [value for episode in shielded for value in episode.kl]
     asked = sum(episode.asked for episode in shielded)
     return {

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from specshield.sim.episodes import Episode
 from specshield.sim.runs import Record
 
 MODES = ("shaped", "switched", "completion", "prior", "fallback", "violated")  # of decisions
@@ -29,12 +30,7 @@ def summary(method: str, records: Sequence[Record], unmodified: Sequence[Record]
     the `both` runs that did the main task both times. broken: runs by the conjunct that was not kept.
     never_ended, ended_elsewhere: why the main task was not done. feasible_mass: mean over decisions.
     """
-    pairs = zip(records, unmodified, strict=True) if unmodified else ()
-    later = [
-        record.ended_at - plain.ended_at
-        for record, plain in pairs
-        if record.main_done and plain.main_done and record.ended_at is not None and plain.ended_at is not None
-    ]
+    later = extra_steps(zip(records, unmodified, strict=True)) if unmodified else []
     masses = [mass for record in records for mass in record.mass if mass is not None]
     return {
         "method": method,
@@ -60,6 +56,15 @@ def summary(method: str, records: Sequence[Record], unmodified: Sequence[Record]
             for name in ("p50", "p99")
         },
     }
+
+
+def extra_steps(pairs: Iterable[tuple[Record, Record] | tuple[Episode, Episode]]) -> list[int]:
+    """How much later the model ended in the first of each pair, of those in which both did the main task."""
+    return [
+        one.ended_at - other.ended_at
+        for one, other in pairs
+        if one.main_done and other.main_done and one.ended_at is not None and other.ended_at is not None
+    ]
 
 
 def _share(outcomes: Iterable[bool]) -> dict[str, Any]:
