@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 import redis
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
@@ -60,6 +61,23 @@ def test_what_was_acknowledged_survives_the_kill_of_store_and_server(tmp_path):
         assert [step(client, session, t).content for t in range(4)] == answers
         assert client.get(f"/v1/sessions/{session['id']}").json()["next_t"] == 4
         assert step(client, session, 4).status_code == 200
+
+
+def test_a_session_that_looks_ahead_goes_on_at_once_after_a_restart(tmp_path):
+    """Projection, which is as safe, while another process prepares: seconds, for an apartment."""
+    logits = np.linspace(-2.0, 2.0, 20)
+    asked = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0], "shaping": "lookahead"}
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=120.0) as client:
+        session = client.post("/v1/sessions", json=asked).json()
+        server.kill()
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=120.0) as client:
+        body = {"t": 0, "poses": [asked["initial_pose"]], "logits": logits.tolist()}
+        answer = client.post(f"/v1/sessions/{session['id']}/steps", json=body).json()
+    moves = np.arange(20) != 4
+    prior = np.exp(logits) / np.exp(logits).sum()
+    kept = prior * moves * (np.array(answer["j_values"]) == 1.0)
+    expected = np.where(moves, kept * (1.0 - prior[4]) / kept.sum(), prior)
+    np.testing.assert_allclose(answer["distribution"], expected, atol=1e-9)
 
 
 def test_the_store_ends_with_its_keeper(tmp_path):

@@ -9,7 +9,7 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from typing import Any, TypeVar
@@ -40,6 +40,7 @@ from specshield.service.settings import Settings
 from specshield.service.store import Change, Record, Store
 from specshield.shield import episode
 from specshield.shield.decision import Carry, Config, Decision, Shield, make_shield
+from specshield.shield.lookahead import AHEADS
 
 R = TypeVar("R")
 RACES = 10  # writes lost to others before a caller is told so
@@ -53,6 +54,8 @@ class Sessions:
         self._settings, self._store, self._policies = settings, store, policies
         self._shields = files.Recent[Shield](settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
+        self._ahead = files.Recent[Future[None]](AHEADS)
+        self._preparing = ThreadPoolExecutor(1, "prepare")
 
     async def create(self, request: SessionRequest) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
@@ -68,7 +71,10 @@ class Sessions:
             expected = f"at most {self._settings.max_steps}"
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
         records = [self._policies.record(key) for key in request.policies]
-        shield = self._shield([record.id for record in records], Config(**settings))
+        ids = [record.id for record in records]
+        shield = self._shield(ids, Config(**settings))
+        if shield.config.shaping == "lookahead":
+            self._prepare(ids, shield, np.array([request.initial_pose])).result()
         feasible = True
         try:
             episode.start(shield, request.initial_pose)
@@ -82,7 +88,7 @@ class Sessions:
         status, _ = episode.close(shield, rows[:, :3], columns(rows, signals))
         config = {
             "id": request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
-            "policy_ids": [record.id for record in records],
+            "policy_ids": ids,
             "map_id": about.map_id,
             "spec": {
                 "formula": str(task.formula),
@@ -152,6 +158,10 @@ class Sessions:
         if request.logits is not None:
             logits = [-np.inf if value is None else value for value in request.logits]
         carry = None if session.state.carry is None else Carry.from_json(session.state.carry)
+        if shield.config.shaping == "lookahead":  # projection, until it is prepared in this process too
+            prepared = self._prepare(session.config["policy_ids"], shield, session.poses[-1:])
+            if not prepared.done() or prepared.exception() is not None:
+                shield = replace(shield, config=replace(shield.config, shaping="projection"))
         with _clock(timing, "rollout"):
             decision = episode.decide(
                 shield,
@@ -247,6 +257,12 @@ class Sessions:
             return make_shield([self._policies.policy(self._policies.record(id)) for id in policy_ids])
 
         return replace(self._shields.get(tuple(policy_ids), make), config=config)
+
+    def _prepare(self, policy_ids: Sequence[str], shield: Shield, poses: Floats) -> Future[None]:
+        """The look-ahead of a task takes seconds: it is prepared beside the decisions, one at a time."""
+        return self._ahead.get(
+            tuple(policy_ids), lambda: self._preparing.submit(episode.prepare_ahead, shield, poses)
+        )
 
     async def _run(self, function: Callable[..., R], *args: Any) -> R:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)

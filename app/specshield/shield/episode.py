@@ -210,6 +210,15 @@ def look_ahead(shield: Shield) -> LookAhead:
     return prepare(shield.task, computed[0] if computed else None)
 
 
+def prepare_ahead(shield: Shield, poses: Floats) -> None:
+    """`look_ahead`, and the kernels that its first step needs. poses [1, 3]: some pose of the robot's."""
+    ahead, robot = look_ahead(shield), shield.task.robot
+    signals = {name: np.array([value]) for name, value in shield.task.signals.items()}
+    ahead.step(
+        ahead.begin(), _history(poses), signals, np.full(len(robot.actions), -math.log(len(robot.actions)))
+    )
+
+
 def _unmodified(shield: Shield, log_prior: Floats | None) -> _Answer:
     """The prior; without logits there is nothing left to do: `end`, or else the first action."""
     if log_prior is not None:

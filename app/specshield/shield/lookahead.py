@@ -33,6 +33,7 @@ from specshield.task import Task
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+AHEADS = 8  # tasks kept prepared in a process
 PRICE = 0.4  # [nats] of a step while the rule is pending: the model's own task waits
 LEAD_GAP = 1.0  # [m] along free space between the places that have a table
 WORK = 200_000_000  # entries solved for a task, at most, where that leaves a few places
@@ -112,7 +113,7 @@ class LookAhead:
         return result
 
 
-@lru_cache(maxsize=8)
+@lru_cache(AHEADS)
 def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
     """The look-ahead for a task; `policy`: one made for it, if there is any.
 
