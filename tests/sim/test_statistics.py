@@ -48,5 +48,7 @@ def test_a_summary_pairs_the_runs_with_the_unmodified_ones():
     assert figures["modes"] == {"shaped": 23, "fallback": 1}
     assert figures["reasons"] == {"infeasible": 1}
     assert (figures["kl"], figures["feasible_mass"], figures["residual"]) == (3.0, 0.75, 0.04)
-    assert summary("ours", ours, [])["extra_steps"]["mean"] is None
+    assert figures["common"] == {"runs": 3, "main_done": 2, "unmodified": 2}
+    alone = summary("ours", ours, [])
+    assert (alone["extra_steps"]["mean"], alone["common"]["runs"]) == (None, 0)
     assert Record.from_json(ours[1].to_json()) == ours[1]

@@ -16,19 +16,18 @@ from specshield.sim.statistics import summary
 def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]:
     """The figures of every method in `records`, as JSON. refused: starts drawn before those that would do.
 
-    left: the steps of a run that the rule leaves after its horizon, and in how many runs the model,
+    left: the steps of a run that the rule leaves after its horizon, and in how many of its runs the model,
     unmodified, does its task in as many.
     """
     by_method: dict[str, list[Record]] = {}
-    for record in records:
+    for record in sorted(records, key=lambda r: r.run):
         by_method.setdefault(record.method, []).append(record)
     runs = sorted({record.run for record in records})
     ranked = sorted(by_method, key=lambda name: METHODS.index(split(name)[0]))
-    complete = {name: sorted(by_method[name], key=lambda r: r.run) for name in ranked}
-    plain = {record.run: record for record in complete.get("unmodified", [])}
+    plain = by_method.get("unmodified", [])
     case = experiment.setting.case
     left = MAX_STEPS - case.task.horizon
-    in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain.values()]
+    in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain]
     return {
         "experiment": experiment.to_json(),
         "case": case.name,
@@ -36,13 +35,8 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
         "instruction": case.instruction,
         "runs": len(runs),
         "refused_starts": sum({record.run: record.refused for record in records}.values()),
-        "left": {"steps": left, "done": sum(in_time)},
-        "methods": [
-            summary(
-                name, found, [plain[r.run] for r in found] if plain.keys() >= {r.run for r in found} else []
-            )
-            for name, found in complete.items()
-        ],
+        "left": {"steps": left, "done": sum(in_time), "of": len(plain)},
+        "methods": [summary(name, by_method[name], plain) for name in ranked],
     }
 
 

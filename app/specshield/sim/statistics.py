@@ -25,12 +25,15 @@ def clopper_pearson(k: int, n: int) -> tuple[float, float]:
 def summary(method: str, records: Sequence[Record], unmodified: Sequence[Record]) -> dict[str, Any]:
     """The figures of one method, as JSON.
 
-    unmodified: the records of the same runs without any method, empty where there are none. kl: mean over
-    the runs of the sum along a run [nats]. extra_steps: how much later the model ended than unmodified, over
-    the `both` runs that did the main task both times. broken: runs by the conjunct that was not kept.
-    never_ended, ended_elsewhere: why the main task was not done. feasible_mass: mean over decisions.
+    unmodified: the records without any method. common: the runs that both have, and in how many of them each
+    did the main task; extra_steps: how much later the model ended than unmodified, over the `both` of them in
+    which both did. kl: mean over the runs of the sum along a run [nats]. broken: runs by the conjunct that
+    was not kept. never_ended, ended_elsewhere: why the main task was not done. feasible_mass: mean over
+    decisions.
     """
-    later = extra_steps(zip(records, unmodified, strict=True)) if unmodified else []
+    plain = {record.run: record for record in unmodified}
+    common = [(record, plain[record.run]) for record in records if record.run in plain]
+    later = extra_steps(common)
     masses = [mass for record in records for mass in record.mass if mass is not None]
     return {
         "method": method,
@@ -42,6 +45,11 @@ def summary(method: str, records: Sequence[Record], unmodified: Sequence[Record]
         "broken": dict(Counter(part for record in records for part in record.broken)),
         "rho_median": _rounded(np.median([record.rho for record in records])),
         "kl": _rounded(np.mean([record.kl for record in records])),
+        "common": {
+            "runs": len(common),
+            "main_done": sum(record.main_done for record, _ in common),
+            "unmodified": sum(beside.main_done for _, beside in common),
+        },
         "extra_steps": {
             "both": len(later),
             "mean": _rounded(np.mean(later)) if later else None,

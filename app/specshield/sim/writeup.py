@@ -155,7 +155,6 @@ def _beside(cases: Iterable[Results]) -> str:
 def _short(results: Results) -> str:
     """What each method did not keep, and why main tasks were not done."""
     lines = []
-    plain = next((one for one in results["methods"] if one["method"] == "unmodified"), None)
     for one in results["methods"]:
         parts = []
         if one["broken"]:
@@ -167,15 +166,18 @@ def _short(results: Results) -> str:
                 f"main task not done in {missed}: never ended {one['never_ended']}, ended elsewhere "
                 f"{one['ended_elsewhere']}"
             )
-        if plain is not None and split(one["method"])[0] in CERTIFYING:
-            points = 100 * (plain["main_done"]["count"] - one["main_done"]["count"]) / one["runs"]
-            parts.append(f"main task {points:+.1f} points below unmodified")
+        common = one["common"]
+        if common["runs"] and split(one["method"])[0] in CERTIFYING:
+            points = 100 * (common["unmodified"] - common["main_done"]) / common["runs"]
+            over = "" if common["runs"] == one["runs"] else f" over the {common['runs']} runs that both have"
+            parts.append(f"main task {points:+.1f} points below unmodified{over}")
         if parts:
             lines.append(f"- {one['method']}: {'; '.join(parts)}.")
-    if plain is not None:
+    left = results["left"]
+    if left["of"]:
         lines.append(
-            f"- A rule may keep the model till its horizon; in the {results['left']['steps']} steps that are "
-            f"then left, unmodified does its task in {results['left']['done']} of {results['runs']} runs."
+            f"- A rule may keep the model till its horizon; in the {left['steps']} steps that are then left, "
+            f"unmodified does its task in {left['done']} of {left['of']} runs."
         )
     return "\n".join(lines)
 
@@ -229,9 +231,10 @@ def _commands(found: Iterable[Results]) -> Iterator[str]:
     for results in found:
         about = results["experiment"]
         case = f"house --house {about['house']}" if about["house"] else results["case"]
-        methods = ",".join(one["method"] for one in results["methods"])
-        yield (
-            f"specshield evaluate --case {case} --runs {results['runs']} --seed {about['seed']} "
-            f"--model {about['model']} --noise {about['noise']} --methods {methods} --out out/results"
-        )
+        for runs in dict.fromkeys(one["runs"] for one in results["methods"]):
+            methods = ",".join(one["method"] for one in results["methods"] if one["runs"] == runs)
+            yield (
+                f"specshield evaluate --case {case} --runs {runs} --seed {about['seed']} "
+                f"--model {about['model']} --noise {about['noise']} --methods {methods} --out out/results"
+            )
     yield "specshield report out/results"

@@ -1,0 +1,42 @@
+"""The page and its figures, from records made by hand."""
+
+import json
+
+import pytest
+
+pytest.importorskip("matplotlib")
+
+from specshield.sim import writeup
+from specshield.sim.experiment import Experiment
+from specshield.sim.runs import Record
+
+
+def record(run, method, **fields):
+    usual = {
+        "run": run, "method": method, "seed": run, "start": (2.0, 2.0, 0.0), "refused": 0, "satisfied": True,
+        "rho": 0.1, "main_done": True, "ended_at": 10, "broken": [], "steps": 10, "modes": {"shaped": 10},
+        "reasons": {}, "kl": 2.0, "asked": 10, "residual": 0.0, "mass": [1.0, None, 0.5],
+        "decision_ms": {"p50": 1.0, "p99": 2.0, "max": 3.0}, "certified": [], "poses": [[2.0, 2.0, 0.0]],
+    }  # fmt: skip
+    return Record(**(usual | fields))
+
+
+def test_methods_of_other_runs_are_compared_over_those_in_common(tmp_path):
+    plain = [record(i, "unmodified", main_done=i != 1, ended_at=3) for i in range(6)]
+    fewer = [record(i, "ours", ended_at=8) for i in (1, 0)]
+    others = [record(i, "simplex", ended_at=5 + i, main_done=i != 5) for i in range(4, 8)]
+    folder = tmp_path / "case1" / "none"
+    folder.mkdir(parents=True)
+    (folder / "experiment.json").write_text(json.dumps(Experiment("case1").to_json()))
+    lines = [json.dumps(each.to_json()) + "\n" for each in plain + fewer + others]
+    (folder / "runs.jsonl").write_text("".join(lines))
+    writeup.write_up(tmp_path, tmp_path / "page.md")
+    page = (tmp_path / "page.md").read_text()
+    assert "- ours: main task -50.0 points below unmodified.\n" in page
+    assert "main task +50.0 points below unmodified over the 2 runs that both have.\n" in page
+    assert "unmodified does its task in 5 of 6 runs." in page
+    found = {one["method"]: one for one in json.loads((folder / "results.json").read_text())["methods"]}
+    assert found["ours"]["extra_steps"] == {"both": 1, "mean": 5.0, "median": 5.0}
+    assert found["simplex"]["extra_steps"] == {"both": 1, "mean": 6.0, "median": 6.0}
+    for runs, method in ((6, "unmodified"), (2, "ours"), (4, "simplex")):
+        assert f"--runs {runs} --seed 0 --model learned --noise none --methods {method} --out" in page
