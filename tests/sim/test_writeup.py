@@ -6,7 +6,8 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from specshield.sim import writeup
+from specshield.sim import figures, writeup
+from specshield.sim.cases import load_case
 from specshield.sim.experiment import Experiment
 from specshield.sim.runs import Record
 
@@ -40,3 +41,13 @@ def test_methods_of_other_runs_are_compared_over_those_in_common(tmp_path):
     assert found["simplex"]["extra_steps"] == {"both": 1, "mean": 6.0, "median": 6.0}
     for runs, method in ((6, "unmodified"), (2, "ours"), (4, "simplex")):
         assert f"--runs {runs} --seed 0 --model learned --noise none --methods {method} --out" in page
+
+
+@pytest.mark.parametrize("make", [figures._robustness, figures._mass])
+def test_every_method_has_a_curve_of_its_own(make):
+    names = ["unmodified", *(f"ours@0.0{i}" for i in range(10))]
+    figure = make(load_case("case1"), {name: [record(0, name)] for name in names})
+    curves = [line for line in figure.axes[0].lines if line.get_label() in names]
+    assert [curve.get_label() for curve in curves] == names
+    assert len({(curve.get_color(), curve.get_linestyle()) for curve in curves}) == len(names)
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == names

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ WAYS = 6  # runs drawn on a map
 INK, FAINT, WALL, PAPER = "#282b32", "#9ea0a5", "#343840", "#faf9f6"
 GOOD, BAD, TARGET = "#2b8a5a", "#c63c3c", "#f6be28"
 COLORS = ("#8a8d94", "#e27d22", "#b0479a", "#5f9ea0", "#7a5cc8", "#2563c8", "#2b8a5a", "#c63c3c")
+LOOKS = tuple(product(("-", "--", ":"), COLORS))  # of methods, in their order
 OF_MODE = {
     "shaped": "#2563c8", "switched": "#e27d22", "completion": "#2b8a5a", "prior": "#c9ccd3",
     "fallback": "#f6be28", "violated": "#c63c3c",
@@ -107,8 +109,8 @@ def _floor(axis: Axes, case: Case) -> None:
 def _robustness(case: Case, by_method: ByMethod) -> Any:
     """rho if the robot stood still from each step on: median over the runs, and the middle 80 %."""
     figure, axis = plt.subplots(figsize=(7.2, 3.2))
-    for (name, records), color in zip(by_method.items(), COLORS, strict=False):
-        _band(axis, np.array([_if_it_stayed(case, record) for record in records]), name, color)
+    for (name, records), look in zip(by_method.items(), cycle(LOOKS), strict=False):
+        _band(axis, np.array([_if_it_stayed(case, record) for record in records]), name, look)
     axis.axhline(0.0, color=INK, lw=0.8)
     axis.set(xlabel="step", ylabel="robustness [m]", title="Robustness, standing still from this step on")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -127,25 +129,26 @@ def _mass(case: Case, by_method: ByMethod) -> Any:
     """pi_FM(S_t) of the methods that know it."""
     figure, axis = plt.subplots(figsize=(7.2, 3.0))
     length = case.task.horizon
-    for (name, records), color in zip(by_method.items(), COLORS, strict=False):
+    for (name, records), look in zip(by_method.items(), cycle(LOOKS), strict=False):
         values = np.full((len(records), length), np.nan)
         for row, record in zip(values, records, strict=True):
             mass = [np.nan if value is None else value for value in record.mass[:length]]
             row[: len(mass)] = mass
         if np.isfinite(values).any():
-            _band(axis, values, name, color)
+            _band(axis, values, name, look)
     axis.set(xlabel="step", ylabel="feasible mass", ylim=(-0.02, 1.02), title="The model's mass on S_t")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
-def _band(axis: Axes, values: Floats, name: str, color: str) -> None:
-    """values [runs, steps]; steps that nobody has a value at are left out."""
+def _band(axis: Axes, values: Floats, name: str, look: tuple[str, str]) -> None:
+    """values [runs, steps]; steps that nobody has a value at are left out. look: of LOOKS."""
+    line, color = look
     there = np.isfinite(values).any(axis=0)
     low, middle, high = np.nanpercentile(values[:, there], (10, 50, 90), axis=0)
     steps = np.flatnonzero(there)
     axis.fill_between(steps, low, high, color=color, alpha=0.08, lw=0)
-    axis.plot(steps, middle, color=color, lw=1.6, label=name)
+    axis.plot(steps, middle, line, color=color, lw=1.6, label=name)
 
 
 def _modes(case: Case, by_method: ByMethod) -> Any:
