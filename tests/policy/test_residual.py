@@ -30,6 +30,7 @@ def texts(*formulas):
         ("G[5,9] x", [1, 1, 1, 1, 1, -1], ["G[6,9] x"]),
         ("G[0,9] not x", [-1, 1], ["G[2,9] not x"]),
         ("not F[0,9] x", [-1, 1], ["G[2,9] not x"]),
+        ("not (F[0,9] x or G[0,9] y)", [-1, 1], ["F[0,9] not y and G[2,9] not x", "F[0,9] not y"]),
         ("G[0,1] x and F[0,9] y", [1, -1], ["F[0,9] y"]),  # its window is over
         ("(G[0,9] x and F[1,2] y) and G[0,3] y", [-1],
          ["F[1,2] y and G[0,3] y and G[1,9] x", "F[1,2] y and G[0,3] y"]),

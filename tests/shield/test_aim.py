@@ -33,6 +33,7 @@ def decision(formula, *motions, **config):
         ("F[0,4] A", [WAIT, WAIT], 0, [1, 0, 0, 1], False),
         ("F[0,4] A and F[2,4] x > 0", [FORWARD], 2, [1, 1, 1, 1], False),  # A is done with
         ("F[2,2] A", [], 5, [1, 0, 0, 1], False),
+        ("not G[0,4] not A", [WAIT], 2, [1, 0, 0, 0], False),
     ],
 )
 def test_slack_asks_for_deadlines_early_and_for_the_most_that_can_be_had(
@@ -50,9 +51,10 @@ def test_slack_is_given_up_where_the_rule_itself_cannot_be_kept():
     assert (lost.mode, lost.reason, lost.feasible_mass) == ("fallback", "infeasible", 0.0)
 
 
-def test_a_margin_lost_to_what_was_driven_is_asked_of_what_is_to_come():
+@pytest.mark.parametrize("formula", ["G[0,3] x > 0.05", "not F[0,3] x <= 0.05", "not not G[0,3] x > 0.05"])
+def test_a_margin_lost_to_what_was_driven_is_asked_of_what_is_to_come(formula):
     """At x_0 the rule is kept by 0.05 m alone; one cell on, by 0.25 m."""
-    found = decision("G[0,3] x > 0.05", margin=0.1)
+    found = decision(formula, margin=0.1)
     assert (found.mode, found.reason) == ("shaped", None)
     assert list(found.j_values[:4]) == [1, 0, 0, 0]
     assert found.robustness[FORWARD] == pytest.approx(0.05)

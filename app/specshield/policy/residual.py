@@ -7,16 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.stl import (
-    SATISFIED_ABOVE,
-    Always,
-    And,
-    Eventually,
-    Formula,
-    Not,
-    conjuncts,
-    robustness_bounds,
-)
+from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts, robustness_bounds
 
 
 def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int) -> Iterator[Formula]:
@@ -43,12 +34,8 @@ def left_over(
         _, high = robustness_bounds(conjunct, {name: prefix[name] for name in conjunct.names})
         if high > SATISFIED_ABOVE:
             kept.append(conjunct)
-            continue
-        match conjunct:
-            case Always(a, b, child) if b > t:
-                broken.append(Always(a, b, child))
-            case Not(Eventually(a, b, child)) if b > t:
-                broken.append(Always(a, b, Not(child)))
+        elif isinstance(conjunct, Always) and conjunct.b > t:
+            broken.append(conjunct)
     return kept, broken
 
 

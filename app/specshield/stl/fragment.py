@@ -34,10 +34,36 @@ class Obligation:
 
 
 def conjuncts(formula: Formula) -> tuple[Formula, ...]:
-    """The formulas that `formula` joins by `and` at its top, left to right."""
-    if isinstance(formula, And):
-        return tuple(leaf for child in formula.children for leaf in conjuncts(child))
-    return (formula,)
+    """The formulas that `formula` joins by `and` at its top, left to right, in one form.
+
+    `not` goes inwards through `and`, `or`, `->`, F and G, so that `not F[a,b] p` is `G[a,b] not p`.
+    """
+    return _joined(formula, negated=False)
+
+
+def _joined(formula: Formula, negated: bool) -> tuple[Formula, ...]:
+    """The conjuncts of `formula`, or of its negation."""
+    match formula:
+        case Not(child):
+            return _joined(child, not negated)
+        case And(children) if not negated:
+            return tuple(part for child in children for part in _joined(child, False))
+        case Or(children) if negated:
+            return tuple(part for child in children for part in _joined(child, True))
+        case Implies(left, right) if negated:
+            return (*_joined(left, False), *_joined(right, True))
+        case Eventually(a, b, child) if negated:
+            return (Always(a, b, _signed(child, True)),)
+        case Always(a, b, child) if negated:
+            return (Eventually(a, b, _signed(child, True)),)
+    return (_signed(formula, negated),)
+
+
+def _signed(formula: Formula, negated: bool) -> Formula:
+    """`formula` or its negation, without a `not not`."""
+    if isinstance(formula, Not):
+        return _signed(formula.child, not negated)
+    return Not(formula) if negated else formula
 
 
 def is_predicate(node: Node) -> bool:
@@ -50,37 +76,25 @@ def obligations(formula: Formula) -> tuple[Obligation, ...]:
 
     A predicate alone is due at step 0. FragmentError, naming the sub-formula, where it is outside.
     """
-    return tuple(found for conjunct in conjuncts(formula) for found in _normal(conjunct, negated=False))
+    return tuple(found for conjunct in conjuncts(formula) for found in _normal(conjunct))
 
 
-def _normal(formula: Formula, negated: bool) -> tuple[Obligation, ...]:
-    """The obligations of `formula`, or of its negation."""
+def _normal(formula: Formula) -> tuple[Obligation, ...]:
     if is_predicate(formula):
-        return (Obligation("always", 0, 0, 0, 0, _predicate(formula, negated)),)
+        return (Obligation("always", 0, 0, 0, 0, _signed(formula, False)),)
+    parts = conjuncts(formula)
+    if parts != (formula,):
+        return tuple(found for part in parts for found in _normal(part))
     match formula:
-        case Not(child):
-            return _normal(child, not negated)
-        case And(children) if not negated:
-            return tuple(found for child in children for found in _normal(child, negated))
-        case Or(children) if negated:
-            return tuple(found for child in children for found in _normal(child, negated))
-        case Implies(left, right) if negated:
-            return (*_normal(left, False), *_normal(right, True))
         case Always(a, b, child) | Eventually(a, b, child):
-            inner = _normal(child, negated)
+            inner = _normal(child)
             if a == b:
                 return tuple(_shifted(obligation, a, a) for obligation in inner)
-            if isinstance(formula, Always) is not negated:
+            if isinstance(formula, Always):
                 return tuple(_under_always(formula, a, b, obligation) for obligation in inner)
             if len(inner) == 1:
                 return (_under_eventually(a, b, inner[0]),)
     raise _outside(formula)
-
-
-def _predicate(formula: Formula, negated: bool) -> Formula:
-    if isinstance(formula, Not):
-        return _predicate(formula.child, not negated)
-    return Not(formula) if negated else formula
 
 
 def _under_always(formula: Formula, a: int, b: int, inner: Obligation) -> Obligation:
