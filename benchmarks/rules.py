@@ -37,6 +37,7 @@ RULES = {
     "patrol": ("case2", "G[0,100] F[0,50] Region1 and G[0,100] F[0,50] Region2"),
     "reactive": ("case2", "G[0,100] (event > 0.5 -> F[0,60] Region2) and G[0,150] not Forbidden"),
     "until": ("case2", "not Region2 U[0,100] Region1 and F[50,140] Region2"),
+    "until, round what is in the way": ("case2", "not Region1 U[0,140] Region2"),
     "disjunction": (
         "case2",
         "(F[0,100] Region1 and F[0,100] Region2 or F[0,100] G[0,20] Region3) and G[0,120] not Forbidden",

@@ -8,6 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from tests.oracles.brute_stl import brute_robustness
 from tests.oracles.cells import END, MOTIONS, Cells
+from tests.oracles.judge import signed_distance
 from tests.policy.rooms import CUSTOM, OCCUPIED, REGIONS, flat
 from tests.stl.formulas import formulas
 
@@ -166,6 +167,47 @@ def test_any_formula_has_a_proposal_for_every_motion(formula, robot, data):
             simulate(shield.body, history[-1], ways, after)
             samples = {n: v.tolist() for n, v in task.samples(np.concatenate([history, after])).items()}
             assert brute_robustness(task.formula, samples) > 0.0
+
+
+ROOM = OccupancyGrid(np.zeros((60, 60), bool), 0.1)
+
+
+def rectangle(x0, y0, x1, y1):
+    return {"type": "rectangle", "min": [x0, y0], "max": [x1, y1]}
+
+
+def decide_at(policy, pose, **asked):
+    robot = policy.task.robot
+    decision = decide(make_shield([policy]), [pose], np.zeros(len(robot.actions)), **asked)
+    return decision, np.array(decision.j_values, float)[robot.representative]
+
+
+@pytest.mark.parametrize("half", [0.5, 0.25])
+def test_an_until_goes_round_what_lies_between(half):
+    """Who is never in K keeps the until: where that is to be had, so is this."""
+    regions = {"K": rectangle(2.5 - half, 2.5 - half, 2.5 + half, 2.5 + half), "B": rectangle(4, 4, 5, 5)}
+    until, never = (
+        synthesise(make_task(ROOM, STRETCH, rule, regions))
+        for rule in ("not K U[0,60] B", "F[0,60] B and G[0,60] not K")
+    )
+    for pose in ((1, 1, 0), (1.5, 1.5, 0), (1, 3, 0), (1.6, 2.5, 0), (0.5, 0.5, 2), (2.5, 1, 1.5)):
+        stricter = decide_at(never, pose)[1]
+        assert stricter.any()
+        assert (decide_at(until, pose)[1] >= stricter).all()
+
+
+def test_an_until_stays_in_a_corridor_up_to_where_it_leads():
+    """The left side ends where the right one begins: no pose is in both, and no goal in the left."""
+    regions = {"Up": rectangle(1, 1, 2, 4), "Along": rectangle(1, 3, 4, 4), "B": rectangle(4, 3, 5, 4)}
+    policy = synthesise(make_task(ROOM, STRETCH, "(Up or Along) U[0,60] B", regions))
+    decision, feasible = decide_at(policy, (1.5, 1.5, 0.0), witnesses=True)
+    assert feasible.all()
+    ways = np.array([STRETCH.motion_of[a] for a in (decision.action, *decision.witness)], np.int64)
+    after = np.empty((len(ways), 3))
+    simulate(make_shield([policy]).body, np.array([1.5, 1.5, 0.0]), ways, after)
+    inside = {n: [signed_distance(region, x, y) > 0 for x, y, _ in after] for n, region in regions.items()}
+    there = inside["B"].index(True)
+    assert all(np.logical_or(inside["Up"], inside["Along"])[:there])
 
 
 def test_a_robot_that_cannot_stand_still_is_planned_for():

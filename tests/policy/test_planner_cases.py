@@ -10,7 +10,7 @@ from tests.oracles.judge import signed_distance
 
 from specshield.shield.episode import make_shield
 
-SHAPES = ("patrol", "reactive", "until", "disjunction", "nested")
+SHAPES = ("patrol", "reactive", "until", "until, round what is in the way", "disjunction", "nested")
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -24,6 +24,7 @@ from specshield.world.regions import region_distance
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Ends = frozenset[tuple[Formula, int]]
 NEVER = 1 << 40  # a step that does not come
 
 
@@ -46,11 +47,13 @@ class Literal(NamedTuple):
     """A predicate or (side -1) its negation.
 
     guards: whether an `always` or the left of an `until` asks for it, so that it is to hold for a while.
+    ends: where only an `until` does, what ends that while: each a predicate and its side, as here.
     """
 
     predicate: Formula
     side: int
     guards: bool
+    ends: Ends
 
 
 @lru_cache(maxsize=64)
@@ -63,7 +66,7 @@ def agenda_of(task: Task, formula: Formula) -> tuple[Agenda, tuple[Literal, ...]
     leaves: list[tuple[int, int]] = []
     last: dict[tuple[int, int], int] = {}
     examples: list[tuple[int, int]] = []
-    for n, (found, positive, guards) in enumerate(_leaves(formula, True, False)):
+    for n, (found, positive, guards) in enumerate(_leaves(formula, True, None)):
         base, sign = _stripped(found)
         if not _reads_pose(task, base):
             leaves.append((-1, sign))
@@ -74,8 +77,11 @@ def agenda_of(task: Task, formula: Formula) -> tuple[Agenda, tuple[Literal, ...]
         p = predicates.index(base)
         leaves.append((p, sign))
         key = (p, sign if positive else -sign)
-        known = literals.get(key)
-        literals[key] = Literal(base, key[1], guards or (known is not None and known.guards))
+        known = literals.get(key, Literal(base, key[1], False, frozenset()))
+        if guards is not None:
+            ends = known.ends & guards if known.guards else guards
+            known = known._replace(guards=True, ends=ends)
+        literals[key] = known
         last[key] = max(last.get(key, 0), int(view.tree.leaf_stop[n]) - 1)
     rows = [(*key, last[key], int(literal.guards)) for key, literal in literals.items()]
     agenda = Agenda(view, _columns(leaves, 2), _columns(examples, 2), _columns(rows, 4))
@@ -127,8 +133,12 @@ def _stripped(predicate: Node) -> tuple[Formula, int]:
     return predicate, sign
 
 
-def _leaves(formula: Formula, positive: bool, guards: bool) -> Iterator[tuple[Formula, bool, bool]]:
-    """The leaves in the order of `compile_tree`: formula, polarity, whether it is to hold all along."""
+def _leaves(
+    formula: Formula, positive: bool, guards: Ends | None
+) -> Iterator[tuple[Formula, bool, Ends | None]]:
+    """The leaves in the order of `compile_tree`: formula, polarity, and where it is to hold all along, what
+    ends that.
+    """
     match formula:
         case _ if not _is_temporal(formula):
             yield formula, positive, guards
@@ -141,12 +151,18 @@ def _leaves(formula: Formula, positive: bool, guards: bool) -> Iterator[tuple[Fo
             yield from _leaves(left, not positive, guards)
             yield from _leaves(right, positive, guards)
         case Always(a, b, child) | Eventually(a, b, child):
-            always = isinstance(formula, Always) is positive
+            always: Ends | None = frozenset() if isinstance(formula, Always) is positive else None
             yield from _leaves(child, positive, always if b > a else guards)
         case Until(a, b, left, right):
             if b > 0:
-                yield from _leaves(left, positive, positive)
-            yield from _leaves(right, positive, not positive)
+                yield from _leaves(left, positive, _ends(right) if positive else None)
+            yield from _leaves(right, positive, None if positive else frozenset())
+
+
+def _ends(right: Formula) -> Ends:
+    """What may hold when the right side of an `until` does."""
+    found = ((_stripped(leaf), positive) for leaf, positive, _ in _leaves(right, True, None))
+    return frozenset((base, sign if positive else -sign) for (base, sign), positive in found)
 
 
 def _is_temporal(formula: Node) -> bool:
@@ -221,9 +237,28 @@ def is_open(
     """Whether the formula may still be satisfied after step s if literal k holds to step `until`, by far, and
     fails from step `start` to step `stop`; k = -1: whatever happens.
     """
-    tree, low, high = agenda.rule.tree, bounds.some_low, bounds.some_high
+    low, high = bounds.some_low, bounds.some_high
     for i in range(low.shape[0]):
         low[i], high[i] = bounds.low[i], bounds.high[i]
+    _suppose(agenda, k, s, until, start, stop, margin, low, high)
+    _, highest = tree_bounds(agenda.rule.tree, low, high)
+    return highest > margin
+
+
+@leaf
+def _suppose(
+    agenda: Agenda,
+    k: int,
+    s: int,
+    until: int,
+    start: int,
+    stop: int,
+    margin: float,
+    low: Floats,
+    high: Floats,
+) -> None:
+    """Changes the bounds to what `is_open` supposes of literal k."""
+    tree = agenda.rule.tree
     for n in range(agenda.leaf.shape[0]):
         if k < 0 or agenda.leaf[n, 0] != agenda.literal[k, 0]:
             continue
@@ -235,8 +270,6 @@ def is_open(
         for i in range(at + max(start, begin), at + min(stop + 1, end)):
             low[i] = min(low[i], margin) if same else max(low[i], -margin)
             high[i] = min(high[i], margin) if same else max(high[i], -margin)
-    _, highest = tree_bounds(tree, low, high)
-    return highest > margin
 
 
 @leaf
@@ -262,6 +295,28 @@ def needed_until(agenda: Agenda, k: int, s: int, begin: int, margin: float, boun
     low, high, tried = begin - 1, agenda.literal[k, 2] + 1, begin
     while high - low > 1:
         if is_open(agenda, k, s, s, tried, tried, margin, bounds):
+            high = tried
+        else:
+            low = tried
+        tried = (low + high) // 2
+    return low
+
+
+@leaf
+def needed_without(
+    agenda: Agenda, k: int, goal: int, s: int, stop: int, margin: float, bounds: Bounds
+) -> int:
+    """The last of the steps from s + 1 to stop - 1 at each of which literal k has to hold while `goal` has
+    not held since s, as the left of an `until`; s for none.
+    """
+    low, high, tried = s, min(agenda.literal[k, 2] + 1, stop), s + 1
+    while high - low > 1:
+        for i in range(bounds.low.shape[0]):
+            bounds.some_low[i], bounds.some_high[i] = bounds.low[i], bounds.high[i]
+        _suppose(agenda, goal, s, s, s + 1, tried, margin, bounds.some_low, bounds.some_high)
+        _suppose(agenda, k, s, s, tried, tried, margin, bounds.some_low, bounds.some_high)
+        _, highest = tree_bounds(agenda.rule.tree, bounds.some_low, bounds.some_high)
+        if highest > margin:
             high = tried
         else:
             low = tried

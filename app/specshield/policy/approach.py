@@ -22,7 +22,9 @@ WIDTH, LENGTH = 12, 64  # poses that a beam keeps, and how long it can be [steps
 TWIN = 0.05  # [m and rad] poses as near as this are one to a beam
 GAIN = 2.0  # [steps] nearer than where the walk got stuck: what a detour has to reach
 
-DUE, BEGIN, UNTIL = range(3)  # of what is needed of a literal: by when, and from when until when throughout
+# Of what is needed of a literal: by when, from when until when throughout, and until when as long as the
+# literal that one goes to does not hold.
+DUE, BEGIN, UNTIL, WITHOUT = range(4)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -96,11 +98,12 @@ def stay(world: World, t: int, n: int, stop: int, motions: Ints, poses: Floats, 
 
 
 @leaf
-def _keeps(world: World, at: int, need: Ints, rho: Floats) -> bool:
-    """Whether everything that has to hold at step `at` does. need (L, 3)."""
-    kept = True
+def _keeps(world: World, goal: int, at: int, need: Ints, rho: Floats) -> bool:
+    """Whether everything that has to hold at step `at`, on the way to a goal, does. need (L, 4)."""
+    kept, there = True, holds(world, goal, rho)
     for k in range(need.shape[0]):
-        kept = kept and (at < need[k, BEGIN] or at > need[k, UNTIL] or holds(world, k, rho))
+        asked = need[k, BEGIN] <= at <= need[k, UNTIL] or (at <= need[k, WITHOUT] and not there)
+        kept = kept and (not asked or holds(world, k, rho))
     return kept
 
 
@@ -120,7 +123,7 @@ def walk(
 ) -> int:
     """Goes on from motions[:n] down field f to where literal k holds; how many motions there are then.
 
-    -1 where it does not come there by motions[:stop]. What has to hold does on the way, need (L, 3); waits:
+    -1 where it does not come there by motions[:stop]. What has to hold does on the way, need (L, 4); waits:
     stay where the way down would break it, instead of going round.
     """
     body, scores = world.body, work.scores
@@ -156,7 +159,7 @@ def walk(
             led = abs(nx - x) + abs(ny - y) > NUDGE or nth != theta
             if led or padding:
                 read_pose(world.agenda, nx, ny, nth, work.values, work.stack, work.rho)
-                if _keeps(world, t + n + 1, need, work.rho):
+                if _keeps(world, k, t + n + 1, need, work.rho):
                     break
                 if padding:
                     return -1
@@ -221,7 +224,7 @@ def beam(
                 if kept == WIDTH and not ahead < places[i, kept - 1, 3]:
                     continue
                 read_pose(world.agenda, x, y, theta, work.values, work.stack, work.rho)
-                if not _keeps(world, t + n + i, need, work.rho):
+                if not _keeps(world, k, t + n + i, need, work.rho):
                     continue
                 if holds(world, k, work.rho):
                     ahead = -1.0

@@ -24,6 +24,7 @@ from specshield.policy.agenda import (
     foresee,
     is_open,
     needed_until,
+    needed_without,
     read_signals,
     stay_for,
 )
@@ -33,6 +34,7 @@ from specshield.policy.approach import (
     LENGTH,
     UNTIL,
     WIDTH,
+    WITHOUT,
     Work,
     World,
     beam,
@@ -65,10 +67,10 @@ class Nodes(NamedTuple):
     """The nodes from the root to the newest.
 
     state [DEEP, 5]: motions MADE, COUNT of children, how many were TRIED, how many of those were OPENED,
-    discrepancies USED. need [DEEP, L, 3]: by when a literal is DUE, and from which step (BEGIN) UNTIL which
-    it has to hold throughout. child [DEEP, C, 5], by KEY: go to LITERAL after waiting BEFORE steps, and STAY
-    there (1) or not (0); or, with KEEP, go at once but keep that literal for the next BEFORE steps; or, with
-    LITERAL -1, STAY that long here.
+    discrepancies USED. need [DEEP, L, 4]: by when a literal is DUE, from which step (BEGIN) UNTIL which it
+    has to hold throughout, and until which step as long as it is WITHOUT the child's literal. child
+    [DEEP, C, 5], by KEY: go to LITERAL after waiting BEFORE steps, and STAY there (1) or not (0); or, with
+    KEEP, go at once but keep that literal for the next BEFORE steps; or, with LITERAL -1, STAY that long.
     """
 
     state: Ints
@@ -101,11 +103,18 @@ def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, 
 
 
 @leaf
-def _guarding(world: World, need: Ints) -> bool:
-    """Whether something has to hold for a while that not every field keeps."""
-    guarding = False
-    for k in range(need.shape[0]):
-        guarding = guarding or (need[k, UNTIL] >= 0 and world.field[k, 0] != world.field[k, 1])
+def _guard(world: World, k: int, s: int, stop: int, need: Ints, work: Work) -> bool:
+    """Notes what has to hold until literal k does. Whether anything has to hold for a while."""
+    agenda, guarding = world.agenda, False
+    foresee(agenda, s, work.known, work.held, work.bounds.low, work.bounds.high)
+    for g in range(need.shape[0]):
+        need[g, WITHOUT] = -1
+        if agenda.literal[g, 3] == 1 and g != k and not (need[g, BEGIN] <= s + 1 and need[g, UNTIL] >= stop):
+            work.spent[0] += 2.0 * world.cost
+            until = needed_without(agenda, g, k, s, stop, world.margin, work.bounds)
+            if until > s:
+                need[g, WITHOUT] = until
+        guarding = guarding or need[g, UNTIL] >= 0 or need[g, WITHOUT] >= 0
     return guarding
 
 
@@ -129,7 +138,7 @@ def _expand(
         guess = nodes.need[d - 1, k, DUE] if d > 0 else NEVER  # most stay what they were
         by = due(agenda, k, s, guess, margin, work.bounds)
         work.spent[0] += (3.0 if by in (guess, NEVER) else bits) * world.cost
-        need[k, DUE], need[k, BEGIN], need[k, UNTIL] = by, NEVER, -1
+        need[k, DUE], need[k, BEGIN], need[k, UNTIL], need[k, WITHOUT] = by, NEVER, -1, -1
         if by != NEVER and agenda.literal[k, 3] == 1:
             work.spent[0] += bits * world.cost
             until = needed_until(agenda, k, s, by, margin, work.bounds)
@@ -186,11 +195,12 @@ def _serve(
         else:
             stay(world, t, n, n + before, motions, poses, work)
             n += before
-        arrived, guarding = -1, _guarding(world, need)
+        arrived, stop = -1, min(steps, by - t)
+        guarding = _guard(world, k, t + n, t + stop, need, work) and world.field[k, 0] != world.field[k, 1]
         for column in range(1, -1, -1):
             f = world.field[k, column]
             if arrived < 0 and f >= 0 and (column == 0 or guarding):
-                stop, waits = min(steps, by - t), column == 0 or keep >= 0
+                waits = column == 0 or keep >= 0
                 arrived = walk(world, k, f, waits, t, n, stop, need, motions, poses, work)
                 if arrived < 0:  # it came too late, or got stuck: look at more than one way
                     arrived = beam(world, k, f, t, n, stop, 0.0, LENGTH, need, motions, poses, work)
@@ -310,7 +320,7 @@ def propose_all(
         np.empty((LENGTH + 1, WIDTH, 2), np.int64), np.zeros(1),
     )  # fmt: skip
     nodes = Nodes(
-        np.empty((DEEP, 5), np.int64), np.empty((DEEP, literals, 3), np.int64),
+        np.empty((DEEP, 5), np.int64), np.empty((DEEP, literals, 4), np.int64),
         np.empty((DEEP, 6 * literals + 1, 5), np.int64),
     )  # fmt: skip
     read_signals(agenda, work.values, work.stack, work.held)

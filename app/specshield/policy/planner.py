@@ -172,7 +172,10 @@ def synthesise(
         for k in range(len(literals)):
             keeps = tuple(g for g in kept if literals[g].predicate != literals[k].predicate)
             if (k, keeps) not in codes and len(codes) < MAX_FIELDS:
-                allowed = np.all(holds[list(keeps)], axis=0) if keeps else free
+                allowed = free.copy()
+                for g in keeps:  # the left of an `until` need not hold where the right does
+                    ended = (literals[k].predicate, literals[k].side) in literals[g].ends
+                    allowed &= holds[g] | holds[k] if ended else holds[g]
                 codes[k, keeps] = steps_to(lattice, holds[k], allowed)[used]
             chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
     cell = np.full(used.shape, -1, np.int32)
