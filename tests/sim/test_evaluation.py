@@ -18,7 +18,7 @@ from rq.serializers import JSONSerializer
 from tests.oracles.judge import margin
 from tests.serving import wait_for
 
-from specshield.errors import InputError, NotFound, StoreError
+from specshield.errors import InputError, NotFound, SpecshieldError, StoreError
 from specshield.service.embedded import EmbeddedStore
 from specshield.sim import calibration, results
 from specshield.sim.cases import load_case
@@ -144,6 +144,33 @@ def test_workers_make_the_same_records_though_one_is_killed(serial, redis, tmp_p
             os.kill(int(children.read_text().split()[0]), signal.SIGKILL)
             assert same(result.result(120.0)) == same(serial)
     finally:
+        process.terminate()
+        process.wait(15.0)
+
+
+def test_runs_that_the_store_forgets_are_given_out_again_but_not_for_ever(serial, redis, tmp_path):
+    process, store = worker(redis, tmp_path), Redis.from_url(redis)
+
+    def forget():
+        return store.delete(*jobs) if (jobs := store.keys("rq:job:*")) else 0
+
+    try:
+        with ThreadPoolExecutor() as threads:
+            wait_for(lambda: listening(redis), 60.0)
+            process.send_signal(signal.SIGSTOP)  # takes none
+            result = threads.submit(evaluate, EXPERIMENT, 1, METHODS, redis_url=redis)
+            wait_for(lambda: forget() or result.done(), 10.0)
+            while not result.done():
+                forget()
+                time.sleep(0.01)
+            with pytest.raises(SpecshieldError, match="runs 0 to 0 were lost 3 times"):
+                result.result()
+            result = threads.submit(evaluate, EXPERIMENT, 1, METHODS, redis_url=redis)
+            wait_for(forget, 10.0)
+            process.send_signal(signal.SIGCONT)
+            assert same(result.result(120.0)) == same(serial[:2])
+    finally:
+        process.send_signal(signal.SIGCONT)
         process.terminate()
         process.wait(15.0)
 

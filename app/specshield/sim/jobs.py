@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import redis
 from rq import Queue, Worker
+from rq.exceptions import NoSuchJobError
 from rq.job import Job, JobStatus
 from rq.serializers import JSONSerializer
 
@@ -34,10 +35,10 @@ Chunk = list[tuple[int, list[str]]]
 def over_workers(
     url: str, experiment: Experiment, missing: Mapping[int, Sequence[str]]
 ) -> Iterator[list[Record]]:
-    """The records of each run, as the workers finish them; what a worker died with is given out again.
+    """The records of each run, as the workers finish them; what is lost is given out again.
 
     missing: {run: methods}. Raises StoreError where the store cannot be reached or no worker listens, and
-    SpecshieldError with a failed job's last line.
+    SpecshieldError with a failed job's last line, or where runs are lost ATTEMPTS times.
     """
     try:
         yield from _over_workers(redis.Redis.from_url(url), experiment, missing)
@@ -62,7 +63,10 @@ def _over_workers(
 
     def give_out(chunk: Chunk, attempt: int) -> None:
         if attempt > ATTEMPTS:
-            raise SpecshieldError(f"{ATTEMPTS} workers died with the runs {chunk[0][0]} to {chunk[-1][0]}")
+            raise SpecshieldError(
+                f"the runs {chunk[0][0]} to {chunk[-1][0]} were lost {ATTEMPTS} times: their workers died or "
+                "the store forgot them"
+            )
         job = queue.enqueue(
             run_chunk,
             experiment.to_json(),
@@ -78,21 +82,24 @@ def _over_workers(
         give_out(chunk, 1)
     try:
         while waiting:
-            for job in _fetched(connection, list(waiting)):
-                if job.get_status(refresh=False) == JobStatus.FINISHED:
-                    del waiting[job.id]
-                    for records in job.return_value() or []:
+            for job_id in list(waiting):
+                job = _fetched(connection, job_id)
+                if job is not None and (made := _result(job)) is not None:
+                    del waiting[job_id]
+                    for records in made:
                         yield [Record.from_json(record) for record in records]
-                elif _is_lost(job):
-                    chunk, attempt = waiting.pop(job.id)
+                elif job is None or _is_lost(job):
+                    chunk, attempt = waiting.pop(job_id)
                     give_out(chunk, attempt + 1)
                 else:
                     continue
-                job.delete()
+                if job is not None:
+                    job.delete()
             time.sleep(POLL)
     finally:
-        for job in _fetched(connection, list(waiting)):
-            job.delete()
+        for job_id in waiting:
+            if (job := _fetched(connection, job_id)) is not None:
+                job.delete()
 
 
 def run_chunk(experiment: dict[str, Any], chunk: Chunk) -> list[list[dict[str, Any]]]:
@@ -106,13 +113,21 @@ def run_chunk(experiment: dict[str, Any], chunk: Chunk) -> list[list[dict[str, A
     return [[record.to_json() for record in run(described, i, names)] for i, names in chunk]
 
 
-def _fetched(connection: Any, ids: list[str]) -> list[Job]:
-    found = Job.fetch_many(ids, connection=connection, serializer=JSONSerializer)
-    return [job for job in found if job is not None]
+def _fetched(connection: Any, job_id: str) -> Job | None:
+    """None where the store has forgotten the job, or most of it: a worker may write to what is gone."""
+    try:
+        return Job.fetch(job_id, connection=connection, serializer=JSONSerializer)
+    except NoSuchJobError:
+        return None
+
+
+def _result(job: Job) -> Any:
+    """None where it has not finished, or the store has forgotten what came of it."""
+    return job.return_value() if job.get_status(refresh=False) == JobStatus.FINISHED else None
 
 
 def _is_lost(job: Job) -> bool:
-    """Whether a job's worker died with it. Raises SpecshieldError for one that failed by itself."""
+    """Whether a job will never have a result. Raises SpecshieldError where it failed by itself."""
     status = job.get_status(refresh=False)
     if status in (JobStatus.FAILED, JobStatus.STOPPED, JobStatus.CANCELED):
         result = job.latest_result()
@@ -121,7 +136,7 @@ def _is_lost(job: Job) -> bool:
             raise SpecshieldError(f"a worker could not do its runs: {said.splitlines()[-1]}")
         return True
     heartbeat: datetime | None = job.last_heartbeat
-    return (
+    return status == JobStatus.FINISHED or (
         status == JobStatus.STARTED
         and heartbeat is not None
         and datetime.now(timezone.utc) - heartbeat > SILENT
