@@ -241,6 +241,19 @@ def test_what_is_broken_is_dropped_and_the_rest_is_kept():
     assert (0, 0) in states[3:]
 
 
+@pytest.mark.parametrize("rest", ["F[5,40] A", "F[5,40] A and G[0,40] not K"])
+def test_a_rule_over_a_signal_that_stays_broken_leaves_the_rest_to_be_kept(rest):
+    """What asks for the signal again cannot be had as long as it is held; what is left can."""
+    regions = {"A": rectangle(4, 0.5, 5, 1.5), "K": rectangle(2, 0.5, 3, 1.5)}
+    regions = {name: region for name, region in regions.items() if name in rest}
+    task = make_task(ROOM, STRETCH, f"G[0,40] (bat > 0.2) and {rest}", regions, signals={"bat": 1.0})
+    history, bat = np.array([[1.0, 1.0, 0.0]] * 2), np.array([1.0, 0.1])
+    poses = synthesise(task).propose(history, {"bat": bat}, 0.0).poses
+    ways = np.concatenate([np.broadcast_to(history, (len(poses), 2, 3)), poses], axis=1)
+    whole = make_task(ROOM, STRETCH, rest, regions)
+    assert (robustness(whole.formula, whole.samples(ways)) > 0.0).all()
+
+
 def test_a_policy_comes_back_from_its_files_as_it_was():
     task = WORLDS["patrol"].task
     policy = synthesise(task, Settings(pitch=0.2))

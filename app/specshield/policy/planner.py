@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -122,16 +123,24 @@ class PlannerPolicy:
         self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
     ) -> tuple[Proposal, bool]:
         """The proposal, and whether a plan of it satisfies the formula, or what can still be kept of it."""
-        t, world = len(history) - 1, self._world
-        rows = signal_rows(self.task, signals, t + 1)
-        known = np.empty(world.agenda.rule.tree.size)
-        _, high = look(world.agenda.rule, history, rows, known)
+        t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
+        _, high = look(self._world.agenda.rule, history, rows, np.empty(self._world.agenda.rule.tree.size))
+        worlds: Iterable[World] = [self._world]
         if high <= SATISFIED_ABOVE:
-            left = next(iter(residuals(self.task.formula, self.task.samples(history, signals), t)), None)
-            if left is not None and left.horizon > t:
-                world = self._world_of(left)
-                known = np.empty(world.agenda.rule.tree.size)
-                look(world.agenda.rule, history, rows, known)
+            left = residuals(self.task.formula, self.task.samples(history, signals), t)
+            worlds = chain((self._world_of(part) for part in left if part.horizon > t), worlds)
+        for world in worlds:
+            proposal, found = self._plan_in(world, history, rows, margin)
+            if found:
+                break
+        return proposal, found
+
+    def _plan_in(
+        self, world: World, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
+    ) -> tuple[Proposal, bool]:
+        t = len(history) - 1
+        known = np.empty(world.agenda.rule.tree.size)
+        look(world.agenda.rule, history, rows, known)
         motions = np.empty((len(self._body.translate), self.task.horizon - t), np.int64)
         poses = np.empty((len(motions), motions.shape[1] + 1, 3))
         effort = self.settings.effort * max(1.0, self.task.horizon / USUAL) ** 2
