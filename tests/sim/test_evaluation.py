@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from tests.serving import wait_for
 
 from specshield.errors import InputError, NotFound, SpecshieldError, StoreError
 from specshield.service.embedded import EmbeddedStore
-from specshield.sim import calibration, results
+from specshield.sim import calibration, cases, experiment, results
 from specshield.sim.cases import load_case
 from specshield.sim.evaluation import evaluate, read
 from specshield.sim.experiment import Experiment
@@ -93,6 +94,57 @@ def test_a_method_named_twice_is_run_once_and_counts_once(serial, tmp_path):
     path.write_text(path.read_text() * 2)
     assert same(read(tmp_path)) == same(serial)
     assert [one["runs"] for one in results.write(tmp_path)["methods"]] == [RUNS, RUNS]
+
+
+def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_path, monkeypatch):
+    """What is there is copied, and changed as little as can be."""
+    out, asked = tmp_path / "out", Experiment("case1", seed=8)
+    kept = evaluate(asked, 1, ["unmodified"], out)
+
+    def changed(name, spoil):
+        maps, models = tmp_path / name / "maps", tmp_path / name / "models"
+        shutil.copytree(cases.MAPS, maps)
+        shutil.copytree(cases.MODELS, models)
+        spoil(maps, models)
+        with monkeypatch.context() as patched:
+            patched.setattr(cases, "MODELS", models)
+            patched.setattr(experiment, "MODELS", models)
+            patched.setattr(experiment, "load_case", lambda case: load_case(case, maps))
+            experiment._setting.cache_clear()
+            try:
+                return evaluate(asked, 1, ["unmodified"], out)
+            except InputError as error:
+                return error.path, error.got
+            finally:
+                experiment._setting.cache_clear()
+
+    def last_bit(path):
+        content = path.read_bytes()
+        path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+
+    def map_and_no_dqn(maps, models):  # which would not fit the map
+        pixels = bytearray((maps / "case1.pgm").read_bytes())
+        pixels[len(pixels) - 3] ^= 255
+        (maps / "case1.pgm").write_bytes(pixels)
+        shutil.rmtree(models / "case1-dqn")
+
+    def instruction(maps, models):
+        path = maps / "case1.regions.json"
+        path.write_text(path.read_text().replace('"instruction": "', '"instruction": "please '))
+
+    assert same(changed("nothing", lambda maps, models: None)) == same(kept)
+    for name, spoil, said in (
+        ("map", map_and_no_dqn, "task, policy dqn"),
+        ("errand", instruction, "instruction"),
+        ("dqn", lambda _, models: last_bit(models / "case1-dqn" / "policy.safetensors"), "policy dqn"),
+        ("fm", lambda _, models: last_bit(models / "fm" / "model.safetensors"), "learned model"),
+    ):
+        assert changed(name, spoil) == ("out", f"changed since: {said}")
+    (out / "experiment.json").write_text(json.dumps(asked.to_json()))  # as it was before it said
+    with pytest.raises(InputError, match="does not say") as caught:
+        evaluate(asked, 2, ["unmodified"], out)
+    assert "report" in caught.value.expected
+    assert results.write(out)["runs"] == 1
 
 
 def test_a_margin_is_calibrated_on_other_runs_and_kept(monkeypatch, tmp_path):

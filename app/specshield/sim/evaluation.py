@@ -9,12 +9,14 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 from specshield.errors import InputError
 from specshield.sim import jobs
 from specshield.sim.experiment import Experiment
 from specshield.sim.runs import Record, run
 
+ABOUT = "experiment.json"
 Missing = Mapping[int, Sequence[str]]  # {run: methods}
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -32,7 +34,8 @@ def evaluate(
 
     folder: finished runs are kept there as they come, those that are there already are not made again.
     processes: 1 is this one. redis_url: where job workers take the runs from instead. on_progress: how many
-    runs are finished. Raises InputError where `folder` holds another experiment.
+    runs are finished. Raises InputError where `folder` holds another experiment, or records made from
+    another map, policy or model.
     """
     methods = list(dict.fromkeys(methods))
     done = {} if folder is None else _open(folder, experiment)
@@ -84,21 +87,45 @@ def _end_with_parent() -> None:
 def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]:
     """What `folder` holds of the experiment."""
     folder.mkdir(parents=True, exist_ok=True)
-    about, written = folder / "experiment.json", folder / "runs.jsonl"
+    about, written = folder / ABOUT, folder / "runs.jsonl"
     if about.exists():
-        found = Experiment.from_json(json.loads(about.read_text()))
-        if found != experiment:
-            raise InputError(
-                "the folder holds another experiment", path="out", got=str(found.to_json()),
-                expected=f"{experiment.to_json()}, or another folder",
-            )  # fmt: skip
+        _check(folder, experiment)
     else:
-        about.write_text(json.dumps(experiment.to_json()) + "\n")
+        described = {**experiment.to_json(), "made_from": experiment.setting.made_from}
+        about.write_text(json.dumps(described) + "\n")
     if not written.exists():
         return {}
-    content = written.read_bytes()
-    os.truncate(written, content.rfind(b"\n") + 1)  # a line that was cut short
+    os.truncate(written, written.read_bytes().rfind(b"\n") + 1)  # a line that was cut short
     return {(record.run, record.method): record for record in read(folder)}
+
+
+def _check(folder: Path, experiment: Experiment) -> None:
+    """Raises InputError unless the folder's records and new ones can stand side by side."""
+    found, made_from = read_about(folder)
+    if found != experiment:
+        raise InputError(
+            "the folder holds another experiment", path="out", got=str(found.to_json()),
+            expected=f"{experiment.to_json()}, or another folder",
+        )  # fmt: skip
+    if made_from is None:
+        raise InputError(
+            "the folder does not say which map, policies and model its records were made from", path="out",
+            got=str(folder), expected="another folder; `specshield report` still reads this one",
+        )  # fmt: skip
+    now = experiment.setting.made_from
+    changed = [name for name in {**made_from, **now} if made_from.get(name) != now.get(name)]
+    if changed:
+        raise InputError(
+            "the folder's records were made from something else than is there now", path="out",
+            got=f"changed since: {', '.join(changed)}", expected="another folder, or what was there then",
+        )  # fmt: skip
+
+
+def read_about(folder: Path) -> tuple[Experiment, dict[str, Any] | None]:
+    """The experiment of a folder, and what its records were made from; None in a folder that does not say."""
+    content = json.loads((folder / ABOUT).read_text())
+    made_from = content.pop("made_from", None)
+    return Experiment.from_json(content), made_from
 
 
 def read(folder: Path) -> list[Record]:

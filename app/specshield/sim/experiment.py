@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
+from specshield import __version__
 from specshield.errors import InputError, NotFound
-from specshield.policy.policy import Policy, Proposer
-from specshield.policy.reachability import synthesise
+from specshield.policy.policy import Policy
+from specshield.policy.reachability import ReachabilityPolicy, synthesise
 from specshield.robot.unicycle import Body, make_body
 from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
-from specshield.sim.cases import Case, case_name, load_case, shipped
+from specshield.sim.cases import MODELS, Case, case_name, load_case, shipped
 from specshield.sim.decoding import HardDecoding, RobustDecoding
 from specshield.sim.disturbance import believed, check
 from specshield.sim.houses import load_house_case
+from specshield.sim.learned.model import FOLDER, WEIGHTS, read
 from specshield.sim.methods import Decoding, Method, Shielded, Simplex
 from specshield.sim.model import FoundationModel, make_model
 from specshield.task import Task
@@ -80,7 +83,7 @@ class Setting:
         return replace(policy, task=self.task) if isinstance(policy, Policy) else None
 
     @cached_property
-    def policies(self) -> tuple[Proposer, ...]:
+    def policies(self) -> tuple[ReachabilityPolicy | Policy, ...]:
         """Reachability, then the DQN if there is one."""
         computed = synthesise(self.task)
         return (computed,) if self.learned is None else (computed, self.learned)
@@ -98,6 +101,23 @@ class Setting:
     @cached_property
     def ours(self) -> Shield:
         return make_shield(self.policies)
+
+    @cached_property
+    def made_from(self) -> dict[str, Any]:
+        """What records depend on beside the experiment's own fields, as JSON: what is long as its sha256."""
+        case = self.case
+        made_from = {
+            "specshield": __version__,
+            "task": case.task.content_hash,
+            "instruction": case.instruction,
+            "target": list(case.target),
+        }
+        for policy in self.policies:
+            made_from[f"policy {policy.card['method']}"] = _hash(policy.weights())
+        if self.experiment.model == "learned":
+            temperature = read(MODELS / FOLDER).temperature
+            made_from["learned model"] = _hash((MODELS / FOLDER / WEIGHTS).read_bytes() + b"%r" % temperature)
+        return made_from
 
     def method(self, name: str) -> Method:
         """A method by its name, NAME@M/K with a margin of M metres and K steps of slack.
@@ -148,6 +168,10 @@ def split(method: str) -> tuple[str, float, int]:
             expected=f"NAME@METRES or NAME@METRES/STEPS, the name one of {', '.join(CAREFUL)}",
         )  # fmt: skip
     return kind, margin, slack
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 @lru_cache(maxsize=4)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from specshield.sim.evaluation import read
+from specshield.sim.evaluation import read, read_about
 from specshield.sim.experiment import METHODS, Experiment, split
 from specshield.sim.runs import MAX_STEPS, Record
 from specshield.sim.statistics import summary
@@ -42,7 +42,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
 
 def write(folder: Path) -> dict[str, Any]:
     """Writes results.json and table.md beside the records of an experiment."""
-    experiment = Experiment.from_json(json.loads((folder / "experiment.json").read_text()))
+    experiment, _ = read_about(folder)
     figures = results(experiment, read(folder))
     (folder / "results.json").write_text(json.dumps(figures, indent=1) + "\n")
     (folder / "table.md").write_text(table(figures) + "\n")
