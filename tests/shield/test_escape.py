@@ -8,10 +8,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from specshield.policy import planner
+from specshield.policy import planner, reachability
+from specshield.robot import robot_from_json
 from specshield.robot.unicycle import simulate
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case, shipped
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 
 CASE = load_case("case2")
 ELSEWHERE = (5.0, 4.7, 0.0)
@@ -67,3 +70,71 @@ def test_where_the_rest_is_lost_it_still_leaves():
         history, carry = [*history, tuple(decision.next_poses[decision.action])], decision.carry
     assert task.horizon > len(history)
     assert not inside(history[-1])
+
+
+ROOM = OccupancyGrid(np.zeros((120, 120), bool), 0.05)
+BODY = robot_from_json(
+    {
+        "footprint": {"radius": 0.15},
+        "actions": [
+            {"name": "stay"}, {"name": "forward", "translate": 0.2}, {"name": "back", "translate": -0.2},
+            {"name": "left", "rotate": math.pi / 6}, {"name": "right", "rotate": -math.pi / 6},
+        ],
+    }
+)  # fmt: skip
+REGIONS = {
+    "K": {"type": "rectangle", "min": [2.0, 2.0], "max": [3.0, 3.0]},
+    "Beside": {"type": "rectangle", "min": [3.001, 1.5], "max": [4.0, 3.5]},
+    "A": {"type": "rectangle", "min": [2.0, 2.0], "max": [3.0, 3.0]},
+    "Hall": {"type": "rectangle", "min": [0.5, 0.2], "max": [5.8, 5.8]},
+}
+
+
+def led_out(formula, pose, steps, signals=None):
+    """At which of some steps the robot is in K, or in what lies beside it, and the last decision."""
+    task = make_task(ROOM, BODY, formula, REGIONS, signals=signals)
+    shield, history, carry = make_shield([reachability.synthesise(task)]), [(1.0, 1.0, 0.0), pose], None
+    given = {name: np.full(steps + 2, value) for name, value in (signals or {}).items()}
+    decisions = []
+    for _ in range(steps):
+        now = {name: values[: len(history)] for name, values in given.items()}
+        decision = decide(shield, history, np.zeros(5), signals=now, carry=carry)
+        decisions.append(decision)
+        history, carry = [*history, tuple(decision.next_poses[decision.action])], decision.carry
+    within = [2 < x < 3 and 2 < y < 3 for x, y, _ in history[1:]]
+    beside = [3.001 < x < 4 and 1.5 < y < 3.5 for x, y, _ in history[1:]]
+    return within, beside, decisions
+
+
+@pytest.mark.parametrize(
+    ("formula", "signals"),
+    [
+        ("G[0,40] not K", None),
+        ("not F[0,40] K", None),
+        ("G[0,38] G[0,2] not K", None),
+        ("G[0,2] not A and G[0,40] not K", None),  # one window ends before the robot can be out
+        ("G[0,40] (bat > 0.2) and G[0,40] not K", {"bat": 0.1}),  # lost for good: the other is not
+    ],
+)
+def test_no_other_rule_keeps_it_inside(formula, signals):
+    within, _, decisions = led_out(formula, (2.5, 2.5, 0.0), 6, signals)
+    assert within == [True, True, True, False, False, False, False]
+    assert all(d.mode in ("violated", "fallback") for d in decisions)
+
+
+def test_it_is_not_led_through_another_forbidden_region():
+    within, beside, decisions = led_out("G[0,60] not K and G[0,60] not Beside", (2.75, 2.5, 0.0), 8)
+    assert within == [True] * 4 + [False] * 5
+    assert not any(beside)
+    assert all(d.reason is None for d in decisions)
+
+
+def test_it_heads_out_of_a_region_that_is_too_large_to_search():
+    actions = [{"name": "stay"}, {"name": "forward", "translate": 0.05}, {"name": "back", "translate": -0.05}]
+    slow = robot_from_json({"footprint": {"radius": 0.15}, "actions": actions})
+    task = make_task(ROOM, slow, "G[0,90] not Hall", REGIONS)
+    shield, history, carry = make_shield([reachability.synthesise(task)]), [(3.0, 3.0, 0.0)], None
+    for _ in range(60):
+        decision = decide(shield, history, np.zeros(3), carry=carry)
+        history, carry = [*history, tuple(decision.next_poses[decision.action])], decision.carry
+    assert [x > 0.5 for x, _, _ in history].index(False) == 51  # 2.5 m, and not on the edge

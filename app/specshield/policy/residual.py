@@ -40,8 +40,8 @@ def left_over(
 
 
 def again(broken: Sequence[Always], t: int) -> list[Formula]:
-    """The broken G, enforced from step t on."""
-    return [Always(max(each.a, t), each.b, each.child) for each in broken]
+    """The broken G whose windows are not over by step t, enforced from then on."""
+    return [Always(max(each.a, t), each.b, each.child) for each in broken if each.b >= t]
 
 
 def joined(parts: Sequence[Formula]) -> Formula:

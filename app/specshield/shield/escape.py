@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,13 @@ from specshield.robot.unicycle import Body, successors
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Futures, Prefix
 from specshield.stl import SATISFIED_ABOVE, Always, robustness
+from specshield.task import Task
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-WIDTH = 64  # poses kept after each first motion: those nearest to being out
-LONGEST = 64  # [steps]
+WORK = 1024  # poses tried at a step, about
+LONGEST = 24  # [steps]
 ALIKE = 1e3  # [1/m, 1/rad] poses as near as a millimetre count as one
 
 
@@ -33,30 +34,62 @@ class Layer(NamedTuple):
     parent: Ints
 
 
-def escape(shield: Shield, prefix: Prefix, broken: Sequence[Always]) -> tuple[int, Futures | None]:
-    """How many steps it takes at least until every `broken` holds again, 0 where no way was found; and, where
-    it takes more than one, such ways with what the policies propose from their ends.
+def flat(formula: Always) -> Always:
+    """A G of a G as one."""
+    while isinstance(formula.child, Always):
+        inner = formula.child
+        formula = Always(formula.a + inner.a, formula.b + inner.b, inner.child)
+    return formula
 
-    At most one way for each first motion. The signals keep their last values.
+
+def is_place(task: Task, formula: Always) -> bool:
+    """Whether a robot keeps a G by its pose, step by step: by leaving a place, or keeping off it."""
+    return formula.child.horizon == 0 and any(name not in task.signals for name in formula.child.names)
+
+
+def escape(
+    shield: Shield, prefix: Prefix, broken: Sequence[Always], kept: Sequence[Always]
+) -> tuple[int, Futures | None]:
+    """How many steps it takes until every `broken` whose window is not over holds again, 0 where no way out
+    was found; and, where it takes more than one, such ways, or the one that came nearest to being out, and
+    then on as the policies propose.
+
+    No way breaks one of `kept`, if there is one that does not. At most one way for each first motion. The
+    signals keep their last values.
     """
-    if any(each.child.horizon > 0 for each in broken):
-        return 0, None
-    room = min(LONGEST, *(each.b - prefix.t for each in broken))
+    for guards in (kept, ()) if kept else ((),):
+        steps, ways = _search(shield.body, prefix, broken, guards)
+        if steps > 0:
+            break
+    return steps, _onward(shield, prefix, ways) if steps != 1 and ways else None
+
+
+def _search(
+    body: Body, prefix: Prefix, broken: Sequence[Always], guards: Sequence[Always]
+) -> tuple[int, list[tuple[Ints, Floats]]]:
+    """The fewest steps out, and a way for each first motion that takes no more; 0 where none leads out in
+    LONGEST, and the way that came nearest.
+    """
     root, motion = np.zeros(1, np.int64), np.full(1, -1)
     layers = [Layer(prefix.poses[-1:], root, motion, root)]
-    while len(layers) <= room:
-        layer = _expand(shield.body, layers[-1])
-        out = _holds(prefix, broken, layer.pose)
-        free = np.flatnonzero(out > SATISFIED_ABOVE)
-        if len(free):
-            best = free[np.argsort(-out[free], kind="stable")]
+    width = max(WORK // len(body.translate), len(body.translate))
+    for k in range(1, min(LONGEST, prefix.task.horizon - prefix.t) + 1):
+        layer = _expand(body, layers[-1])
+        layer = _rows(layer, _holding(prefix, guards, layer.pose, prefix.t + k) > SATISFIED_ABOVE)
+        if not len(layer.pose):
+            break
+        out = _holding(prefix, broken, layer.pose, prefix.t + k)
+        order = np.argsort(-out, kind="stable")
+        if out[order[0]] > SATISFIED_ABOVE:
+            best = order[out[order] > SATISFIED_ABOVE]
             _, first = np.unique(layer.root[best], return_index=True)
-            ends = best[np.sort(first)]
-            k = len(layers)
-            ways = [_trace([*layers, layer], int(end)) for end in ends]
-            return k, None if k == 1 else _onward(shield, prefix, ways)
-        layers.append(_keep(layer, out))
-    return 0, None
+            return k, [_trace([*layers, layer], int(end)) for end in best[np.sort(first)]]
+        layers.append(_rows(layer, order[:width]))
+    return 0, [_trace(layers, 0)] if len(layers) > 1 else []
+
+
+def _rows(layer: Layer, which: NDArray[Any]) -> Layer:
+    return Layer(*(column[which] for column in layer))
 
 
 def _expand(body: Body, layer: Layer) -> Layer:
@@ -78,24 +111,16 @@ def _successors(body: Body, poses: Floats, out: Floats) -> None:
         successors(body, poses[i], out[i * count : (i + 1) * count])
 
 
-def _holds(prefix: Prefix, broken: Sequence[Always], poses: Floats) -> Floats:
-    """By how much all of what is broken would hold at each pose [N]."""
+def _holding(prefix: Prefix, formulas: Sequence[Always], poses: Floats, t: int) -> Floats:
+    """By how much all whose window holds step t would hold there at each pose [N]; inf for none."""
+    least = np.full(len(poses), np.inf)
     now = {name: values[-1:] for name, values in prefix.signals.items()}
     samples = prefix.task.samples(poses[:, None], now)
-    held = [robustness(each.child, {n: samples[n] for n in each.child.names}) for each in broken]
-    least: Floats = np.min(held, axis=0)
+    for formula in formulas:
+        if formula.a <= t <= formula.b:
+            child = formula.child
+            least = np.minimum(least, robustness(child, {n: samples[n] for n in child.names}))
     return least
-
-
-def _keep(layer: Layer, out: Floats) -> Layer:
-    """Those nearest to being out, WIDTH for each first motion."""
-    order = np.argsort(-out, kind="stable")
-    rank = np.empty(len(order), np.int64)
-    for root in np.unique(layer.root):
-        own = order[layer.root[order] == root]
-        rank[own] = np.arange(len(own))
-    kept = np.flatnonzero(rank < WIDTH)
-    return Layer(layer.pose[kept], layer.root[kept], layer.motion[kept], layer.parent[kept])
 
 
 def _trace(layers: Sequence[Layer], at: int) -> tuple[Ints, Floats]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +13,9 @@ from specshield.policy.view import view_of
 from specshield.shield import shaping
 from specshield.shield.aim import aim
 from specshield.shield.decision import Shield
-from specshield.shield.escape import escape
+from specshield.shield.escape import escape, flat, is_place
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho, together
-from specshield.stl import SATISFIED_ABOVE, Formula
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -44,16 +44,15 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
     robot, asked = shield.task.robot, shield.config.margin
     motions = len(robot.motions)
     tried = futures(prefix, shield.body, shield.policies, tail, asked)
-    whole = rho(prefix, tried)
-    best = best_of(tried, whole, motions)
-    feasible, lowered = _kept(best, asked)
+    whole = kept = rho(prefix, tried)
+    best, part = best_of(tried, kept, motions), prefix
     if violated:
-        tried, best = _left(shield, prefix, tried, best)
-        whole = rho(prefix, tried)
-        feasible, lowered = _kept(best, asked)
+        tried, best, part = _left(shield, prefix, tried)
+        whole, kept = rho(prefix, tried), rho(part, tried)
+    feasible, lowered = _kept(best, asked)
     values = best.robustness
-    if not violated and (shield.config.slack or lowered):
-        best, feasible, lowered = aim(shield, prefix, tried, whole)
+    if lowered or (shield.config.slack and _some(best)):
+        best, feasible, lowered = aim(shield, part, tried, kept)
     some, first = bool(feasible.any()), tried.preferred
     if tail and feasible[tail[0]]:
         first = tail[0]
@@ -72,34 +71,54 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
     )
 
 
-def _left(shield: Shield, prefix: Prefix, tried: Futures, best: Best) -> tuple[Futures, Best]:
-    """The futures by what can still be kept of a formula that is violated, the most demanding first.
+def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best, Prefix]:
+    """The futures by what can still be kept of a formula that is violated, and the prefix as that sees it.
 
-    That is all but what is broken, with a broken G again from the next step, or else from the earliest step
-    at which it can hold again; without it; and that G alone.
+    The first of these that some future keeps: all but what is broken, with a broken G again from the next
+    step; from the earliest step at which it can hold again; that with the other G, before what is to be
+    reached; all but what is broken; the broken G alone. A G over signals that does not hold now is given up.
     """
     task, t = shield.task, prefix.t
-    kept, broken = left_over(task.formula, task.samples(prefix.poses, prefix.signals), t)
+    kept, lost = left_over(task.formula, task.samples(prefix.poses, prefix.signals), t)
+    broken = [
+        each
+        for each in map(flat, lost)
+        if is_place(task, each) or each.child.horizon > 0 or _holds_now(prefix, each)
+    ]
+    places = [each for each in broken if is_place(task, each)]
+    guards = [flat(each) for each in kept if isinstance(each, Always)]
+    guards = [each for each in guards if is_place(task, each)]
 
-    def by(parts: Sequence[Formula]) -> Best:
+    def options() -> Iterator[list[Formula]]:
+        nonlocal tried
+        if broken:
+            yield [*kept, *again(broken, t + 1)]
+        if places:
+            steps, ways = escape(shield, prefix, places, guards)
+            if ways is not None:
+                tried = together(tried, ways)
+            if steps > 0:
+                others = [each for each in broken if each not in places]
+                yield [*kept, *again(broken, t + steps)]
+                if others:
+                    yield [*kept, *again(places, t + steps)]
+                yield [*guards, *again(places, t + steps)]
+        yield kept
+
+    part, best = prefix, None
+    for parts in filter(None, options()):
         formula = joined(parts)
         part = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
-        return best_of(tried, rho(part, tried), len(task.robot.motions))
-
-    steps = 0
-    if broken:
-        best = by([*kept, *again(broken, t + 1)])
+        best = best_of(tried, rho(part, tried), len(task.robot.motions))
         if _some(best):
-            return tried, best
-        steps, ways = escape(shield, prefix, broken)
-        if ways is not None:
-            tried = together(tried, ways)
-            best = by([*kept, *again(broken, t + steps)])
-    if kept and not _some(best):
-        best = by(kept)
-    if steps > 0 and not _some(best):
-        best = by(again(broken, t + steps))
-    return tried, best
+            break
+    return tried, best or best_of(tried, rho(part, tried), len(task.robot.motions)), part
+
+
+def _holds_now(prefix: Prefix, formula: Always) -> bool:
+    """Whether what a G over signals alone asks for holds at x_t."""
+    now = {name: values[-1:] for name, values in prefix.task.samples(prefix.poses, prefix.signals).items()}
+    return bool(robustness(formula.child, {n: now[n] for n in formula.child.names}) > SATISFIED_ABOVE)
 
 
 def _some(best: Best) -> bool:
