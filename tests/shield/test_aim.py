@@ -60,6 +60,28 @@ def test_a_margin_lost_to_what_was_driven_is_asked_of_what_is_to_come(formula):
     assert found.robustness[FORWARD] == pytest.approx(0.05)
 
 
+@pytest.mark.parametrize(
+    ("formula", "motions", "asked", "feasible", "reason"),
+    [
+        ("F[0,4] A and F[0,0] x > 9", [WAIT], {"slack": 0}, [1, 1, 1, 1], None),
+        ("F[0,4] A and F[0,0] x > 9", [WAIT], {"slack": 2}, [1, 0, 0, 0], None),
+        ("F[0,4] A and F[0,0] x > 9", [WAIT, WAIT], {"slack": 2}, [1, 0, 0, 0], "margin_unattainable"),
+        ("F[0,2] A and F[0,0] x > 9", [LEFT], {"slack": 1}, [0, 0, 0, 0], "infeasible"),
+        # the F is settled by 0.05 m; of the G, broken at x_0, one more cell keeps 0.35 m, the others 0.15 m
+        ("F[0,0] x > 0.05 and G[0,4] x > 0.15", [FORWARD], {"margin": 0.1}, [1, 1, 1, 1], None),
+        ("F[0,0] x > 0.05 and G[0,4] x > 0.15", [FORWARD], {"margin": 0.2}, [1, 0, 0, 0], None),
+        ("F[0,0] x > 0.05 and G[0,4] x > 0.15", [FORWARD], {"margin": 0.4}, [1, 0, 0, 0],
+         "margin_unattainable"),
+    ],
+)  # fmt: skip
+def test_what_is_left_of_a_violated_rule_has_its_slack_and_its_margin(
+    formula, motions, asked, feasible, reason
+):
+    found = decision(formula, *motions, **asked)
+    assert list(found.j_values[:4]) == feasible
+    assert (found.mode, found.reason) == ("violated", reason)
+
+
 @pytest.mark.parametrize("asked", [{"slack": 1}, {"margin": 0.3}, {"slack": 2, "margin": 0.3}])
 def test_a_real_valued_j_is_rho_whatever_is_asked_beside_it(asked):
     plain = {"evaluation": "robustness", "threshold": 0.05}

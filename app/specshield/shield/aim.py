@@ -21,7 +21,7 @@ Bools = NDArray[np.bool_]
 def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[Best, Bools, bool]:
     """(best futures, which motions keep what can be had, whether it is less than was asked for).
 
-    whole [N]: rho of the futures on the whole formula; what does not satisfy it keeps nothing.
+    whole [N]: rho of the futures on the whole of `prefix.formula`; what does not satisfy it keeps nothing.
     """
     motions, margin = len(shield.task.robot.motions), SATISFIED_ABOVE + shield.config.margin
 
