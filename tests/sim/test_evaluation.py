@@ -114,7 +114,7 @@ def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_pat
             try:
                 return evaluate(asked, 1, ["unmodified"], out)
             except InputError as error:
-                return error.path, error.got
+                return str(error), error.expected
             finally:
                 experiment._setting.cache_clear()
 
@@ -133,13 +133,15 @@ def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_pat
         path.write_text(path.read_text().replace('"instruction": "', '"instruction": "please '))
 
     assert same(changed("nothing", lambda maps, models: None)) == same(kept)
-    for name, spoil, said in (
+    for name, spoil, what in (
         ("map", map_and_no_dqn, "task, policy dqn"),
         ("errand", instruction, "instruction"),
         ("dqn", lambda _, models: last_bit(models / "case1-dqn" / "policy.safetensors"), "policy dqn"),
         ("fm", lambda _, models: last_bit(models / "fm" / "model.safetensors"), "learned model"),
     ):
-        assert changed(name, spoil) == ("out", f"changed since: {said}")
+        said, expected = changed(name, spoil)
+        assert said == f"since the records in {out} were made there is another {what}"
+        assert expected.startswith("another --out")
     (out / "experiment.json").write_text(json.dumps(asked.to_json()))  # as it was before it said
     with pytest.raises(InputError, match="does not say") as caught:
         evaluate(asked, 2, ["unmodified"], out)

@@ -109,15 +109,15 @@ def _check(folder: Path, experiment: Experiment) -> None:
         )  # fmt: skip
     if made_from is None:
         raise InputError(
-            "the folder does not say which map, policies and model its records were made from", path="out",
-            got=str(folder), expected="another folder; `specshield report` still reads this one",
+            f"{folder} does not say which map, policies and model its records were made from", path="out",
+            got=str(folder), expected="another --out; `specshield report` reads this one as it is",
         )  # fmt: skip
     now = experiment.setting.made_from
     changed = [name for name in {**made_from, **now} if made_from.get(name) != now.get(name)]
     if changed:
         raise InputError(
-            "the folder's records were made from something else than is there now", path="out",
-            got=f"changed since: {', '.join(changed)}", expected="another folder, or what was there then",
+            f"since the records in {folder} were made there is another {', '.join(changed)}", path="out",
+            got=changed, expected="another --out, or what was there then",
         )  # fmt: skip
 
 
