@@ -51,3 +51,14 @@ def test_every_method_has_a_curve_of_its_own(make):
     assert [curve.get_label() for curve in curves] == names
     assert len({(curve.get_color(), curve.get_linestyle()) for curve in curves}) == len(names)
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == names
+
+
+def test_look_ahead_is_told_as_a_share_of_the_projection():
+    ours = {"kl": 160.0, "extra_steps": {"mean": 100.0}}
+    ahead = {"kl": 40.0, "extra_steps": {"mean": 90.0}}
+    assert list(writeup._look_ahead({"ours": ours, "lookahead": ahead})) == [
+        "- lookahead, as a share of ours: KL a run 0.25, mean extra steps 0.90."
+    ]
+    at_no_cost = {"kl": 0.0, "extra_steps": {"mean": None}}
+    assert not list(writeup._look_ahead({"ours": at_no_cost, "lookahead": ahead}))
+    assert not list(writeup._look_ahead({"ours": ours}))

@@ -6,7 +6,7 @@ Every figure in the page is read from a results.json; the words around them are 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -173,6 +173,7 @@ def _short(results: Results) -> str:
             parts.append(f"main task {points:+.1f} points below unmodified{over}")
         if parts:
             lines.append(f"- {one['method']}: {'; '.join(parts)}.")
+    lines += _look_ahead({one["method"]: one for one in results["methods"]})
     left = results["left"]
     if left["of"]:
         lines.append(
@@ -180,6 +181,20 @@ def _short(results: Results) -> str:
             f"unmodified does its task in {left['done']} of {left['of']} runs."
         )
     return "\n".join(lines)
+
+
+def _look_ahead(methods: Mapping[str, Results]) -> Iterator[str]:
+    """What looking ahead saves of what the projection costs, where both were run and it costs something."""
+    if not {"ours", "lookahead"} <= set(methods):
+        return
+    ours, ahead = methods["ours"], methods["lookahead"]
+    shares = [("KL a run", ahead["kl"], ours["kl"])]
+    shares.append(("mean extra steps", ahead["extra_steps"]["mean"], ours["extra_steps"]["mean"]))
+    parts = [
+        f"{name} {mine / whole:.2f}" for name, mine, whole in shares if whole is not None and whole > 1.0
+    ]
+    if parts:
+        yield f"- lookahead, as a share of ours: {', '.join(parts)}."
 
 
 def _noise_table(experiments: Sequence[Results]) -> str:
