@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -223,6 +225,37 @@ def test_a_robot_that_cannot_stand_still_is_planned_for():
         simulate(shield.body, history[0], motions, again)
         np.testing.assert_array_equal(poses, again)
     assert any(decide(shield, history, np.zeros(3)).j_values)
+
+
+FORWARD = {"name": "go", "translate": 0.2}
+HASTY = {  # none of them has a turn on the spot and a stop
+    "car": [FORWARD, *({"name": f"arc {a}", "translate": 0.15, "rotate": a} for a in (0.5, -0.5))],
+    "no stop": [FORWARD, *({"name": f"turn {a}", "rotate": a} for a in (1.5, -1.5))],
+    "rail": [FORWARD, {"name": "back", "translate": -0.2}, {"name": "stop"}],
+}
+
+
+@pytest.mark.parametrize("actions", HASTY.values(), ids=list(HASTY))
+def test_a_robot_that_has_to_bide_its_time_in_motion_is_there_in_time(actions):
+    """Windows that open later than it could be there, or leave, against every way of seven motions."""
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": actions})
+    random, found, missed = np.random.default_rng(4), 0, 0
+    choices = np.array(list(itertools.product(range(3), repeat=7)))
+    for rule in ("F[3,7] C", "G[5,7] not C", "F[7,7] C", "F[4,7] C and G[0,2] C"):
+        task = make_task(ROOM, robot, rule, {"C": {"type": "circle", "center": [3, 3], "radius": 0.6}})
+        policy, ways = synthesise(task), np.empty((len(choices), 8, 3))
+        body = make_shield([policy]).body
+        for _ in range(6):
+            ways[:, 0] = *random.uniform(2.5, 3.5, 2), random.uniform(-3.1, 3.1)
+            for motions, poses in zip(choices, ways, strict=True):
+                simulate(body, poses[0], motions, poses[1:])
+            kept = robustness(task.formula, task.samples(ways)) > 0.0
+            some = np.array([kept[choices[:, 0] == m].any() for m in range(3)])
+            claimed = decide_at(policy, ways[0, 0])[1] == 1.0
+            assert not (claimed & ~some).any()
+            found, missed = found + claimed.sum(), missed + (some & ~claimed).sum()
+    assert found > 40
+    assert missed <= 0.02 * found
 
 
 def test_what_is_broken_is_dropped_and_the_rest_is_kept():

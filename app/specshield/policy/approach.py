@@ -34,15 +34,17 @@ class World(NamedTuple):
     """What a search reads.
 
     field [L, 2]: the field that leads to each literal freely, and the one that keeps to what has to hold for
-    a while; -1 for none. pad: the motion that stays, or comes nearest to it. cost: of one evaluation of the
-    formula [about us]. margin: rho to aim above.
+    a while; -1 for none. band: how far these may err [steps]. pad: the motion that stays, or comes nearest to
+    it; stands: whether it stays. cost: of one evaluation of the formula [about us]. margin: rho to aim above.
     """
 
     body: Body
     fields: Fields
     agenda: Agenda
     field: Ints
+    band: float
     pad: int
+    stands: bool
     cost: float
     margin: float
 
@@ -107,6 +109,32 @@ def _keeps(world: World, goal: int, at: int, need: Ints, rho: Floats) -> bool:
     return kept
 
 
+@leaf
+def linger(
+    world: World, k: int, t: int, n: int, stop: int, need: Ints, motions: Ints, poses: Floats, work: Work
+) -> None:
+    """Stays from motions[:n] to motions[:stop]; a robot that cannot stays near where literal k holds, so that
+    it does in the end.
+    """
+    if world.stands:
+        stay(world, t, n, stop, motions, poses, work)
+        return
+    read_at(world, poses, n, work)
+    kept = True
+    for i in range(n, stop):
+        move(world, t, i, world.pad, motions, poses, work)
+        kept = kept and _keeps(world, k, t + i + 1, need, work.rho)
+    if world.field[k, 0] < 0 or (kept and holds(world, k, work.rho)):
+        return
+    while n < stop:
+        i = min(LENGTH, stop - n)
+        after = beam(world, k, world.field[k, 0], t, n, n + i, np.inf, i, i, need, motions, poses, work)
+        if after < 0:
+            stay(world, t, n, stop, motions, poses, work)
+            return
+        n = after
+
+
 @merged
 def walk(
     world: World,
@@ -127,13 +155,14 @@ def walk(
     stay where the way down would break it, instead of going round.
     """
     body, scores = world.body, work.scores
-    best, best_n, detours = np.inf, n, 0
+    begin, best, best_n, detours = n, np.inf, n, 0
     x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
     while n < stop:
         if n - best_n > PATIENCE:
             detours += 1
             best = to_go_at(body, world.fields, f, poses[best_n, 0], poses[best_n, 1], poses[best_n, 2])
-            n = beam(world, k, f, t, best_n, stop, max(best - GAIN, 0.0), DETOUR, need, motions, poses, work)
+            enough = max(best - GAIN, 0.0)
+            n = beam(world, k, f, t, best_n, stop, enough, 0, DETOUR, need, motions, poses, work)
             if n < 0 or detours == DETOURS:
                 return -1
             x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
@@ -143,7 +172,7 @@ def walk(
             best, best_n = np.inf, n
             continue
         work.spent[0] += 2.0
-        last = motions[n - 1] if n > 0 else -1
+        last = motions[n - 1] if n > begin else -1
         to_go_after(body, world.fields, f, x, y, theta, last, scores)
         barred = False
         while True:
@@ -193,19 +222,21 @@ def beam(
     n: int,
     stop: int,
     enough: float,
+    shortest: int,
     longest: int,
     need: Ints,
     motions: Ints,
     poses: Floats,
     work: Work,
 ) -> int:
-    """A beam down field f from motions[:n] to fewer steps to go than `enough`, or to where literal k holds.
+    """A beam down field f from motions[:n] to fewer steps to go than `enough`, or to where literal k holds,
+    after `shortest` steps or later.
 
-    Returns how many motions there are then, -1 where it finds no way. Other arguments as in `_walk`.
+    Returns how many motions there are then, -1 where it finds no way. Other arguments as in `walk`.
     """
     body, places, trail = world.body, work.places, work.trail
     places[0, 0, 0], places[0, 0, 1], places[0, 0, 2] = poses[n, 0], poses[n, 1], poses[n, 2]
-    trail[0, 0, 1] = motions[n - 1] if n > 0 else -1
+    trail[0, 0, 1] = -1
     count, reached = 1, -1
     for i in range(1, min(longest, stop - n) + 1):
         kept = 0
@@ -213,12 +244,15 @@ def beam(
         for w in range(count):
             last = trail[i - 1, w, 1]
             moved, turned = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
+            if shortest > 0:
+                moved = turned = 0.0  # there is time to go to and fro
             for m in range(body.translate.shape[0]):
-                if m == world.pad or body.translate[m] * moved < 0.0 or body.rotate[m] * turned < 0.0:
+                back = body.translate[m] * moved < 0.0 or body.rotate[m] * turned < 0.0
+                if back or (m == world.pad and world.stands):
                     continue
                 x, y, theta = step(body, places[i - 1, w, 0], places[i - 1, w, 1], places[i - 1, w, 2], m)
                 led = abs(x - places[i - 1, w, 0]) + abs(y - places[i - 1, w, 1]) > NUDGE
-                if not led and theta == places[i - 1, w, 2]:
+                if shortest == 0 and not led and theta == places[i - 1, w, 2]:
                     continue
                 ahead = to_go_at(body, world.fields, f, x, y, theta)
                 if kept == WIDTH and not ahead < places[i, kept - 1, 3]:
@@ -227,11 +261,11 @@ def beam(
                 if not _keeps(world, k, t + n + i, need, work.rho):
                     continue
                 if holds(world, k, work.rho):
-                    ahead = -1.0
+                    ahead = -1.0 - abs(work.rho[world.agenda.literal[k, 0]])
                 kept = _keep(i, kept, x, y, theta, ahead, w, m, places, trail)
         if kept == 0:
             return -1
-        if places[i, 0, 3] < enough:
+        if i >= shortest and places[i, 0, 3] < enough:
             reached = i
             break
         count = kept

@@ -1,11 +1,12 @@
 """Plans for any formula: go to where a predicate holds, stay, go on; searched in exact simulation.
 
 A node of the search is a simulated prefix. Its children serve one literal each, the one due first before
-the others: walk to where it holds and stay until it is not due any more. A child that no continuation can
-save (the upper bound on rho) is cut; a node from which staying to the horizon satisfies the formula ends the
-search. The order is right nearly always, so the search tries first the ways that depart least from it
-(limited discrepancy search, Harvey and Ginsberg 1995). What it may spend is counted, not timed: one question
-has one answer.
+the others: walk to where it holds and stay until it is not due any more; a robot that cannot stay keeps
+near, and the last children of its nodes are its single motions. A child that no continuation can save (the
+upper bound on rho) is cut; a node from which staying to the horizon satisfies the formula ends the search.
+The order is right nearly always, so the search tries first the ways that depart least from it (limited
+discrepancy search, Harvey and Ginsberg 1995). What it may spend is counted, not timed: one question has one
+answer.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from specshield.policy.approach import (
     World,
     beam,
     holds,
+    linger,
     move,
     read_at,
     stay,
@@ -51,13 +53,13 @@ from specshield.stl.program import STACK_SIZE
 from specshield.stl.tree import tree_value
 
 DEEP = 128  # nodes on one way, at most
-BAND = 6.0  # [steps] how far the fields may err
 SPARE = 3  # [steps] left over where one departs as late as can be
 SHARE = 0.25  # of the effort of one plan: what a first motion may cost that the plan does not begin with
 
 MADE, COUNT, TRIED, OPENED, USED = range(5)  # of a node
 KEY, LITERAL, BEFORE, STAY, KEEP = range(5)  # of a child
-FIRST, SECOND, LATER, LAST = 0, 1 << 20, 1 << 21, 1 << 22  # its key: which kind comes first; then what is due
+# Its key: which kind comes first; then what is due.
+FIRST, SECOND, LATER, LAST, ANY = 0, 1 << 20, 1 << 21, 1 << 22, 1 << 23
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -70,7 +72,8 @@ class Nodes(NamedTuple):
     discrepancies USED. need [DEEP, L, 4]: by when a literal is DUE, from which step (BEGIN) UNTIL which it
     has to hold throughout, and until which step as long as it is WITHOUT the child's literal. child
     [DEEP, C, 5], by KEY: go to LITERAL after waiting BEFORE steps, and STAY there (1) or not (0); or, with
-    KEEP, go at once but keep that literal for the next BEFORE steps; or, with LITERAL -1, STAY that long.
+    KEEP, go at once but keep that literal for the next BEFORE steps; or, with LITERAL -1, STAY that long
+    where KEEP holds; or, without both, for a robot that cannot stay, make the motion STAY.
     """
 
     state: Ints
@@ -152,7 +155,7 @@ def _expand(
         stays = stay_for(agenda, k, s, by, steps - n, margin, work.bounds)
         work.spent[0] += bits * world.cost
         if stays <= steps - n and (stays > 1 or (stays == 1 and need[k, BEGIN] == s + 1)):
-            _add(nodes, d, SECOND + by, -1, 0, stays, -1)
+            _add(nodes, d, SECOND + by, -1, 0, stays, k)
             if stays < steps - n:
                 dwelling, dwell = k, stays
     for k in range(need.shape[0]):
@@ -160,7 +163,7 @@ def _expand(
         if f < 0 or holds(world, k, work.rho):
             continue
         ahead = to_go_at(world.body, world.fields, f, x, y, theta)
-        if not ahead - BAND < min(steps - n, by - s):
+        if not ahead - world.band < min(steps - n, by - s):
             continue
         if dwelling >= 0:
             _add(nodes, d, SECOND + min(by, LAST), k, dwell, 1, dwelling)
@@ -171,6 +174,9 @@ def _expand(
         late = by - s - math.ceil(ahead) - SPARE
         if late > 1:
             _add(nodes, d, LATER + by, k, late, 1, -1)
+    if not world.stands and n < steps:
+        for m in range(world.body.translate.shape[0]):
+            _add(nodes, d, ANY, -1, 0, m, -1)
     return False
 
 
@@ -180,30 +186,37 @@ def _serve(
 ) -> int:
     """Makes child c of the node on depth d: how many motions there are then, -1 where it leads nowhere."""
     agenda, margin, steps, need = world.agenda, world.margin, motions.shape[0], nodes.need[d]
-    n = nodes.state[d, MADE]
-    k, before, stays = nodes.child[d, c, LITERAL], nodes.child[d, c, BEFORE], nodes.child[d, c, STAY]
-    keep = nodes.child[d, c, KEEP]
-    if k < 0:
-        stay(world, t, n, n + stays, motions, poses, work)
+    made, child = nodes.state[d, MADE], nodes.child[d, c]
+    k, before, stays, keep = child[LITERAL], child[BEFORE], child[STAY], child[KEEP]
+    n = made
+    if k < 0 and keep < 0:
+        read_at(world, poses, n, work)
+        move(world, t, n, stays, motions, poses, work)
+        n += 1
+    elif k < 0:
+        _guard(world, keep, t + n, t + steps, need, work)
+        linger(world, keep, t, n, n + stays, need, motions, poses, work)
         n += stays
     else:
         by = need[k, DUE]
-        begin, until = 0, 0
+        stop = min(steps, by - t)
+        guarding = _guard(world, k, t + n, t + stop, need, work) or keep >= 0
+        arrived, begin, until = -1, 0, 0
         if keep >= 0:
             begin, until = need[keep, BEGIN], need[keep, UNTIL]
             need[keep, BEGIN], need[keep, UNTIL] = t + n + 1, t + n + before
-        else:
-            stay(world, t, n, n + before, motions, poses, work)
+        elif before > 0:
+            linger(world, k, t, n, n + before, need, motions, poses, work)
             n += before
-        arrived, stop = -1, min(steps, by - t)
-        guarding = _guard(world, k, t + n, t + stop, need, work) and world.field[k, 0] != world.field[k, 1]
+            arrived = n if holds(world, k, work.rho) else -1
+        guarding = guarding and world.field[k, 0] != world.field[k, 1]
         for column in range(1, -1, -1):
             f = world.field[k, column]
             if arrived < 0 and f >= 0 and (column == 0 or guarding):
-                waits = column == 0 or keep >= 0
+                waits = (column == 0 or keep >= 0) and world.stands
                 arrived = walk(world, k, f, waits, t, n, stop, need, motions, poses, work)
                 if arrived < 0:  # it came too late, or got stuck: look at more than one way
-                    arrived = beam(world, k, f, t, n, stop, 0.0, LENGTH, need, motions, poses, work)
+                    arrived = beam(world, k, f, t, n, stop, 0.0, 0, LENGTH, need, motions, poses, work)
         if keep >= 0:
             need[keep, BEGIN], need[keep, UNTIL] = begin, until
         if arrived < 0:
@@ -215,9 +228,9 @@ def _serve(
             work.spent[0] += 8.0 * world.cost
             if 0 < stays <= steps - n:
                 if before == 0:  # or wait first and go there when it counts, or go on before it is served
-                    _add(nodes, d, SECOND + by, k, stays, 1, -1)
+                    _add(nodes, d, SECOND + by, k, stays if world.stands else n - made + stays, 1, -1)
                     _add(nodes, d, LATER + by, k, 0, 0, -1)
-                stay(world, t, n, n + stays, motions, poses, work)
+                linger(world, k, t, n, n + stays, need, motions, poses, work)
                 n += stays
     foresee(agenda, t + n, work.known, work.held, work.bounds.low, work.bounds.high)
     work.spent[0] += world.cost
@@ -321,7 +334,7 @@ def propose_all(
     )  # fmt: skip
     nodes = Nodes(
         np.empty((DEEP, 5), np.int64), np.empty((DEEP, literals, 4), np.int64),
-        np.empty((DEEP, 6 * literals + 1, 5), np.int64),
+        np.empty((DEEP, 6 * literals + count, 5), np.int64),
     )  # fmt: skip
     read_signals(agenda, work.values, work.stack, work.held)
     way, places = np.empty(steps, np.int64), np.empty((steps + 1, 3))

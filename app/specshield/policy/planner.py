@@ -4,7 +4,12 @@ For each predicate of the formula, and its negation where that is asked for, a f
 computed once (policy/fields.py). A decision asks the formula what is due (policy/agenda.py), and searches for
 a way that serves it. What it proposes is certified by the shield like anything else; how often it finds a way
 that exists is measured. It covers what reachability does not: reactive rules over signals, patrols (G F),
-until, disjunctions of temporal parts, nested mixes, robots that cannot stand still.
+until, disjunctions of temporal parts, nested mixes.
+
+A robot that cannot stand still, or cannot turn in place, is planned for too. Of the first motions that some
+future of 7 or 8 steps keeps the rule after, in random rooms with one to three random conjuncts, it certifies
+0.99 for one that moves on arcs and cannot stand, 0.99 or more for one that turns but cannot stand and for one
+that goes to and fro on a line (one that stands and turns: 0.99 or more). Longer horizons are not measured.
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ from safetensors.numpy import save as save_tensors
 from specshield.errors import PolicyError
 from specshield.policy.agenda import Agenda, Bounds, Literal, agenda_of, foresee, is_open, read_signals
 from specshield.policy.approach import World
-from specshield.policy.fields import Fields, steps_to, values_at
+from specshield.policy.fields import FAR, Fields, steps_to, values_at
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
 from specshield.policy.plan import propose_all
 from specshield.policy.policy import Card, Proposal, make_card
@@ -43,6 +48,7 @@ from specshield.world.regions import pack_regions
 MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
 MAX_FIELDS = 32
 USUAL = 150
+BAND = 6.0  # [steps] how far the fields may err; without a turn in place, a lattice has few of the ways
 STARTS = 50  # poses that a new policy is tried from
 
 
@@ -111,7 +117,10 @@ class PlannerPolicy:
             if i >= 0:
                 field[k] = self.chosen[i]
         pad = _pad_motion(self._body)
-        return World(self._body, self.fields, agenda, field, pad, cost_of(agenda), 0.0)
+        stands = bool(self._body.translate[pad] == 0.0 and self._body.rotate[pad] == 0.0)
+        turns = bool(np.any((self._body.translate == 0.0) & (self._body.rotate != 0.0)))
+        band = BAND if turns else 2.0 * FAR
+        return World(self._body, self.fields, agenda, field, band, pad, stands, cost_of(agenda), 0.0)
 
     def propose(
         self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
