@@ -64,6 +64,22 @@ WORLDS = {
     ),
 }
 
+ALONE = {
+    "overlapping windows, in either order": [
+        lambda s: s["A"][..., 1:6].any(-1),
+        lambda s: s["B"][..., 2:].any(-1),
+    ],
+    "one visit that serves two": [
+        lambda s: (s["A"] | s["B"])[..., :5].any(-1),
+        lambda s: s["A"][..., 4:].any(-1),
+    ],
+    "a dwell while another always begins": [
+        lambda s: np.any([s["A"][..., k + 1 : k + 4].all(-1) for k in range(1, 4)], axis=0),
+        lambda s: ~s["A"][..., 5:].any(-1),
+    ],
+}
+"""What each conjunct of a world asks for by itself."""
+
 RESTLESS = replace(ROBOT, name="restless", actions=ROBOT.actions[:WAIT])
 
 
@@ -88,6 +104,28 @@ def test_s_t_is_the_exact_feasible_set_where_it_can_be_enumerated(cells):
             motion = int(random.choice(likely))
             history, carry = [*history, decision.next_poses[motion]], decision.carry
     assert len(seen) > 3
+
+
+@pytest.mark.parametrize("world", ALONE)
+def test_what_each_conjunct_has_a_future_for_need_not_have_one_for_all(world):
+    """Reasoning conjunct by conjunct claims pairs that no single future keeps; S_t has none of them."""
+    cells = WORLDS[world]
+    alone = [Cells(cells.formula, keeps, cells.regions) for keeps in ALONE[world]]
+    shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
+    random, claimed = np.random.default_rng(4), 0
+    for i, j, heading in [(i, j, h) for i, j in ((0, 0), (0, 1), (2, 1), (2, 2), (4, 2)) for h in range(4)]:
+        history = [cells.pose(i, j, heading)]
+        for _ in range(cells.task.horizon):
+            decision = decide(shield, history, np.zeros(5))
+            if decision.mode not in ("shaped", "fallback"):
+                break
+            one_by_one = np.all([each.feasible(history) for each in alone], axis=0)
+            wrong = one_by_one & ~cells.feasible(history)
+            claimed += int(wrong.sum())
+            assert not np.array(decision.j_values[:MOTIONS])[wrong].any()
+            likely = np.flatnonzero(one_by_one) if one_by_one.any() else np.arange(MOTIONS)
+            history.append(decision.next_poses[int(random.choice(likely))])
+    assert claimed > 0
 
 
 @pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
