@@ -86,7 +86,8 @@ def _lines(figures: Figures, race: Figures | None) -> Iterator[str]:
     yield "## Growth"
     yield ""
     yield (
-        "Case 2 at t = 0, from starts feasible or not: its windows stretched to each horizon (7 distinct "
+        "Case 2 at t = 0, from starts feasible or not (none breaks the rule already): its windows "
+        "stretched to each horizon (7 distinct "
         "motions, the shipped network), and with made robots of more distinct motions (T = 150, the shipped "
         "network, which uses the Stretch's seven of them; lost: one of random weights, which satisfies "
         "nothing, so that each motion is followed by a rollout of its own and each step of it looks at each)."

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.decisions import ask, warm
 from benchmarks.states import State, shipped_dqn
@@ -22,6 +23,7 @@ from specshield.robot.actions import Action
 from specshield.robot.unicycle import make_body
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
+from specshield.stl import SATISFIED_ABOVE, robustness_bounds
 from specshield.task import Task, make_task
 
 HORIZONS = (20, 50, 100, 200, 500, 1000)
@@ -109,5 +111,12 @@ def _row(task: Task, dqn: Policy, n: int, repeats: int, seed: int) -> dict[str, 
 
 
 def _states(task: Task, n: int, seed: int) -> list[State]:
-    poses = free_poses(task, make_body(task.robot, task.grid), n, np.random.default_rng([seed, 20]))
-    return [State(pose[None], np.zeros(len(task.robot.actions)), None) for pose in poses]
+    """Starts, feasible or not, that do not break the rule already."""
+    poses = free_poses(task, make_body(task.robot, task.grid), 2 * n, np.random.default_rng([seed, 20]))
+    whole = [pose for pose in poses if _bounds(task, pose)[1] > SATISFIED_ABOVE][:n]
+    return [State(pose[None], np.zeros(len(task.robot.actions)), None) for pose in whole]
+
+
+def _bounds(task: Task, pose: NDArray[np.float64]) -> tuple[float, float]:
+    low, high = robustness_bounds(task.formula, task.samples(pose[None], {}))
+    return float(low), float(high)

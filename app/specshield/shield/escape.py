@@ -20,6 +20,7 @@ Ints = NDArray[np.int64]
 
 WORK = 1024  # poses tried at a step, about
 LONGEST = 24  # [steps]
+WAYS = 4  # that are gone on with: each asks every policy
 ALIKE = 1e3  # [1/m, 1/rad] poses as near as a millimetre count as one
 
 
@@ -54,8 +55,8 @@ def escape(
     was found; and, where it takes more than one, such ways, or the one that came nearest to being out, and
     then on as the policies propose.
 
-    No way breaks one of `kept`, if there is one that does not. At most one way for each first motion. The
-    signals keep their last values.
+    No way breaks one of `kept`, if there is one that does not. Each way has another first motion. The signals
+    keep their last values.
     """
     for guards in (kept, ()) if kept else ((),):
         steps, ways = _search(shield.body, prefix, broken, guards)
@@ -67,8 +68,8 @@ def escape(
 def _search(
     body: Body, prefix: Prefix, broken: Sequence[Always], guards: Sequence[Always]
 ) -> tuple[int, list[tuple[Ints, Floats]]]:
-    """The fewest steps out, and a way for each first motion that takes no more; 0 where none leads out in
-    LONGEST, and the way that came nearest.
+    """The fewest steps out, and some ways that take no more, each by another first motion; 0 where none leads
+    out in LONGEST, and the way that came nearest.
     """
     root, motion = np.zeros(1, np.int64), np.full(1, -1)
     layers = [Layer(prefix.poses[-1:], root, motion, root)]
@@ -83,7 +84,7 @@ def _search(
         if out[order[0]] > SATISFIED_ABOVE:
             best = order[out[order] > SATISFIED_ABOVE]
             _, first = np.unique(layer.root[best], return_index=True)
-            return k, [_trace([*layers, layer], int(end)) for end in best[np.sort(first)]]
+            return k, [_trace([*layers, layer], int(end)) for end in best[np.sort(first)[:WAYS]]]
         layers.append(_rows(layer, order[:width]))
     return 0, [_trace(layers, 0)] if len(layers) > 1 else []
 
