@@ -5,11 +5,13 @@ Near a wall many motions end in the same pose; arcs of one length end in the sam
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf
-from specshield.robot.unicycle import Body, wrap
+from specshield.robot.unicycle import Body, step, wrap
 
 ALIKE = 1e-9  # [rad] as good as the same angle
 NONE = -2  # no motion does it
@@ -108,3 +110,21 @@ def join(
             motions[n] = base[at] if at < steps else wait
             at += 1
         n += 1
+
+
+@leaf
+def undoing(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]) -> int:
+    """The motion that leads from `reached` back to `pose`, -1 where it is the same, NONE where none does."""
+    if _is_near(pose[0], pose[1], pose[2], reached):
+        return -1
+    for m in range(body.translate.shape[0]):
+        x, y, theta = step(body, reached[0], reached[1], reached[2], m)
+        if _is_near(x, y, theta, pose):
+            return m
+    return NONE
+
+
+@leaf
+def _is_near(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
+    turn = abs(theta - pose[2])
+    return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)

@@ -17,16 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf, merged
+from specshield.compiled import leaf, merged
 from specshield.policy.agenda import (
     NEVER,
-    Bounds,
     due,
     foresee,
     is_open,
     needed_until,
     needed_without,
-    read_signals,
     stay_for,
 )
 from specshield.policy.approach import (
@@ -34,7 +32,6 @@ from specshield.policy.approach import (
     DUE,
     LENGTH,
     UNTIL,
-    WIDTH,
     WITHOUT,
     Work,
     World,
@@ -46,15 +43,11 @@ from specshield.policy.approach import (
     stay,
     walk,
 )
-from specshield.policy.detour import join
 from specshield.policy.fields import to_go_at
-from specshield.robot.unicycle import Body, step
-from specshield.stl.program import STACK_SIZE
 from specshield.stl.tree import tree_value
 
 DEEP = 128  # nodes on one way, at most
 SPARE = 3  # [steps] left over where one departs as late as can be
-SHARE = 0.25  # of the effort of one plan: what a first motion may cost that the plan does not begin with
 
 MADE, COUNT, TRIED, OPENED, USED = range(5)  # of a node
 KEY, LITERAL, BEFORE, STAY, KEEP = range(5)  # of a child
@@ -82,7 +75,7 @@ class Nodes(NamedTuple):
 
 
 @leaf
-def _value(world: World, work: Work) -> float:
+def value(world: World, work: Work) -> float:
     """rho of a way that is complete."""
     for i in range(work.buffer.shape[0]):
         work.buffer[i] = work.known[i]
@@ -131,7 +124,7 @@ def _expand(
     state[MADE], state[USED], state[COUNT], state[TRIED], state[OPENED] = n, used, 0, 0, 0
     stay(world, t, n, steps, motions, poses, work)
     work.spent[0] += 0.1 * (steps - n)
-    if _value(world, work) > margin:
+    if value(world, work) > margin:
         return True
     read_at(world, poses, n, work)
     foresee(agenda, s, work.known, work.held, work.bounds.low, work.bounds.high)
@@ -238,7 +231,7 @@ def _serve(
 
 
 @leaf
-def _search(
+def search(
     world: World, t: int, n: int, effort: float, motions: Ints, poses: Floats, work: Work, nodes: Nodes
 ) -> bool:
     """A way to the horizon that satisfies the formula, on from motions[:n], into motions (T - t,) and
@@ -269,103 +262,3 @@ def _search(
         if after > state[d, MADE]:
             made, used = after, state[d, USED] + state[d, OPENED]
             state[d, OPENED] += 1
-
-
-@leaf
-def _undoing(body: Body, pose: Floats, reached: Floats) -> int:
-    """The motion that leads from `reached` back to `pose`, -1 where it is the same, -2 where none does."""
-    if _same(pose[0], pose[1], pose[2], reached):
-        return -1
-    for m in range(body.translate.shape[0]):
-        x, y, theta = step(body, reached[0], reached[1], reached[2], m)
-        if _same(x, y, theta, pose):
-            return m
-    return -2
-
-
-@leaf
-def _same(x: float, y: float, theta: float, pose: Floats) -> bool:
-    turn = abs(theta - pose[2])
-    return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)
-
-
-@leaf
-def _rejoin(world: World, t: int, base: Ints, motions: Ints, poses: Floats, work: Work) -> bool:
-    """Undoes the first motion and goes by `base` (T - t,), a way from x_t; the steps lost are made up where
-    it stays. Whether that satisfies the formula.
-    """
-    back = _undoing(world.body, poses[0], poses[1])
-    if back == -2:
-        return False
-    join(back, -1, base, 0, world.pad, motions)
-    for n in range(1, motions.shape[0]):
-        move(world, t, n, motions[n], motions, poses, work)
-    work.spent[0] += 0.3 * motions.shape[0]
-    return _value(world, work) > world.margin
-
-
-@kernel
-def propose_all(
-    world: World,
-    t: int,
-    pose: Floats,
-    signals: Floats,
-    prefix: Floats,
-    effort: float,
-    motions: Ints,
-    poses: Floats,
-) -> tuple[int, bool]:
-    """A continuation a first motion, into motions (M, T - t) and poses (M, T - t + 1, 3); returns the motion
-    that the plan from x_t takes, and whether there is one.
-
-    signals (S,): those held; prefix (size,): the formula's leaves to step t. One plan is made from x_t, if
-    there is one. For the other first motions it is enough to undo them and go the same way; where that comes
-    too late, they are planned for themselves.
-    """
-    agenda, (count, steps) = world.agenda, motions.shape
-    size, literals, leaves = prefix.shape[0], agenda.literal.shape[0], agenda.leaf.shape[0]
-    bounds = Bounds(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
-    values = np.zeros(3 + agenda.rule.first.shape[0] + signals.shape[0])
-    values[values.shape[0] - signals.shape[0] :] = signals
-    work = Work(
-        values, np.empty(STACK_SIZE), np.empty(agenda.predicate.shape[0]), np.empty(leaves), prefix.copy(),
-        np.empty(size), bounds, np.empty(count), np.empty((LENGTH + 1, WIDTH, 4)),
-        np.empty((LENGTH + 1, WIDTH, 2), np.int64), np.zeros(1),
-    )  # fmt: skip
-    nodes = Nodes(
-        np.empty((DEEP, 5), np.int64), np.empty((DEEP, literals, 4), np.int64),
-        np.empty((DEEP, 6 * literals + count, 5), np.int64),
-    )  # fmt: skip
-    read_signals(agenda, work.values, work.stack, work.held)
-    way, places = np.empty(steps, np.int64), np.empty((steps + 1, 3))
-    base = -1
-    for root in range(
-        -2, count
-    ):  # x_t itself, staying (what others can fall back on), then every other motion
-        m = world.pad if root < 0 else root
-        if root >= -1 and (m == base or (root >= 0 and m == world.pad)):
-            continue
-        work.known[:] = prefix
-        work.spent[0] = 0.0
-        places[0] = pose
-        n, found = 0, False
-        if root >= -1:
-            read_at(world, places, 0, work)
-            move(world, t, 0, m, way, places, work)
-            n = 1
-            if base >= 0:
-                found = _rejoin(world, t, motions[base], way, places, work)
-        read_at(world, places, n, work)
-        foresee(agenda, t + n, work.known, work.held, work.bounds.low, work.bounds.high)
-        if not found and is_open(agenda, -1, t + n, 0, 0, 0, world.margin, work.bounds):
-            found = _search(world, t, n, effort * (1.0 if n == 0 else SHARE), way, places, work, nodes)
-        if root == -2 and not found:
-            continue
-        if root == -2:
-            m = way[0]
-        if found and base < 0:
-            base = m
-        if not found:
-            stay(world, t, n, steps, way, places, work)
-        motions[m], poses[m] = way, places
-    return (base, True) if base >= 0 else (world.pad, False)

@@ -32,7 +32,7 @@ from specshield.policy.agenda import Agenda, Bounds, Literal, agenda_of, foresee
 from specshield.policy.approach import World
 from specshield.policy.fields import FAR, Fields, steps_to, values_at
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
-from specshield.policy.plan import propose_all
+from specshield.policy.plans import propose_all
 from specshield.policy.policy import Card, Proposal, make_card
 from specshield.policy.progress import signal_rows
 from specshield.policy.residual import residuals

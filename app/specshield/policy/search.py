@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf, merged
 from specshield.policy.beam import EASY, MAX_ROOTS, beam
-from specshield.policy.detour import copy_way, find_sibling, find_twins
+from specshield.policy.detour import NONE, copy_way, find_sibling, find_twins, turn_by
 from specshield.policy.progress import forgive, replay
 from specshield.policy.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.walk import SETTLED_ALL, STUCK, rejoin, walk
@@ -36,7 +36,7 @@ SMALL_SHARE = 512
 class Starts(NamedTuple):
     """After each first motion [M]: the progress, the slack, whether a way was found.
 
-    turn, move: the motions that undo it, nearly; -1 where none is needed, a turn of -2 where there is none.
+    turn, move: the motions that undo it, nearly; -1 where none is needed, a turn of NONE where there is none.
     sibling (3,): scratch.
     """
 
@@ -88,10 +88,10 @@ def propose_all(
             continue
         turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
         starts.settled[m] = _join(guide, t, walked[:ways], int(m), starts, motions, poses, work)
-        if base >= 0 and turn > -2 and not starts.settled[m]:
+        if base >= 0 and turn != NONE and not starts.settled[m]:
             _resume(starts.status[m], starts.run[m], work)
             starts.settled[m] = rejoin(guide, t, turn, move, motions[base], 0, motions[m], poses[m], work)
-        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == -2):
+        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == NONE):
             _resume(starts.status[m], starts.run[m], work)
             escapes = ahead >= (0.0 if base < 0 else EASY)
             starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
@@ -134,22 +134,13 @@ def _first_steps(
         x, y, theta = step(body, pose[0], pose[1], pose[2], m)
         motions[m, 0] = m
         poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
-        starts.turn[m] = _turning_back(body, m) if theta != pose[2] else -1
+        starts.turn[m] = turn_by(body, -body.rotate[m]) if theta != pose[2] else -1
         starts.move[m] = _moving_back(body, m, math.hypot(x - pose[0], y - pose[1]))
         _resume(status, run, work)
         observe(rules, t + 1, x, y, theta, work)
         for k in range(status.shape[0]):
             starts.status[m, k], starts.run[m, k] = work.status[k], work.run[k]
         starts.slack[m] = slack(body, rules, tables, x, y, theta, t + 1, work.status, work.run)
-
-
-@leaf
-def _turning_back(body: Body, motion: int) -> int:
-    """The turn that undoes a motion's, -2 where there is none."""
-    for m in range(body.translate.shape[0]):
-        if body.translate[m] == 0.0 and body.rotate[m] == -body.rotate[motion]:
-            return m
-    return -2
 
 
 @leaf
