@@ -90,7 +90,9 @@ def propose_all(
         starts.settled[m] = _join(guide, t, walked[:ways], int(m), starts, motions, poses, work)
         if base >= 0 and turn != NONE and not starts.settled[m]:
             _resume(starts.status[m], starts.run[m], work)
-            starts.settled[m] = rejoin(guide, t, turn, move, motions[base], 0, motions[m], poses[m], work)
+            starts.settled[m] = rejoin(
+                guide, t, turn, move, motions[base], poses[base], 0, motions[m], poses[m], work
+            )
         if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == NONE):
             _resume(starts.status[m], starts.run[m], work)
             escapes = ahead >= (0.0 if base < 0 else EASY)
@@ -188,7 +190,8 @@ def _join(
     if found[0] < 0:
         return False
     _resume(starts.status[m], starts.run[m], work)
-    return rejoin(guide, t, found[1], -1, motions[found[0]], found[2], motions[m], poses[m], work)
+    other = found[0]
+    return rejoin(guide, t, found[1], -1, motions[other], poses[other], found[2], motions[m], poses[m], work)
 
 
 @merged

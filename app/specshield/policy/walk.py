@@ -210,6 +210,7 @@ def rejoin(
     turn: int,
     move: int,
     base: NDArray[np.int64],
+    led: NDArray[np.float64],
     at: int,
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
@@ -217,18 +218,27 @@ def rejoin(
 ) -> bool:
     """Goes on from motions[:1] by `turn` and `move`, then by `base`, a way to every goal, as `join` has it.
 
-    To be on its way only nearly may do: the result says whether every goal was settled. Other arguments as in
-    `walk`.
+    led (T - t, 3): where `base` led, which need not be found again from the very same pose. To be on its way
+    only nearly may do: the result says whether every goal was settled. Other arguments as in `walk`.
     """
     body, rules, tables, wait = guide
     join(turn, move, base, at, wait, motions)
     x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
-    n, looked = 1, False
+    n, looked, joined = 1, False, 1 + (turn >= 0) + (move >= 0)
     while n < motions.shape[0] and not is_over(rules, tables, t + n, work.status):
         if is_broken(work.status):
             break
         if motions[n] != wait:
-            x, y, theta = step(body, x, y, theta, motions[n])
+            known = False
+            if n >= joined:  # `base` has the same motions in the same order, waits apart
+                while base[at] == wait:
+                    at += 1
+                known = at > 0 and led[at - 1, 0] == x and led[at - 1, 1] == y and led[at - 1, 2] == theta
+                at += 1
+            if known:
+                x, y, theta = led[at - 1, 0], led[at - 1, 1], led[at - 1, 2]
+            else:
+                x, y, theta = step(body, x, y, theta, motions[n])
             observe(rules, t + n + 1, x, y, theta, work)
             looked = False
         else:
