@@ -46,7 +46,7 @@ lint: .venv/.dev
 bench: .venv-bench/.done
 	.venv-bench/bin/python -m benchmarks $(ARGS)
 
-# docs/results.md. What is in RESULTS already is not done again.
+# docs/results*.md. What is in RESULTS already is not done again.
 RESULTS ?= out/results
 MODEL ?= learned
 EVALUATE = $(BIN)/specshield evaluate --runs 200 --model $(MODEL) --out $(RESULTS)
@@ -60,12 +60,17 @@ results: .venv/.dev
 	    --methods paper,ours,ours@0.04/8 || exit 1; \
 	  $(EVALUATE) --case $$case --model goal-seeker --seed 1 --out $(RESULTS)-goal-seeker \
 	    --methods unmodified,ours,lookahead || exit 1; \
+	  for model in decoyed drifter jumper; do \
+	    $(EVALUATE) --case $$case --model $$model --seed 1 --out $(RESULTS)-unknown-models/$$model \
+	      --methods unmodified,ours,lookahead || exit 1; \
+	  done; \
 	done
 	for house in house_0 house_2; do \
 	  $(EVALUATE) --case house --house $$house --runs 60 --methods unmodified,hcd,ours,lookahead || exit 1; \
 	done
 	$(BIN)/specshield report $(RESULTS)
 	$(BIN)/specshield report $(RESULTS)-goal-seeker --out docs/results-goal-seeker.md
+	$(BIN)/specshield report $(RESULTS)-unknown-models --out docs/results-unknown-models.md
 
 openapi: .venv/.server
 	$(BIN)/specshield openapi > openapi.json

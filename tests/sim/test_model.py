@@ -7,8 +7,8 @@ from tests.oracles.judge import margin
 from specshield.errors import NotFound
 from specshield.policy.environment import free_poses
 from specshield.robot import STRETCH
-from specshield.sim.model import GoalSeeker, make_model, softmax
-from specshield.sim.robot import Observation, SimulatedRobot
+from specshield.sim.model import MODELS, Decoyed, Drifter, GoalSeeker, Jumper, elsewhere, make_model, softmax
+from specshield.sim.robot import COMFORT, NEAR, Observation, SimulatedRobot
 
 NAMES = list(STRETCH.action_names)
 
@@ -87,21 +87,117 @@ def test_models_go_by_name(case):
     assert "goal-seeker" in error.value.expected
 
 
-def test_alone_it_finds_its_target_from_everywhere_and_breaks_the_rule(case):
-    runs, found, kept = 60, 0, 0
-    model, terminal = GoalSeeker(STRETCH), STRETCH.terminal
+def alone(case, model, runs):
+    """Of each run: its poses, whether the model ended, and whether at its target."""
     for i, start in enumerate(free_poses(case.task, case.body, runs, np.random.default_rng(5)).tolist()):
         robot, random = SimulatedRobot(case, tuple(start)), np.random.default_rng([i, 1])
         model.reset(np.random.default_rng([i, 0]))
-        poses = [robot.pose]
-        for _ in range(600):
-            action = int(random.choice(20, p=softmax(model.logits(robot))))
-            if terminal[action]:
-                found += robot.at_target
-                break
-            robot.execute(action)
-            poses.append(robot.pose)
-        poses += [robot.pose] * (case.task.horizon + 1 - len(poses))
+        poses, ended = [robot.pose], False
+        while not ended and len(poses) <= 600:
+            logits = model.logits(robot)
+            assert np.all(np.isfinite(logits))
+            action = int(random.choice(20, p=softmax(logits)))
+            ended = bool(STRETCH.terminal[action])
+            if not ended:
+                robot.execute(action)
+                poses.append(robot.pose)
+        yield poses, ended, ended and robot.at_target
+
+
+def test_alone_it_finds_its_target_from_everywhere_and_breaks_the_rule(case):
+    runs, found, kept = 60, 0, 0
+    for poses, _, done in alone(case, GoalSeeker(STRETCH), runs):
+        found += done
+        poses += poses[-1:] * (case.task.horizon + 1 - len(poses))
         kept += margin(case.spec, poses) > 0
     assert found >= 0.95 * runs
     assert kept <= 0.1 * runs
+
+
+def test_other_places_are_reachable_roomy_and_far_apart(case):
+    places = elsewhere(case, 8)
+    assert [place.target for place in elsewhere(case, 3)] == [place.target for place in places[:3]]
+    apart = []
+    for i, place in enumerate(places):
+        cell = case.cell(place.target)
+        assert case.task.grid.clearance[cell] > COMFORT
+        apart.append(min(before.distance[cell] for before in [case, *places[:i]]))
+    assert sorted(apart, reverse=True) == pytest.approx(apart)  # the farthest first
+    assert 2.0 < apart[-1] < np.inf
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name != "learned"])
+def test_an_episode_is_decided_by_its_seed_and_what_the_robot_does(case, name):
+    """Two goes of one seed say the same, whatever was before; another seed says otherwise."""
+    robot = SimulatedRobot(case, next(alone(case, GoalSeeker(STRETCH), 1))[0][0])
+    model, said = make_model(name, case), []
+    for seed in (3, 4, 3):
+        model.reset(np.random.default_rng(seed))
+        said.append([model.logits(robot) for _ in range(60)])
+    assert np.array_equal(said[0], said[2])
+    assert not np.array_equal(said[0], said[1])
+
+
+@pytest.mark.parametrize(("name", "steps"), [("jumper", 60), ("decoyed", 60)])
+def test_those_sent_elsewhere_come_to_their_target_late_and_end_nowhere_else(case, name, steps):
+    seeker = [len(poses) for poses, _, done in alone(case, GoalSeeker(STRETCH), 30) if done]
+    runs = list(alone(case, make_model(name, case), 30))
+    assert all(ended == done for _, ended, done in runs)
+    assert sum(done for *_, done in runs) >= 28
+    assert np.mean([len(poses) for poses, _, done in runs if done]) > np.mean(seeker) + steps
+
+
+def errands(model, place, steps):
+    """Where the model asks the way to while it stands at a place: targets, None for its own."""
+    asked = []
+
+    class Standing(SimulatedRobot):
+        def observe(self, errand=None):
+            asked.append(None if errand is None else errand.target)
+            return super().observe(errand)
+
+    standing = Standing(place, (*place.target, 0.0))
+    for _ in range(steps):
+        model.logits(standing)
+    return asked
+
+
+def test_where_the_jumper_goes_and_when_is_the_same_wherever_it_is(case):
+    model, found = Jumper(case), []
+    for place in elsewhere(case, 2):
+        model.reset(np.random.default_rng(6))
+        found.append(errands(model, place, 400))
+    assert found[0] == found[1]
+    changes = sum(one != other for one, other in zip(found[0], found[0][1:], strict=False))
+    assert 2 <= changes <= 40
+    home = found[0].index(None)
+    assert found[0][home:] == [None] * (400 - home)
+
+
+def test_the_decoyed_turns_to_its_target_once_it_has_been_about_its_decoy_for_long(case):
+    model, stays = Decoyed(case), []
+    for seed in range(40):
+        model.reset(np.random.default_rng(seed))
+        decoy = model._decoy
+        away = next(place for place in elsewhere(case, 2) if decoy.distance[case.cell(place.target)] > NEAR)
+        assert set(errands(model, away, 40)) == {decoy.target}  # it has not come there yet
+        asked = errands(model, decoy, 400)
+        home = asked.index(None)
+        assert set(asked[:home]) == {decoy.target}
+        assert set(asked[home:]) == {None}
+        stays.append(len(asked[home:]))
+    assert 0.6 * Decoyed.STAY < 401 - np.mean(stays) < 1.6 * Decoyed.STAY
+
+
+def test_the_drifter_goes_nowhere_and_its_likings_last():
+    model = Drifter(STRETCH)
+    model.reset(np.random.default_rng(0))
+    said = np.array([model.react(seen(bearing=1.0)) for _ in range(4000)])
+    model.reset(np.random.default_rng(0))
+    assert np.array_equal(said, [model.react(seen(bearing=-2.0, distance=3.0)) for _ in range(4000)])
+    forward = said[:, NAMES.index("m")]
+    assert abs(forward.mean()) < 1.0
+    for lag, stays in ((1, 0.97), (20, 0.97**20)):
+        assert np.corrcoef(forward[:-lag], forward[lag:])[0, 1] == pytest.approx(stays, abs=0.1)
+    blocked = model.react(seen(blocked=["m", "ls"])) - Drifter.NOISE * model._noise
+    assert [NAMES[a] for a in np.flatnonzero(blocked == -model.SHARPNESS)] == ["m", "ls"]

@@ -9,6 +9,7 @@ pytest.importorskip("matplotlib")
 from specshield.sim import figures, writeup
 from specshield.sim.cases import load_case
 from specshield.sim.experiment import Experiment
+from specshield.sim.model import MODELS
 from specshield.sim.runs import Record
 
 
@@ -41,6 +42,29 @@ def test_methods_of_other_runs_are_compared_over_those_in_common(tmp_path):
     assert found["simplex"]["extra_steps"] == {"both": 1, "mean": 6.0, "median": 6.0}
     for runs, method in ((6, "unmodified"), (2, "ours"), (4, "simplex")):
         assert f"--runs {runs} --seed 0 --model learned --noise none --methods {method} --out" in page
+
+
+def test_several_models_share_a_page(tmp_path):
+    folder = tmp_path / "results-two"
+    for model in ("jumper", "drifter"):
+        kept = folder / model / "case1" / "none"
+        kept.mkdir(parents=True)
+        (kept / "experiment.json").write_text(json.dumps(Experiment("case1", model=model).to_json()))
+        lines = [json.dumps(record(0, name).to_json()) + "\n" for name in ("ours", "lookahead")]
+        (kept / "runs.jsonl").write_text("".join(lines))
+    writeup.write_up(folder, tmp_path / "two.md")
+    page = (tmp_path / "two.md").read_text()
+    for model in ("jumper", "drifter"):
+        assert page.count(f"## case1, {model}: method by method\n") == 1
+        assert f"| case1, {model} | lookahead |" in page
+        assert f"![ways of case1, {model}](two/{model}/case1/ways.png)" in page
+        assert (tmp_path / "two" / model / "case1" / "ways.png").is_file()
+        assert f"--model {model} --noise none --methods ours,lookahead --out out/results-two/{model}" in page
+    assert "specshield report out/results-two --out docs/two.md\n" in page
+
+
+def test_every_model_is_described():
+    assert set(writeup.MODELS) == set(MODELS)
 
 
 @pytest.mark.parametrize("make", [figures._robustness, figures._mass])

@@ -1,9 +1,14 @@
-"""The foundation model as the simulation sees it, and a stand-in that seeks its target and knows no rule."""
+"""The foundation model as the simulation sees it, and stand-ins for it that know no rule.
+
+GoalSeeker is the plain one. Where Jumper, Decoyed and Drifter are going cannot be known from their logits:
+they show what look-ahead (shield/lookahead.py) costs where it takes a model for what it is not.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +18,7 @@ from specshield.errors import NotFound
 from specshield.robot import Robot
 from specshield.sim.cases import Case
 from specshield.sim.learned.model import load_learned
-from specshield.sim.robot import Observation, SimulatedRobot
+from specshield.sim.robot import COMFORT, NEAR, Observation, SimulatedRobot
 
 Floats = NDArray[np.float64]
 
@@ -81,8 +86,98 @@ class GoalSeeker:
         return np.where(observation.blocked, -1.0, saved)
 
 
+class Jumper(GoalSeeker):
+    """A goal-seeker that changes its mind: at random steps, wherever it is, it sets out for another place.
+
+    In the end that is the target, which it keeps to. When it jumps, and where to, is the same however it is
+    steered.
+    """
+
+    JUMP = 0.05  # a step
+    HOME = 0.2  # of the jumps go to the target
+    PLACES = 8
+
+    def __init__(self, case: Case) -> None:
+        self._elsewhere = elsewhere(case, self.PLACES)
+        super().__init__(case.task.robot)
+
+    def reset(self, random: np.random.Generator) -> None:
+        super().reset(random)
+        self._errand: Case | None = self._any()
+
+    def logits(self, robot: SimulatedRobot) -> Floats:
+        if self._errand is not None and self._random.random() < self.JUMP:
+            self._errand = None if self._random.random() < self.HOME else self._any()
+        return self.react(_sent(robot, self._errand))
+
+    def _any(self) -> Case:
+        return self._elsewhere[int(self._random.integers(self.PLACES))]
+
+
+class Decoyed(GoalSeeker):
+    """A goal-seeker with a wrong target: it goes there first, stays about it for some tens of steps without
+    ending, and then turns to the right one.
+    """
+
+    STAY = 30.0  # steps near the decoy, in the mean
+    PLACES = 8
+
+    def __init__(self, case: Case) -> None:
+        self._elsewhere = elsewhere(case, self.PLACES)
+        super().__init__(case.task.robot)
+
+    def reset(self, random: np.random.Generator) -> None:
+        super().reset(random)
+        self._decoy = self._elsewhere[int(random.integers(self.PLACES))]
+        self._left = int(random.geometric(1.0 / self.STAY))  # steps near the decoy
+
+    def logits(self, robot: SimulatedRobot) -> Floats:
+        if self._left > 0 and robot.observe(self._decoy).distance <= NEAR:
+            self._left -= 1
+        return self.react(_sent(robot, self._decoy if self._left > 0 else None))
+
+
+class Drifter(GoalSeeker):
+    """Goes nowhere: its likings for actions drift, whatever the way. It sees what is blocked, and where the
+    target happens to be near it may end, with a small chance a step.
+    """
+
+    NOISE = 2.0
+    DRIFT = 0.97
+    HABIT = 0.0
+    END_WITHIN = 0.9
+    END_NEAR = 0.0
+
+    def _saved(self, observation: Observation) -> Floats:
+        return np.where(observation.blocked, -1.0, 0.0)
+
+
+def elsewhere(case: Case, places: int) -> list[Case]:
+    """The case with its target at other places instead, where the robot turns freely: each the farthest along
+    free space from the target and those before it.
+    """
+    grid = case.task.grid
+    nearest = np.where(grid.clearance > COMFORT, case.distance, -np.inf)
+    nearest[np.isinf(nearest)] = -1.0  # walls, and what cannot be reached
+    found: list[Case] = []
+    for _ in range(places):
+        x, y = grid.centres[np.unravel_index(np.argmax(nearest), nearest.shape)].tolist()
+        found.append(replace(case, target=(x, y)))
+        nearest = np.minimum(nearest, found[-1].distance)
+    return found
+
+
+def _sent(robot: SimulatedRobot, errand: Case | None) -> Observation:
+    """What the robot senses on an errand, where nothing is to be ended; None: on its own."""
+    seen = robot.observe(errand)
+    return seen if errand is None else replace(seen, distance=math.inf)
+
+
 MODELS: dict[str, Callable[[Case], FoundationModel]] = {
+    "decoyed": Decoyed,
+    "drifter": lambda case: Drifter(case.task.robot),
     "goal-seeker": lambda case: GoalSeeker(case.task.robot),
+    "jumper": Jumper,
     "learned": lambda case: load_learned(case.instruction),
 }
 

@@ -52,18 +52,16 @@ class SimulatedRobot:
 
     @property
     def at_target(self) -> bool:
-        return bool(self._distance <= NEAR)
+        return bool(self._case.distance[self._case.cell(self.pose)] <= NEAR)
 
-    @property
-    def _distance(self) -> float:
-        return float(self._case.distance[self._case.cell(self.pose)])
-
-    def observe(self) -> Observation:
-        x, y, theta = self.pose
-        way = waypoints(self._case)[self._case.cell(self.pose)] - (x, y)
+    def observe(self, errand: Case | None = None) -> Observation:
+        """errand: the case with another target, that distance and bearing are to be of."""
+        errand, (x, y, theta) = errand or self._case, self.pose
+        cell = errand.cell(self.pose)
+        way = waypoints(errand)[cell] - (x, y)
         bearing = math.atan2(way[1], way[0]) - theta
         return Observation(
-            distance=self._distance,
+            distance=float(errand.distance[cell]),
             bearing=math.remainder(bearing, 2.0 * math.pi),
             blocked=self._blocked(),
             last_action=self.last_action,
@@ -84,7 +82,7 @@ class SimulatedRobot:
         return np.where(robot.terminal, False, (short | unturned)[robot.motion_of])
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def waypoints(case: Case) -> NDArray[np.float64]:
     """From each cell, the point LOOK_AHEAD cells on along the way, in metres. Shape [height, width, 2].
 

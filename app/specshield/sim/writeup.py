@@ -45,7 +45,13 @@ NOISES = {
 }
 
 MODELS = {
+    "decoyed": """decoyed, a goal-seeker that goes to another place first, and stays about it for some tens of
+steps before it turns to its target""",
+    "drifter": """drifter, which goes nowhere: its likings for actions drift, and it may end where the target
+happens to be near""",
     "goal-seeker": "goal-seeker, a stand-in that is told the way along free space and strays from it",
+    "jumper": """jumper, a goal-seeker that sets out for another place at random steps, and in the end for its
+target""",
     "learned": "learned, a transformer that imitates shortest paths, from egocentric senses",
 }
 WHY_NEXT_STEP = """\
@@ -62,9 +68,10 @@ Results = dict[str, Any]
 def write_up(folder: Path, page: Path) -> None:
     """Writes the page, and the figures of each experiment in the world as told beside it.
 
-    folder: as `specshield evaluate --out` was given. Raises NotFound where it holds no results.
+    folder: as `specshield evaluate --out` was given, or one that holds such folders, one a model. Raises
+    NotFound where it holds no results.
     """
-    found = {about.parent: write(about.parent) for about in sorted(folder.glob("*/*/experiment.json"))}
+    found = {about.parent: write(about.parent) for about in sorted(folder.rglob("experiment.json"))}
     if not found:
         raise NotFound(
             "there are no results", path="results", got=str(folder),
@@ -72,22 +79,23 @@ def write_up(folder: Path, page: Path) -> None:
         )  # fmt: skip
     beside = page.with_suffix("")
     drawn = {
-        kept: figures.draw(_case(results), read(kept), beside / results["case"])
+        kept: figures.draw(_case(results), read(kept), beside / kept.parent.relative_to(folder))
         for kept, results in found.items()
         if results["experiment"]["noise"] == "none"
     }
-    page.write_text("\n\n".join(_sections(found, drawn, page)) + "\n")
+    page.write_text("\n\n".join(_sections(folder, found, drawn, page)) + "\n")
 
 
 def _case(results: Results) -> Any:
     return Experiment.from_json(results["experiment"]).setting.case
 
 
-def _sections(found: dict[Path, Results], drawn: dict[Path, list[Path]], page: Path) -> Iterator[str]:
+def _sections(
+    folder: Path, found: dict[Path, Results], drawn: dict[Path, list[Path]], page: Path
+) -> Iterator[str]:
     from specshield.sim.decoding import ALPHA, BETA
 
     told = {kept: r for kept, r in found.items() if r["experiment"]["noise"] == "none"}
-    cases = {r["case"]: r for r in told.values() if r["experiment"]["house"] is None}
     yield "# Results"
     yield (
         "Written by `specshield report`; every figure is from a campaign's `results.json`. Shares carry "
@@ -99,33 +107,37 @@ def _sections(found: dict[Path, Results], drawn: dict[Path, list[Path]], page: P
     legend = [f"- **{name}**: {text}" for name, text in METHODS.items() if name in there]
     yield "\n".join([*legend, CAREFUL]).format(alpha=ALPHA, beta=BETA)
     yield "## Beside the paper's Table II"
-    yield _beside(cases.values())
+    yield _beside(r for r in told.values() if r["experiment"]["house"] is None)
     if there & {"hcd", "rcd"}:
         yield WHY_NEXT_STEP
     used = dict.fromkeys(_model(results) for results in found.values())
     yield f"Models: {'; '.join(MODELS[name] for name in used)}. They know no rule."
     for kept, results in told.items():
-        yield f"## {results['case']}: method by method"
+        yield f"## {_title(results)}: method by method"
         yield _about(results)
         yield table(results)
         yield _short(results)
         for path in drawn[kept]:
-            yield f"![{path.stem} of {results['case']}]({path.relative_to(page.parent)})"
+            yield f"![{path.stem} of {_title(results)}]({path.relative_to(page.parent)})"
     disturbed = [r for r in found.values() if r["experiment"]["noise"] != "none"]
     if disturbed:
         yield "## Noise and mismatch"
         yield "\n".join(f"- **{name}**: {NOISES[name]}." for name in DISTURBANCES[1:])
-        for case in dict.fromkeys(r["case"] for r in disturbed):
-            yield f"### {case}"
-            yield _noise_table([r for r in found.values() if r["case"] == case])
+        for title in dict.fromkeys(map(_title, disturbed)):
+            yield f"### {title}"
+            yield _noise_table([r for r in found.values() if _title(r) == title])
         yield WHY_SLACK
         yield from _calibrations(found)
     yield "## How it was run"
-    yield "```sh\n" + "\n".join(_commands(found.values())) + "\n```"
+    yield "```sh\n" + "\n".join(_commands(folder, found, page)) + "\n```"
 
 
 def _model(results: Results) -> str:
     return str(results["experiment"]["model"])
+
+
+def _title(results: Results) -> str:
+    return f"{results['case']}, {_model(results)}"
 
 
 def _about(results: Results) -> str:
@@ -146,9 +158,16 @@ def _beside(cases: Iterable[Results]) -> str:
             of = one["runs"]
             kept, done = one["satisfied"]["count"], one["main_done"]["count"]
             rows.append(
-                (results["case"], one["method"], *said, f"{100 * kept / of:g} %", f"{100 * done / of:g} %")
+                (_title(results), one["method"], *said, f"{100 * kept / of:g} %", f"{100 * done / of:g} %")
             )
-    heads = ("case", "method", "the paper: rule", "the paper: main task", "here: rule", "here: main task")
+    heads = (
+        "case, model",
+        "method",
+        "the paper: rule",
+        "the paper: main task",
+        "here: rule",
+        "here: main task",
+    )
     return markdown(heads, rows)
 
 
@@ -242,14 +261,16 @@ def _calibrations(found: dict[Path, Results]) -> Iterator[str]:
         yield "\n".join(lines)
 
 
-def _commands(found: Iterable[Results]) -> Iterator[str]:
-    for results in found:
+def _commands(folder: Path, found: Mapping[Path, Results], page: Path) -> Iterator[str]:
+    top = Path("out") / folder.name
+    for kept, results in found.items():
         about = results["experiment"]
         case = f"house --house {about['house']}" if about["house"] else results["case"]
+        out = top / kept.parent.parent.relative_to(folder)
         for runs in dict.fromkeys(one["runs"] for one in results["methods"]):
             methods = ",".join(one["method"] for one in results["methods"] if one["runs"] == runs)
             yield (
                 f"specshield evaluate --case {case} --runs {runs} --seed {about['seed']} "
-                f"--model {about['model']} --noise {about['noise']} --methods {methods} --out out/results"
+                f"--model {about['model']} --noise {about['noise']} --methods {methods} --out {out}"
             )
-    yield "specshield report out/results"
+    yield f"specshield report {top} --out docs/{page.name}"
