@@ -54,6 +54,7 @@ happens to be near""",
 target""",
     "learned": "learned, a transformer that imitates shortest paths, from egocentric senses",
 }
+FEW = 20  # runs: extra steps of fewer are not compared
 WHY_NEXT_STEP = """\
 Next-step methods see of a window the last step alone: where the place to visit is further than that, nothing
 is left to choose. HCD keeps a G. What RCD adds to the logits leads straight at a place, walls or not."""
@@ -208,12 +209,14 @@ def _look_ahead(methods: Mapping[str, Results]) -> Iterator[str]:
         return
     ours, ahead = methods["ours"], methods["lookahead"]
     shares = [("KL a run", ahead["kl"], ours["kl"])]
-    shares.append(("mean extra steps", ahead["extra_steps"]["mean"], ours["extra_steps"]["mean"]))
-    parts = [
-        f"{name} {mine / whole:.2f}" for name, mine, whole in shares if whole is not None and whole > 1.0
-    ]
+    both = [one["extra_steps"]["both"] for one in (ours, ahead)]
+    if min(both) >= FEW:
+        shares.append(("mean extra steps", ahead["extra_steps"]["mean"], ours["extra_steps"]["mean"]))
+    parts = [f"{name} {mine / whole:.2f}" for name, mine, whole in shares if whole > 1.0]
     if parts:
         yield f"- lookahead, as a share of ours: {', '.join(parts)}."
+    if min(both) < FEW:
+        yield f"- Extra steps: of {both[0]} runs with ours and {both[1]} with lookahead, too few to compare."
 
 
 def _noise_table(experiments: Sequence[Results]) -> str:
