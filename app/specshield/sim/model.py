@@ -67,8 +67,7 @@ class GoalSeeker:
 
     def react(self, observation: Observation) -> Floats:
         """Logits (A,) for one observation."""
-        fresh = self._random.normal(size=len(self._noise))
-        self._noise = self.DRIFT * self._noise + math.sqrt(1.0 - self.DRIFT**2) * fresh
+        self._shake(self.DRIFT)
         logits = self.SHARPNESS * self._saved(observation) + self.NOISE * self._noise
         logits[self._idle] += self.IDLE
         if observation.last_action is not None:
@@ -76,6 +75,11 @@ class GoalSeeker:
         beyond = max(observation.distance - self.END_WITHIN, 0.0)
         logits[self._robot.terminal] = max(self.END_NEAR - self.END_SLOPE * beyond, self.END_FAR)
         return logits
+
+    def _shake(self, kept: float) -> None:
+        """The noise of the next step, of which `kept` is that of the last; its variance stays 1."""
+        fresh = self._random.normal(size=len(self._noise))
+        self._noise = kept * self._noise + math.sqrt(1.0 - kept**2) * fresh
 
     def _saved(self, observation: Observation) -> Floats:
         """The steps each action saves, shape (A,): one for a stride nearer, or for the largest turn."""
@@ -138,18 +142,29 @@ class Decoyed(GoalSeeker):
 
 
 class Drifter(GoalSeeker):
-    """Goes nowhere: its likings for actions drift, whatever the way. It sees what is blocked, and where the
-    target happens to be near it may end, with a small chance a step.
+    """Goes nowhere for a long time, and ends nowhere: its likings for actions drift, whatever the way, but
+    for what is blocked. Then it seeks its target. For how long it drifts is the same however it is steered.
     """
 
-    NOISE = 2.0
-    DRIFT = 0.97
-    HABIT = 0.0
-    END_WITHIN = 0.9
-    END_NEAR = 0.0
+    WHILE = 120.0  # steps that it drifts, in the mean
+    LIKING = 2.0  # logits
+    LASTING = 0.97  # of the likings stays from one step to the next
+    BLOCKED = -2.5
 
-    def _saved(self, observation: Observation) -> Floats:
-        return np.where(observation.blocked, -1.0, 0.0)
+    def reset(self, random: np.random.Generator) -> None:
+        super().reset(random)
+        self._left = int(random.geometric(1.0 / self.WHILE))  # steps to drift
+
+    def react(self, observation: Observation) -> Floats:
+        if self._left == 0:
+            return super().react(observation)
+        self._left -= 1
+        self._shake(self.LASTING)
+        logits = self.LIKING * self._noise
+        logits[observation.blocked] += self.BLOCKED
+        logits[self._idle] += self.IDLE
+        logits[self._robot.terminal] = self.END_FAR
+        return logits
 
 
 def elsewhere(case: Case, places: int) -> list[Case]:

@@ -47,8 +47,8 @@ NOISES = {
 MODELS = {
     "decoyed": """decoyed, a goal-seeker that goes to another place first, and stays about it for some tens of
 steps before it turns to its target""",
-    "drifter": """drifter, which goes nowhere: its likings for actions drift, and it may end where the target
-happens to be near""",
+    "drifter": """drifter, which goes nowhere for a long time, its likings for actions drifting, and then
+seeks its target""",
     "goal-seeker": "goal-seeker, a stand-in that is told the way along free space and strays from it",
     "jumper": """jumper, a goal-seeker that sets out for another place at random steps, and in the end for its
 target""",
