@@ -9,7 +9,16 @@ import pytest
 from tests.oracles.brute_stl import brute_robustness
 
 from specshield.errors import FragmentError
-from specshield.policy.progress import BROKEN, PENDING, SETTLED, make_rules, replay, signal_rows
+from specshield.policy.progress import (
+    BROKEN,
+    PENDING,
+    SETTLED,
+    make_rules,
+    pasts,
+    recall,
+    replay,
+    signal_rows,
+)
 from specshield.robot import STRETCH
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -49,6 +58,16 @@ def status_of(rules, xs, signals=()):
     return status
 
 
+def recalled(rules, past, xs):
+    status, run = np.full(len(rules.kind), 9, np.int8), np.full(len(rules.kind), 9)
+    recall(rules, past, *trace(xs), status, run)
+    return status.tolist(), run.tolist()
+
+
+def trace(xs):
+    return np.array([[x, 0.0, 0.0] for x in xs]), np.empty((len(xs), 0))
+
+
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_the_status_of_every_prefix_is_what_all_its_continuations_say(formula):
     rules = rules_of(formula)
@@ -73,6 +92,41 @@ def test_a_margin_asks_for_more():
     rules = rules_of("F[0,3] x and G[0,3] x")._replace(margin=0.5)
     assert status_of(rules, [0.5]).tolist() == [PENDING, BROKEN]
     assert status_of(rules, [0.6]).tolist() == [SETTLED, PENDING]
+
+
+@pytest.mark.parametrize(
+    ("formula", "xs", "by_margin", "by_zero", "margins"),
+    [
+        ("F[0,3] x", [0.2], [PENDING], [SETTLED], (0.5, 0.0)),  # by less: J may ask for more yet
+        ("F[0,1] x", [0.2, 0.2], [BROKEN], [SETTLED], (0.0,)),  # or not any more
+        ("G[0,3] x", [0.2], [BROKEN], [PENDING], (0.0,)),
+        ("G[0,1] x", [0.2, 0.6], [BROKEN], [SETTLED], (0.0,)),
+        ("G[0,3] x and F[0,3] x", [-0.1, 0.6], [BROKEN, SETTLED], [BROKEN, SETTLED], (0.5,)),
+        ("F[0,3] x and F[0,3] not x", [0.6, 0.0], [SETTLED, PENDING], [SETTLED, PENDING], (0.5,)),
+    ],
+)
+def test_what_was_kept_by_less_than_the_margin(formula, xs, by_margin, by_zero, margins):
+    rules = rules_of(formula)._replace(margin=0.5)
+    assert status_of(rules, xs).tolist() == by_margin
+    assert recalled(rules, 0.5, xs)[0] == by_margin
+    assert recalled(rules, 0.0, xs)[0] == by_zero
+    assert pasts(rules, *trace(xs)) == margins
+    assert pasts(rules._replace(margin=0.0), *trace(xs)) == (0.0,)
+
+
+@pytest.mark.parametrize(
+    ("xs", "status", "run"),
+    [
+        ([0.6, 0.2, 0.6], PENDING, 1),  # J asks the margin of a whole dwell
+        ([0.2, 0.6, 0.6], PENDING, 2),
+        ([0.2, 0.2], PENDING, 0),
+        ([0.2, 0.2, 0.2], PENDING, 3),  # too late for another: the rule itself
+        ([0.2, 0.2, 0.2, 0.2, 0.2], SETTLED, 5),
+    ],
+)
+def test_a_dwell_in_progress_counts_what_keeps_the_margin(xs, status, run):
+    rules = rules_of("F[0,2] G[0,4] x")._replace(margin=0.5)
+    assert recalled(rules, 0.0, xs) == ([status], [run])
 
 
 def test_each_conjunct_has_its_own_progress():

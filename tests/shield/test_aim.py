@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted
+from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted, ways
+from tests.policy.rooms import random_weights, sizes
 
-from specshield.policy.view import view_of
-from specshield.shield.aim import _open
+from specshield.policy import planner, reachability
+from specshield.policy.network import make_network
+from specshield.policy.policy import Policy, Proposal
+from specshield.policy.residual import still_open
 from specshield.shield.episode import Config, decide, make_shield
-from specshield.shield.feasibility import prefix_of
 
 EVEN = np.zeros(5)
 SHORTEST = {WAIT: [FORWARD], LEFT: [RIGHT, FORWARD], RIGHT: [LEFT, FORWARD]}
@@ -97,5 +99,62 @@ def test_what_a_nested_rule_still_asks():
     cells = Cells("G[0,10] F[0,6] x > 0.1 and G[0,9] x > -1", None, {})
     history = np.array([cells.pose(0, 0, 0)] * 9)
     task = cells.task
-    prefix = prefix_of(task, task.formula, view_of(task, task.formula), history, {})
-    assert str(_open(prefix, 0)) == "G[3,10] F[0,6] x > 0.1 and G[9,9] x > -1"
+    left = still_open(task, task.formula, history, np.empty((9, 0)), 0)
+    assert str(left) == "G[3,10] F[0,6] x > 0.1 and G[9,9] x > -1"
+
+
+class Everything:
+    """Proposes every future there is."""
+
+    id = "everything"
+
+    def __init__(self, cells):
+        self.cells, self.task = cells, cells.task
+
+    def propose(self, history, signals, margin):
+        rows = ways(self.task.horizon + 1 - len(history))
+        return Proposal(*self.cells.proposal(history, rows), WAIT)
+
+
+def tables(task):
+    return reachability.synthesise(task, reachability.Settings(pitch=0.2))
+
+
+def plans(task):
+    return planner.synthesise(task, planner.Settings(pitch=0.2))
+
+
+@pytest.mark.parametrize("synthesise", [tables, plans])
+@pytest.mark.parametrize(
+    ("formula", "states", "feasible", "robustness"),
+    [
+        # kept by 0.02 m so far, where 0.05 m was asked, and no time to go back: of what is open, the margin
+        ("F[0,1] x > 0.48 and F[0,3] y > 0.28", [(2, 0, 1)] * 2, [1, 0, 0, 0], 0.02),
+        ("F[0,5] y > 0.68 and F[2,5] y < 0.72", [(2, 3, 0), (2, 3, 1)], [0, 1, 1, 1], 0.02),
+        ("F[0,5] G[0,1] x > 0.48 and F[0,4] y > 0.28", [(2, 0, 1)] * 3, [1, 0, 0, 0], 0.02),
+        ("G[0,0] x > 0.48 and F[0,4] y > 0.28", [(2, 0, 1)], [1, 1, 1, 1], 0.02),
+        # time to go there, and then deeper: of all of it
+        ("F[0,6] x > 0.48 and F[0,2] y > 0.28", [(2, 0, 1)], [1, 0, 0, 0], 0.22),
+        ("F[1,4] y > 0.28 and F[3,6] y > 0.68", [(2, 3, 2)] * 5, [0, 0, 1, 0], 0.22),
+    ],
+)  # fmt: skip
+def test_a_margin_is_found_beside_what_was_settled_by_less(synthesise, formula, states, feasible, robustness):
+    cells = Cells(formula, None, {})
+    history, careful = [cells.pose(*state) for state in states], Config(margin=0.05)
+    for policy in (Everything(cells), synthesise(cells.task)):
+        found = decide(make_shield([policy], careful), history, EVEN)
+        assert (found.mode, found.reason) == ("shaped", None)
+        assert list(found.j_values[:4]) == feasible
+        kept = [rho for rho, ok in zip(found.robustness, feasible, strict=False) if ok]
+        assert max(kept) == pytest.approx(robustness)
+
+
+def test_a_learned_policy_shares_a_way_that_keeps_the_margin_of_what_is_open():
+    """A network that goes ahead always: a turn is undone where ahead settles all that is open."""
+    cells = Cells("F[0,9] x > 0.48 and F[0,4] y > 0.28", None, {})
+    weights = {name: np.zeros_like(values) for name, values in random_weights(cells.task).items()}
+    weights["b3"][FORWARD] = 1.0
+    policy = Policy(cells.task, {"id": "ahead"}, make_network(weights, *sizes(cells.task)))
+    found = decide(make_shield([policy], Config(margin=0.05)), [cells.pose(2, 0, 1)], EVEN)
+    assert (found.mode, found.reason) == ("shaped", None)
+    assert list(found.j_values[:4]) == [1, 1, 1, 1]

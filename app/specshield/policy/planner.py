@@ -33,13 +33,13 @@ from specshield.policy.approach import World
 from specshield.policy.fields import FAR, Fields, steps_to, values_at
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
 from specshield.policy.plans import propose_all
-from specshield.policy.policy import Card, Proposal, make_card
+from specshield.policy.policy import Card, Proposal, as_one, make_card
 from specshield.policy.progress import signal_rows
-from specshield.policy.residual import residuals
+from specshield.policy.residual import bounds_after, residuals, still_open
 from specshield.policy.tensors import read_tensors
 from specshield.policy.view import look
 from specshield.robot.unicycle import Body, make_body
-from specshield.stl import SATISFIED_ABOVE, Formula
+from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.stl.program import STACK_SIZE, compile_predicate, pack
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL
 from specshield.task import POSE_NAMES, Task
@@ -134,15 +134,29 @@ class PlannerPolicy:
         """The proposal, and whether a plan of it satisfies the formula, or what can still be kept of it."""
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
         _, high = look(self._world.agenda.rule, history, rows, np.empty(self._world.agenda.rule.tree.size))
-        worlds: Iterable[World] = [self._world]
+        parts: Iterable[Formula] = (self.task.formula,)
         if high <= SATISFIED_ABOVE:
             left = residuals(self.task.formula, self.task.samples(history, signals), t)
-            worlds = chain((self._world_of(part) for part in left if part.horizon > t), worlds)
-        for world in worlds:
-            proposal, found = self._plan_in(world, history, rows, margin)
+            parts = chain((part for part in left if part.horizon > t), parts)
+        for part in parts:
+            asked = self._asked(part, history, rows, margin) if margin > 0.0 else (part,)
+            worlds = (self._world if each is self.task.formula else self._world_of(each) for each in asked)
+            plans = [self._plan_in(world, history, rows, margin) for world in worlds]
+            found = any(found for _, found in plans)
             if found:
                 break
-        return proposal, found
+        return as_one([proposal for proposal, _ in plans]), found
+
+    def _asked(
+        self, formula: Formula, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
+    ) -> tuple[Formula, ...]:
+        """What J asks the margin of: the whole trajectory where that can be had, else what is still open."""
+        bounds = [bounds_after(self.task, part, history, rows) for part in conjuncts(formula)]
+        lost = any(SATISFIED_ABOVE < high <= margin for _, high in bounds)
+        if not lost and not any(SATISFIED_ABOVE < low <= margin for low, _ in bounds):
+            return (formula,)
+        left = still_open(self.task, formula, history, rows, 0)
+        return (left,) if lost else (formula, left)
 
     def _plan_in(
         self, world: World, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.policy.network import Network, make_network
 from specshield.policy.observation import Sight, make_sight, observation_size
-from specshield.policy.progress import Rules, make_rules, signal_rows
+from specshield.policy.progress import Rules, make_rules, pasts, signal_rows
 from specshield.policy.rollout import propose_all
 from specshield.policy.tensors import read_tensors
 from specshield.robot import Robot, robot_to_json
@@ -32,15 +32,25 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Proposal:
-    """A continuation to the horizon after each first motion.
+    """Continuations to the horizon, one after each first motion; several where a margin may be had in several
+    ways.
 
-    motions [M, T - t]: row m begins with motion m; indices into `Robot.motions`. poses [M, T - t, 3]: after
-    each. preferred: the motion pi_phi itself takes at x_t.
+    motions [N, T - t]: row m < M begins with motion m; indices into `Robot.motions`. poses [N, T - t, 3]:
+    after each. preferred: the motion pi_phi itself takes at x_t.
     """
 
     motions: NDArray[np.int64]
     poses: NDArray[np.float64]
     preferred: int
+
+
+def as_one(proposals: Sequence[Proposal]) -> Proposal:
+    """The continuations of all of `proposals`, as the first prefers."""
+    first = proposals[0]
+    if len(proposals) == 1:
+        return first
+    motions, poses = [each.motions for each in proposals], [each.poses for each in proposals]
+    return Proposal(np.concatenate(motions), np.concatenate(poses), first.preferred)
 
 
 class Proposer(Protocol):
@@ -92,14 +102,17 @@ class Policy:
     ) -> Proposal:
         body, rules, sight = self._prepared
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
-        t = len(history) - 1
-        motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
-        poses = np.empty((*motions.shape, 3))
-        preferred = propose_all(
-            body, rules, sight, self.network, history, signal_rows(self.task, signals, t + 1),
-            wait_motion(self.task.robot), self._undoing, self.literal, motions, poses,
-        )  # fmt: skip
-        return Proposal(motions, poses, preferred)
+        t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
+        proposals = []
+        for past in pasts(rules, history, rows):
+            motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
+            poses = np.empty((*motions.shape, 3))
+            preferred = propose_all(
+                body, rules, sight, self.network, past, history, rows, wait_motion(self.task.robot),
+                self._undoing, self.literal, motions, poses,
+            )  # fmt: skip
+            proposals.append(Proposal(motions, poses, preferred))
+        return as_one(proposals)
 
     def weights(self) -> bytes:
         """The safetensors file."""

@@ -171,6 +171,43 @@ def replay(
 
     Overwritten: status, run (K,), and rules.signals, which is left at the last row: the values that are held.
     """
+    _replay(rules, rules.margin, poses, signals, status, run)
+
+
+@kernel
+def recall(
+    rules: Rules,
+    past: float,
+    poses: NDArray[np.float64],
+    signals: NDArray[np.float64],
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+) -> None:
+    """As `replay`, but the states x_0..x_t are judged by the margin `past`: what that settles is settled.
+
+    Of a dwell in progress only the steps that keep the rules' own margin count, as J asks it of all of them;
+    where it is too late to begin anew, all that keep `past`.
+    """
+    _replay(rules, past, poses, signals, status, run)
+    if past == rules.margin:
+        return
+    asked, whole = np.empty_like(status), np.empty_like(run)
+    _replay(rules, rules.margin, poses, signals, asked, whole)
+    for k in range(status.shape[0]):
+        if status[k] == PENDING and asked[k] == PENDING:
+            run[k] = whole[k]
+
+
+@kernel
+def _replay(
+    rules: Rules,
+    past: float,
+    poses: NDArray[np.float64],
+    signals: NDArray[np.float64],
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+) -> None:
+    """`replay` by the margin `past`."""
     values, stack = np.empty(value_count(rules)), np.empty(STACK)
     predicates = np.empty(rules.kind.shape[0])
     status[:] = PENDING
@@ -178,7 +215,40 @@ def replay(
     for t in range(poses.shape[0]):
         rules.signals[:] = signals[t]
         read_predicates(rules, poses[t, 0], poses[t, 1], poses[t, 2], values, stack, predicates)
+        if past != rules.margin:  # which `advance` goes by
+            for k in range(predicates.shape[0]):
+                predicates[k] = np.inf if predicates[k] > past else -np.inf
         advance(rules, t, predicates, status, run)
+
+
+def pasts(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[float, ...]:
+    """By which margins proposals have to `recall` the states x_0..x_t, as J will ask for the rules' own.
+
+    J asks it of the whole trajectory where that can be had: what was settled by less is settled anew. Else of
+    what is still open, where what was settled at all is settled.
+    """
+    if rules.margin == 0.0:
+        return (0.0,)
+    lost, less = _fall_short(rules, poses, signals)
+    if lost:
+        return (0.0,)
+    return (rules.margin, 0.0) if less else (rules.margin,)
+
+
+@kernel
+def _fall_short(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[bool, bool]:
+    """Whether x_0..x_t lost the rules' margin for good where they keep the rule, and whether they settled
+    something by less.
+    """
+    count = rules.kind.shape[0]
+    asked, status, run = np.empty(count, np.int8), np.empty(count, np.int8), np.empty(count, np.int64)
+    _replay(rules, rules.margin, poses, signals, asked, run)
+    _replay(rules, 0.0, poses, signals, status, run)
+    lost = less = False
+    for k in range(count):
+        lost = lost or (asked[k] == BROKEN and status[k] != BROKEN)
+        less = less or asked[k] != status[k]
+    return lost, less
 
 
 @leaf

@@ -16,11 +16,12 @@ from safetensors.numpy import save as save_tensors
 from specshield.errors import PolicyError
 from specshield.policy.latest import Phase, latest_times, masks_of, phases_of
 from specshield.policy.lattice import heading_count, holds_at, make_lattice
-from specshield.policy.policy import Card, Proposal, make_card, wait_motion
+from specshield.policy.policy import Card, Proposal, as_one, make_card, wait_motion
 from specshield.policy.progress import (
     ALWAYS,
     Rules,
     make_rules,
+    pasts,
     signal_rows,
 )
 from specshield.policy.search import propose_all
@@ -92,13 +93,15 @@ class ReachabilityPolicy:
         """A continuation after each first motion: greedy, or by a beam near a deadline."""
         body, rules = self._prepared
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
-        motions = np.empty((len(body.translate), self.task.horizon + 1 - len(history)), np.int64)
-        poses = np.empty((*motions.shape, 3))
-        preferred = propose_all(
-            Guide(body, rules, self.tables, wait_motion(self.task.robot)), self.settings.beam, history,
-            signal_rows(self.task, signals, len(history)), motions, poses,
-        )  # fmt: skip
-        return Proposal(motions, poses, int(preferred))
+        rows = signal_rows(self.task, signals, len(history))
+        guide = Guide(body, rules, self.tables, wait_motion(self.task.robot))
+        proposals = []
+        for past in pasts(rules, history, rows):
+            motions = np.empty((len(body.translate), self.task.horizon + 1 - len(history)), np.int64)
+            poses = np.empty((*motions.shape, 3))
+            preferred = propose_all(guide, self.settings.beam, past, history, rows, motions, poses)
+            proposals.append(Proposal(motions, poses, int(preferred)))
+        return as_one(proposals)
 
     def weights(self) -> bytes:
         """The safetensors file."""

@@ -19,7 +19,7 @@ from specshield.policy.progress import (
     Rules,
     advance,
     read_predicates,
-    replay,
+    recall,
     value_count,
 )
 from specshield.robot.unicycle import Body, step, successors
@@ -199,6 +199,7 @@ def propose_all(
     rules: Rules,
     sight: Sight,
     net: Network,
+    past: float,
     history: NDArray[np.float64],
     signals: NDArray[np.float64],
     wait: int,
@@ -209,14 +210,14 @@ def propose_all(
 ) -> int:
     """A continuation a first motion, into motions (M, T - t) and poses (M, T - t, 3); returns pi_phi's own.
 
-    history (t + 1, 3), signals (t + 1, S); rules.signals is left at the last row. undoing (M, 2): the motions
-    that undo each, -1: no more is needed. Where `literal`, every row is pi_phi's own rollout. Else, once one
-    row settles everything, it is enough for another motion to come onto its way, from the same place or by
-    undoing; where that fails it is pi_phi's own rollout too.
+    history (t + 1, 3), signals (t + 1, S); rules.signals is left at the last row. past: the margin that
+    history is judged by. undoing (M, 2): the motions that undo each, -1: no more is needed. Where `literal`,
+    every row is pi_phi's own rollout. Else, once one row settles everything, it is enough for another motion
+    to come onto its way, from the same place or by undoing; where that fails it is pi_phi's own rollout too.
     """
     t, count = history.shape[0] - 1, rules.kind.shape[0]
     status, run = np.empty(count, np.int8), np.empty(count, np.int64)
-    replay(rules, history, signals, status, run)
+    recall(rules, past, history, signals, status, run)
     state = _make_state(body, rules, net)
     _begin(rules, history[t], status, run, state)
     _follow(body, rules, sight, net, t, -1, wait, state, motions[0, :1], poses[0, :1])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel, leaf, merged
 from specshield.policy.beam import EASY, MAX_ROOTS, beam
 from specshield.policy.detour import NONE, copy_way, find_sibling, find_twins, turn_by
-from specshield.policy.progress import forgive, replay
+from specshield.policy.progress import forgive, recall
 from specshield.policy.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.walk import SETTLED_ALL, STUCK, rejoin, walk
 from specshield.policy.work import Guide, Work, fill, make_work, observe
@@ -53,19 +53,21 @@ class Starts(NamedTuple):
 def propose_all(
     guide: Guide,
     width: int,
+    past: float,
     history: NDArray[np.float64],
     signals: NDArray[np.float64],
     motions: NDArray[np.int64],
     poses: NDArray[np.float64],
 ) -> int:
-    """history (t + 1, 3), signals (t + 1, S); width: poses a beam keeps for each motion.
+    """history (t + 1, 3), signals (t + 1, S); width: poses a beam keeps for each motion; past: the margin
+    that history is judged by.
 
     Writes a continuation a first motion, motions (M, T - t) and poses (M, T - t, 3); returns the motion of
     most slack. The rules' signals are left at the last row.
     """
     count, t, k_count = motions.shape[0], history.shape[0] - 1, guide.rules.kind.shape[0]
     status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
-    replay(guide.rules, history, signals, status, run)
+    recall(guide.rules, past, history, signals, status, run)
     forgive(guide.rules, t, status)
     work = make_work(guide.rules, count)
     starts = Starts(

@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.policy.residual import still_open
 from specshield.policy.view import view_of
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, prefix_of, rho
-from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts
+from specshield.stl import SATISFIED_ABOVE
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -26,7 +27,7 @@ def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[
     motions, margin = len(shield.task.robot.motions), SATISFIED_ABOVE + shield.config.margin
 
     def at(slack: int) -> Best:
-        formula = _open(prefix, slack)
+        formula = still_open(prefix.task, prefix.formula, prefix.poses, prefix.rows, slack)
         part = prefix_of(prefix.task, formula, view_of(prefix.task, formula), prefix.poses, prefix.signals)
         return best_of(tried, np.where(whole > SATISFIED_ABOVE, rho(part, tried), -np.inf), motions)
 
@@ -46,25 +47,3 @@ def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[
         else:
             high = middle
     return best, best.robustness > margin, True
-
-
-def _open(prefix: Prefix, slack: int) -> Formula:
-    """What of the formula the prefix leaves open: a G from where its child is, an F `slack` steps early.
-
-    A window keeps at least half its length. With nothing open, the formula itself.
-    """
-    kept: list[Formula] = []
-    for conjunct in conjuncts(prefix.formula):
-        view = view_of(prefix.task, conjunct)
-        if prefix_of(prefix.task, conjunct, view, prefix.poses, prefix.signals).low > SATISFIED_ABOVE:
-            continue
-        match conjunct:
-            case Always(a, b, child):
-                kept.append(Always(max(a, min(prefix.t + 1 - child.horizon, b)), b, child))
-            case Eventually(a, b, child):
-                kept.append(Eventually(a, b - min(slack, (b - a) // 2), child))
-            case _:
-                kept.append(conjunct)
-    if not kept:
-        return prefix.formula
-    return kept[0] if len(kept) == 1 else And(tuple(kept))
