@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from tests.serving import wait_for
 
 from specshield.errors import InputError, NotFound, SpecshieldError, StoreError
 from specshield.service.embedded import EmbeddedStore
-from specshield.sim import calibration, cases, experiment, results
+from specshield.sim import calibration, cases, commands, experiment, results
 from specshield.sim.cases import load_case
 from specshield.sim.evaluation import evaluate, read
 from specshield.sim.experiment import Experiment
@@ -94,6 +95,17 @@ def test_a_method_named_twice_is_run_once_and_counts_once(serial, tmp_path):
     path.write_text(path.read_text() * 2)
     assert same(read(tmp_path)) == same(serial)
     assert [one["runs"] for one in results.write(tmp_path)["methods"]] == [RUNS, RUNS]
+
+
+def test_a_folder_of_other_records_is_refused_before_anything_is_done(tmp_path):
+    """The margin is not calibrated, nor is the first experiment run, where the second cannot be kept."""
+    asked = [Experiment("case1", noise=noise, seed=5) for noise in ("none", "gaussian")]
+    kept = tmp_path / "case1" / "gaussian"
+    kept.mkdir(parents=True)
+    (kept / "experiment.json").write_text(json.dumps(replace(asked[1], seed=6).to_json()))
+    with pytest.raises(InputError, match="another experiment"):
+        commands.evaluate(asked, 1, ["ours@conformal/4"], tmp_path, 1, None, False)
+    assert [path.name for path in tmp_path.rglob("*.json*")] == ["experiment.json"]
 
 
 def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_path, monkeypatch):

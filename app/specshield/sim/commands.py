@@ -61,9 +61,12 @@ def evaluate(
     method that certifies its actions broke the rule in a world that was as told.
     """
     broken = False
-    for experiment in experiments:
+    folders = [None if out is None else out / e.setting.case.name / e.noise for e in experiments]
+    for experiment, folder in zip(experiments, folders, strict=True):
+        if folder is not None:
+            evaluation.check(folder, experiment)  # before anything that takes long
+    for experiment, folder in zip(experiments, folders, strict=True):
         began = time.monotonic()
-        folder = None if out is None else out / experiment.setting.case.name / experiment.noise
         chosen = [calibrated(experiment, name, folder, processes) for name in methods]
         progress = _Progress(f"{experiment.setting.case.name}, {experiment.noise}", runs)
         records = evaluation.evaluate(experiment, runs, chosen, folder, processes, redis_url, progress.show)

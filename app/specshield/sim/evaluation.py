@@ -88,9 +88,8 @@ def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]
     """What `folder` holds of the experiment."""
     folder.mkdir(parents=True, exist_ok=True)
     about, written = folder / ABOUT, folder / "runs.jsonl"
-    if about.exists():
-        _check(folder, experiment)
-    else:
+    check(folder, experiment)
+    if not about.exists():
         described = {**experiment.to_json(), "made_from": experiment.setting.made_from}
         about.write_text(json.dumps(described) + "\n")
     if not written.exists():
@@ -99,8 +98,10 @@ def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]
     return {(record.run, record.method): record for record in read(folder)}
 
 
-def _check(folder: Path, experiment: Experiment) -> None:
-    """Raises InputError unless the folder's records and new ones can stand side by side."""
+def check(folder: Path, experiment: Experiment) -> None:
+    """Raises InputError unless the folder's records, if it has any, and new ones can stand side by side."""
+    if not (folder / ABOUT).exists():
+        return
     found, made_from = read_about(folder)
     if found != experiment:
         raise InputError(
