@@ -6,7 +6,6 @@ import json
 import os
 import sys
 import tempfile
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -73,22 +72,26 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
-    _settings()  # what is wrong with them is said here, in one line
-    # Of one process uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
-    metrics = tempfile.TemporaryDirectory(prefix="specshield-metrics-") if workers > 1 else nullcontext()
-    with metrics as folder:
-        if folder is not None:
-            os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder  # before prometheus_client is imported
-        uvicorn.run(
-            "specshield.service.app:create_app",
-            factory=True,
-            host=host,
-            port=port,
-            workers=workers,
-            access_log=False,
-            server_header=False,
-            timeout_graceful_shutdown=5,
-        )
+    from specshield.service.embedded import EmbeddedStore
+
+    settings = _settings()  # what is wrong with them is said here, in one line
+    embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
+    if embedded is not None:
+        embedded.join()  # and so is why it does not start
+    options: dict[str, Any] = {
+        "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
+        "timeout_graceful_shutdown": 5,
+    }  # fmt: skip
+    if workers == 1:  # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up
+        from specshield.service.app import create_app
+
+        uvicorn.run(create_app(settings, embedded), **options)
+        return
+    with tempfile.TemporaryDirectory(prefix="specshield-metrics-") as folder:
+        os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder  # before prometheus_client is imported
+        uvicorn.run("specshield.service.app:create_app", factory=True, **options)
+    if embedded is not None:
+        embedded.leave()
 
 
 def worker(

@@ -94,3 +94,22 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
     assert told in line
     assert expected in line.partition("; expected ")[2]
     assert "secret" not in line
+
+
+@pytest.mark.parametrize("more", [[], ["--workers", "2"]])
+def test_why_the_store_does_not_start_is_said_in_one_line(tmp_path, more):
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
+    folder = tmp_path / "store" / "appendonlydir"
+    folder.mkdir(parents=True)
+    (folder / "appendonly.aof.manifest").write_text("not a manifest\n")
+    run = subprocess.run(
+        [sys.executable, "-m", "specshield.cli", "serve", "--port", "0", *more],
+        env={**kept, "SPECSHIELD_DATA_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("the embedded store does not start: Invalid AOF manifest file format; see ")
+    assert line.endswith("store.log")

@@ -50,15 +50,18 @@ TAGS = [
 log = logging.getLogger("specshield")
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
-    """The application. Nothing is opened before it starts."""
+def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None = None) -> FastAPI:
+    """The application. Nothing is opened before it starts.
+
+    embedded: this process's share in the embedded store, where it has one already; left at the end.
+    """
     settings = settings or Settings()
     app = FastAPIOffline(
         title="specshield",
         version=__version__,
         description=DESCRIPTION,
         openapi_tags=TAGS,
-        lifespan=lambda app: _life(app, settings),
+        lifespan=lambda app: _life(app, settings, embedded),
         redoc_url=None,
         generate_unique_id_function=lambda route: "_".join([*map(str, route.tags), route.name]),
         swagger_ui_parameters={"defaultModelsExpandDepth": 0, "tryItOutEnabled": True},
@@ -76,10 +79,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 
 @asynccontextmanager
-async def _life(app: FastAPI, settings: Settings) -> AsyncIterator[None]:
+async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None) -> AsyncIterator[None]:
     if multiprocessing.parent_process() is not None:  # one of uvicorn's workers
         follow_parent()
-    embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
+    if embedded is None and settings.redis_url is None:
+        embedded = EmbeddedStore(settings.data_dir)
     if embedded is not None:
         await asyncio.to_thread(embedded.join)
     url = embedded.url if embedded is not None else str(settings.redis_url)

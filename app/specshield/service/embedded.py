@@ -46,6 +46,8 @@ class EmbeddedStore:
     def join(self) -> None:
         """Blocks until the store answers: some 50 ms where it has to be started."""
         self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        log = self.folder / "store.log"
+        said = log.stat().st_size if log.exists() else 0
         lock = os.open(self.folder / "start.lock", os.O_RDWR | os.O_CREAT, 0o600)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -55,7 +57,7 @@ class EmbeddedStore:
                     tries += 1
                     self._open()
                 if tries > TRIES or time.monotonic() > deadline:
-                    raise StoreError(f"the embedded store does not start; see {self.folder / 'store.log'}")
+                    raise StoreError(f"the embedded store does not start{_reason(log, said)}; see {log}")
                 time.sleep(0.005)
         finally:
             os.close(lock)
@@ -138,3 +140,14 @@ class EmbeddedStore:
                 return connection.recv(64).startswith(b"+PONG")  # -LOADING while it reads its file
             except OSError:
                 return False
+
+
+def _reason(log: Path, said: int) -> str:
+    """The last warning in the log after its first `said` bytes, as ": why"; empty where there is none."""
+    if not log.exists():
+        return ""
+    with open(log, "rb") as file:
+        file.seek(said)
+        lines = file.read(1 << 20).decode(errors="replace").splitlines()
+    warnings = [line.partition(" # ")[2] for line in lines if " # " in line]  # pid:role time # what
+    return f": {warnings[-1]}" if warnings else ""
