@@ -26,12 +26,12 @@ KEEP = 0.97  # of the charges from one step to the next: models change their min
 TRACK = 0.95  # of the record of predictions, likewise
 HABITS = 0.1  # how fast the running average of the model's motions follows
 DOUBT = 6.0  # [nats] by which habits may predict better, over the last 1 / (1 - TRACK) steps
-WARY = 3.0  # of them before anything is seen
+WARY = 8.0  # of them before anything is seen: a model that ends soon by itself is best left alone
 SHARP = 20.0  # a KL is charged for a whole distribution, which tells more than one draw from it would
 POSSIBLE = 0.03  # of the leading goal's probability: goals below that are left out
 FLOOR = 0.03  # of the surrogate's mass is spread over all motions: no observation rules a goal out
 LEAST = 1e-6  # of a motion's probability
-STEEPEST = 4.0  # logits a feature
+FLATTEST, STEEPEST = 0.5, 4.0  # logits a feature
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class Belief:
 
     @property
     def style(self) -> Floats:
-        """The logit of each feature, shape (F,): progress and turning for, in steps of a quarter octave."""
+        """The logit of each feature, shape (F,): one number for progress, turning and being blocked."""
         fitted = np.linalg.solve(self.normal, self.moment)
-        sharp = 2.0 ** (round(2.0 * math.log2(min(max(fitted[:2].mean(), 0.5), STEEPEST))) / 2.0)
-        return np.array([sharp, sharp, -sharp, round(float(fitted[3]))])
+        sharp = min(max(float(fitted[:2].mean()), FLATTEST), STEEPEST)
+        return np.array([sharp, sharp, -sharp, fitted[3]])
 
     def probabilities(self) -> Floats:
         """Of each goal, 0 for those that hardly can be it, and of wandering. Shape (G + 1,)."""
