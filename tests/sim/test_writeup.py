@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
+from specshield.errors import NotFound
 from specshield.sim import figures, writeup
 from specshield.sim.cases import load_case
 from specshield.sim.experiment import Experiment
@@ -61,6 +62,16 @@ def test_several_models_share_a_page(tmp_path):
         assert (tmp_path / "two" / model / "case1" / "ways.png").is_file()
         assert f"--model {model} --noise none --methods ours,lookahead --out out/results-two/{model}" in page
     assert "specshield report out/results-two --out docs/two.md\n" in page
+
+
+def test_a_part_of_a_results_folder_is_no_results_folder(tmp_path):
+    kept = tmp_path / "results" / "case1" / "none"
+    kept.mkdir(parents=True)
+    (kept / "experiment.json").write_text(json.dumps(Experiment("case1").to_json()))
+    (kept / "runs.jsonl").write_text(json.dumps(record(0, "ours").to_json()) + "\n")
+    for part in (kept, kept.parent):
+        with pytest.raises(NotFound, match="no results"):
+            writeup.write_up(part, tmp_path / "page.md")
 
 
 def test_every_model_is_described():

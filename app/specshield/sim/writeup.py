@@ -72,7 +72,8 @@ def write_up(folder: Path, page: Path) -> None:
     folder: as `specshield evaluate --out` was given, or one that holds such folders, one a model. Raises
     NotFound where it holds no results.
     """
-    found = {about.parent: write(about.parent) for about in sorted(folder.rglob("experiment.json"))}
+    written = [*folder.glob("*/*/experiment.json"), *folder.glob("*/*/*/experiment.json")]
+    found = {about.parent: write(about.parent) for about in sorted(written)}
     if not found:
         raise NotFound(
             "there are no results", path="results", got=str(folder),
@@ -265,7 +266,7 @@ def _calibrations(found: dict[Path, Results]) -> Iterator[str]:
 
 
 def _commands(folder: Path, found: Mapping[Path, Results], page: Path) -> Iterator[str]:
-    top = Path("out") / folder.name
+    top = Path("out") / folder.resolve().name
     for kept, results in found.items():
         about = results["experiment"]
         case = f"house --house {about['house']}" if about["house"] else results["case"]
