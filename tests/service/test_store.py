@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
 from tests.serving import serving, wait_for
 
 from specshield.errors import StoreError
+from specshield.service import keeper
 from specshield.service.embedded import EmbeddedStore
 
 
@@ -103,6 +106,20 @@ def test_a_store_stays_until_its_last_user_is_gone(tmp_path):
     assert second.joined()
     second.leave()
     wait_for(lambda: not runs(pid), 5.0)
+
+
+def test_a_store_that_nobody_wants_any_more_leaves_at_once_however_young(tmp_path):
+    """The keeper ignores SIGTERM, and a store has no handler of its own in its first moments."""
+    waits = [sys.executable, "-c", "import time; time.sleep(30)"]
+    began = time.monotonic()
+    subprocess.run([sys.executable, keeper.__file__, tmp_path, *waits], stdin=subprocess.DEVNULL, timeout=20)
+    assert time.monotonic() - began < 5.0
+
+
+def test_a_folder_that_cannot_be_used_is_said_to_be(tmp_path):
+    (tmp_path / "store").touch()
+    with pytest.raises(StoreError, match=f"cannot be used: {tmp_path}/store: File exists"):
+        EmbeddedStore(tmp_path).join()
 
 
 def test_a_path_too_long_for_a_socket_is_said_to_be(tmp_path):

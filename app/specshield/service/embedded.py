@@ -44,7 +44,20 @@ class EmbeddedStore:
         return f"unix://{self.socket}"
 
     def join(self) -> None:
-        """Blocks until the store answers: some 50 ms where it has to be started."""
+        """Blocks until the store answers: some 50 ms where it has to be started.
+
+        Raises StoreError where it does not start, or its folder cannot be used.
+        """
+        try:
+            self._join()
+        except OSError as error:
+            where = error.filename or self.folder
+            raise StoreError(
+                f"the embedded store's folder cannot be used: {where}: {error.strerror}",
+                expected="a folder to write to",
+            ) from error
+
+    def _join(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         log = self.folder / "store.log"
         said = log.stat().st_size if log.exists() else 0
@@ -143,11 +156,15 @@ class EmbeddedStore:
 
 
 def _reason(log: Path, said: int) -> str:
-    """The last warning in the log after its first `said` bytes, as ": why"; empty where there is none."""
+    """The last warning in the log after its first `said` bytes, as ": why"; empty where there is none.
+
+    What begins with WARNING is advice on the machine's settings, which no start fails for.
+    """
     if not log.exists():
         return ""
     with open(log, "rb") as file:
         file.seek(said)
         lines = file.read(1 << 20).decode(errors="replace").splitlines()
     warnings = [line.partition(" # ")[2] for line in lines if " # " in line]  # pid:role time # what
-    return f": {warnings[-1]}" if warnings else ""
+    reasons = [warning for warning in warnings if not warning.startswith("WARNING")]
+    return f": {reasons[-1]}" if reasons else ""

@@ -24,6 +24,12 @@ def follow_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
+def _as_store() -> None:
+    """It can be told to stop from its first moment on; the keeper, whose signals it takes over, cannot."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    follow_parent()
+
+
 def main(folder: Path, command: list[str]) -> int:
     """Hold the lock, run the store, stop it at the end of standard input; its exit status."""
     lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
@@ -37,7 +43,7 @@ def main(folder: Path, command: list[str]) -> int:
             stderr=log,
             cwd=folder,
             pass_fds=[lock],
-            preexec_fn=follow_parent,
+            preexec_fn=_as_store,
         )
 
     def watch() -> None:
