@@ -108,6 +108,14 @@ def test_a_folder_of_other_records_is_refused_before_anything_is_done(tmp_path):
     assert [path.name for path in tmp_path.rglob("*.json*")] == ["experiment.json"]
 
 
+@pytest.mark.parametrize("name", ["magic", "magic@conformal", "hcd@conformal/4", "ours@much"])
+def test_a_method_that_is_not_is_told_before_anything_is_done(tmp_path, name):
+    with pytest.raises((InputError, NotFound)) as caught:
+        commands.evaluate([Experiment("case1")], 1, ["ours@conformal", name], tmp_path, 1, None, False)
+    assert caught.value.path == "methods"
+    assert not list(tmp_path.iterdir())
+
+
 def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_path, monkeypatch):
     """What is there is copied, and changed as little as can be."""
     out, asked = tmp_path / "out", Experiment("case1", seed=8)
@@ -256,6 +264,7 @@ def test_a_house_is_a_case_like_another():
         (lambda: Experiment("house"), "house"),
         (lambda: Experiment("case1", "house_0"), "house"),
         (lambda: Experiment("case1", noise="fog"), "noise"),
+        (lambda: Experiment("case1", model="oracle"), "model"),
         (lambda: Experiment("house", "nowhere").setting, "house"),
         (lambda: EXPERIMENT.setting.method("magic"), "methods"),
         (lambda: EXPERIMENT.setting.method("ours@much"), "methods"),

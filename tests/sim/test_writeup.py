@@ -64,12 +64,15 @@ def test_several_models_share_a_page(tmp_path):
     assert "specshield report out/results-two --out docs/two.md\n" in page
 
 
-def test_a_part_of_a_results_folder_is_no_results_folder(tmp_path):
+def test_a_folder_without_results_is_said_to_be(tmp_path):
     kept = tmp_path / "results" / "case1" / "none"
     kept.mkdir(parents=True)
     (kept / "experiment.json").write_text(json.dumps(Experiment("case1").to_json()))
     (kept / "runs.jsonl").write_text(json.dumps(record(0, "ours").to_json()) + "\n")
-    for part in (kept, kept.parent):
+    begun = tmp_path / "begun" / "case1" / "none"  # no run of it is finished
+    begun.mkdir(parents=True)
+    (begun / "experiment.json").write_text(json.dumps(Experiment("case1").to_json()))
+    for part in (kept, kept.parent, tmp_path / "begun"):
         with pytest.raises(NotFound, match="no results"):
             writeup.write_up(part, tmp_path / "page.md")
 

@@ -60,11 +60,13 @@ def evaluate(
     out: the folder of the results, one folder an experiment; what is there already is not done again. 1 if a
     method that certifies its actions broke the rule in a world that was as told.
     """
-    broken = False
+    for name in methods:  # what cannot be is said before anything that takes long
+        split(name.replace("@conformal", "@0"))
     folders = [None if out is None else out / e.setting.case.name / e.noise for e in experiments]
     for experiment, folder in zip(experiments, folders, strict=True):
         if folder is not None:
-            evaluation.check(folder, experiment)  # before anything that takes long
+            evaluation.check(folder, experiment)
+    broken = False
     for experiment, folder in zip(experiments, folders, strict=True):
         began = time.monotonic()
         chosen = [calibrated(experiment, name, folder, processes) for name in methods]

@@ -22,7 +22,7 @@ from specshield.sim.disturbance import believed, check
 from specshield.sim.houses import load_house_case
 from specshield.sim.learned.model import FOLDER, WEIGHTS, read
 from specshield.sim.methods import Decoding, Method, Shielded, Simplex
-from specshield.sim.model import FoundationModel, make_model
+from specshield.sim.model import FoundationModel, check_model, make_model
 from specshield.task import Task
 
 METHODS = ("unmodified", "hcd", "rcd", "simplex", "paper", "ours", "lookahead")
@@ -42,6 +42,7 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check(self.noise)
+        check_model(self.model)
         if (self.case == "house") != (self.house is not None):
             raise InputError(
                 "the case 'house' needs a house, and no other has one", path="house", got=self.house,

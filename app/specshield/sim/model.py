@@ -199,11 +199,16 @@ MODELS: dict[str, Callable[[Case], FoundationModel]] = {
 
 def make_model(name: str, case: Case) -> FoundationModel:
     """A model of that name, told the case's instruction. Raises NotFound."""
+    check_model(name)
+    return MODELS[name](case)
+
+
+def check_model(name: str) -> None:
+    """Raises NotFound where no model has that name."""
     if name not in MODELS:
         raise NotFound(
             f"there is no model {name!r}", path="model", got=name, expected=f"one of {', '.join(MODELS)}"
         )
-    return MODELS[name](case)
 
 
 def softmax(logits: Floats) -> Floats:

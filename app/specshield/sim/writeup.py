@@ -72,8 +72,8 @@ def write_up(folder: Path, page: Path) -> None:
     folder: as `specshield evaluate --out` was given, or one that holds such folders, one a model. Raises
     NotFound where it holds no results.
     """
-    written = [*folder.glob("*/*/experiment.json"), *folder.glob("*/*/*/experiment.json")]
-    found = {about.parent: write(about.parent) for about in sorted(written)}
+    written = [*folder.glob("*/*/runs.jsonl"), *folder.glob("*/*/*/runs.jsonl")]
+    found = {runs.parent: write(runs.parent) for runs in sorted(written)}
     if not found:
         raise NotFound(
             "there are no results", path="results", got=str(folder),
