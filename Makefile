@@ -58,7 +58,7 @@ results: .venv/.dev
 	    --methods unmodified,paper,ours,ours@conformal/8 || exit 1; \
 	  $(EVALUATE) --case $$case --noise slip,obstacle,shift,collider --runs 50 \
 	    --methods paper,ours,ours@0.04/8 || exit 1; \
-	  $(EVALUATE) --case $$case --model goal-seeker --seed 1 --out $(RESULTS)-goal-seeker \
+	  $(EVALUATE) --case $$case --model goal-seeker --runs 800 --seed 1 --out $(RESULTS)-goal-seeker \
 	    --methods unmodified,ours,lookahead || exit 1; \
 	  for model in decoyed drifter jumper; do \
 	    $(EVALUATE) --case $$case --model $$model --seed 1 --out $(RESULTS)-unknown-models/$$model \

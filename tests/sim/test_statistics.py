@@ -1,7 +1,7 @@
 import pytest
 
 from specshield.sim.runs import Record
-from specshield.sim.statistics import clopper_pearson, summary
+from specshield.sim.statistics import FEW, clopper_pearson, costs_beside, summary
 
 
 @pytest.mark.parametrize(
@@ -52,3 +52,18 @@ def test_a_summary_pairs_the_runs_with_the_unmodified_ones():
     alone = summary("ours", ours, [])
     assert (alone["extra_steps"]["mean"], alone["common"]["runs"]) == (None, 0)
     assert Record.from_json(ours[1].to_json()) == ours[1]
+
+
+def test_costs_are_shares_over_the_runs_that_both_have():
+    plain = [record(i, "unmodified", ended_at=10) for i in range(FEW)]
+    ours = [record(i, kl=4.0, ended_at=10 + 20) for i in range(FEW + 5)]
+    half = [record(i, "lookahead", kl=1.0 + 2.0 * (i % 2), ended_at=10 + 5) for i in range(FEW)]
+    found = costs_beside(half, ours, plain)
+    assert found["extra_steps"] == {"share": 0.25, "low": 0.25, "high": 0.25}  # every run alike
+    assert found["kl"]["share"] == 0.5
+    spread = 1.96 * 1.0 / FEW**0.5 / 4.0  # of the mean of values 1 and 3, as a share of 4
+    assert found["kl"]["low"] == pytest.approx(0.5 - spread, abs=0.03)
+    assert found["kl"]["high"] == pytest.approx(0.5 + spread, abs=0.03)
+    undone = [record(0, "lookahead", main_done=False), *half[1:]]
+    assert costs_beside(undone, ours, plain)["extra_steps"] is None  # too few
+    assert costs_beside(half, [record(i, kl=0.5) for i in range(FEW)], plain)["kl"] is None

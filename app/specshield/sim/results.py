@@ -10,14 +10,14 @@ from typing import Any
 from specshield.sim.evaluation import read, read_about
 from specshield.sim.experiment import METHODS, Experiment, split
 from specshield.sim.runs import MAX_STEPS, Record
-from specshield.sim.statistics import summary
+from specshield.sim.statistics import costs_beside, summary
 
 
 def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]:
     """The figures of every method in `records`, as JSON. refused: starts drawn before those that would do.
 
     left: the steps of a run that the rule leaves after its horizon, and in how many of its runs the model,
-    unmodified, does its task in as many.
+    unmodified, does its task in as many. lookahead_beside_ours: `costs_beside`, None where either is missing.
     """
     by_method: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda r: r.run):
@@ -27,6 +27,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
     plain = by_method.get("unmodified", [])
     case = experiment.setting.case
     left = MAX_STEPS - case.task.horizon
+    pair = by_method.get("lookahead", []), by_method.get("ours", [])
     in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain]
     return {
         "experiment": experiment.to_json(),
@@ -37,6 +38,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
         "refused_starts": sum({record.run: record.refused for record in records}.values()),
         "left": {"steps": left, "done": sum(in_time), "of": len(plain)},
         "methods": [summary(name, by_method[name], plain) for name in ranked],
+        "lookahead_beside_ours": costs_beside(*pair, plain) if all(pair) else None,
     }
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from specshield.sim.episodes import Episode
@@ -14,6 +15,8 @@ from specshield.sim.runs import Record
 
 MODES = ("shaped", "switched", "completion", "prior", "fallback", "violated")  # of decisions
 CONFIDENCE = 0.95
+RESAMPLED = 2000  # times, for a bootstrap
+FEW = 20  # runs: extra steps of fewer are not compared
 
 
 def clopper_pearson(k: int, n: int) -> tuple[float, float]:
@@ -73,6 +76,37 @@ def extra_steps(pairs: Iterable[tuple[Record, Record] | tuple[Episode, Episode]]
         for one, other in pairs
         if one.main_done and other.main_done and one.ended_at is not None and other.ended_at is not None
     ]
+
+
+def costs_beside(
+    records: Sequence[Record], others: Sequence[Record], unmodified: Sequence[Record]
+) -> dict[str, dict[str, float] | None]:
+    """Path KL and mean extra steps as shares of another method's, over the runs that both have.
+
+    share, low, high: with the interval of a bootstrap over those runs (Efron and Tibshirani, 1993). None
+    where the other method costs less than 1 nat or step, and for extra steps of fewer than FEW runs.
+    """
+    theirs = {record.run: record for record in others}
+    plain = {record.run: record for record in unmodified}
+    pairs = [(record, theirs[record.run]) for record in records if record.run in theirs]
+    later = [
+        [extra_steps([(one, plain[one.run])]) if one.run in plain else [] for one in pair] for pair in pairs
+    ]
+    steps = np.array([[each[0] if each else np.nan for each in pair] for pair in later], dtype=np.float64)
+    kl = np.array([[mine.kl, other.kl] for mine, other in pairs])
+    enough = len(pairs) > 0 and int(np.isfinite(steps).sum(axis=0).min()) >= FEW
+    return {"kl": _ratio(kl), "extra_steps": _ratio(steps) if enough else None}
+
+
+def _ratio(pairs: NDArray[np.float64]) -> dict[str, float] | None:
+    """The ratio of two columns' means, pairs [n, 2]; NaN: not counted."""
+    if len(pairs) == 0 or not np.nanmean(pairs[:, 1]) > 1.0:
+        return None
+    drawn = np.random.default_rng(0).integers(len(pairs), size=(RESAMPLED, len(pairs)))
+    means = np.nanmean(pairs[drawn], axis=1)
+    low, high = np.quantile(means[:, 0] / means[:, 1], [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
+    share = np.nanmean(pairs[:, 0]) / np.nanmean(pairs[:, 1])
+    return {"share": _rounded(share), "low": _rounded(low), "high": _rounded(high)}
 
 
 def _share(outcomes: Iterable[bool]) -> dict[str, Any]:

@@ -54,7 +54,6 @@ seeks its target""",
 target""",
     "learned": "learned, a transformer that imitates shortest paths, from egocentric senses",
 }
-FEW = 20  # runs: extra steps of fewer are not compared
 WHY_NEXT_STEP = """\
 Next-step methods see of a window the last step alone: where the place to visit is further than that, nothing
 is left to choose. HCD keeps a G. What RCD adds to the logits leads straight at a place, walls or not."""
@@ -194,7 +193,7 @@ def _short(results: Results) -> str:
             parts.append(f"main task {points:+.1f} points below unmodified{over}")
         if parts:
             lines.append(f"- {one['method']}: {'; '.join(parts)}.")
-    lines += _look_ahead({one["method"]: one for one in results["methods"]})
+    lines += _look_ahead(results["lookahead_beside_ours"])
     left = results["left"]
     if left["of"]:
         lines.append(
@@ -204,20 +203,19 @@ def _short(results: Results) -> str:
     return "\n".join(lines)
 
 
-def _look_ahead(methods: Mapping[str, Results]) -> Iterator[str]:
-    """What looking ahead saves of what the projection costs, where both were run and it costs something."""
-    if not {"ours", "lookahead"} <= set(methods):
-        return
-    ours, ahead = methods["ours"], methods["lookahead"]
-    shares = [("KL a run", ahead["kl"], ours["kl"])]
-    both = [one["extra_steps"]["both"] for one in (ours, ahead)]
-    if min(both) >= FEW:
-        shares.append(("mean extra steps", ahead["extra_steps"]["mean"], ours["extra_steps"]["mean"]))
-    parts = [f"{name} {mine / whole:.2f}" for name, mine, whole in shares if whole > 1.0]
+def _look_ahead(beside: Mapping[str, Mapping[str, float] | None] | None) -> Iterator[str]:
+    """What looking ahead costs beside the projection, where both were run and it costs something."""
+    names = {"kl": "KL a run", "extra_steps": "mean extra steps"}
+    parts = [
+        f"{names[name]} {one['share']:.2f} ({one['low']:.2f} to {one['high']:.2f})"
+        for name, one in (beside or {}).items()
+        if one is not None
+    ]
     if parts:
-        yield f"- lookahead, as a share of ours: {', '.join(parts)}."
-    if min(both) < FEW:
-        yield f"- Extra steps: of {both[0]} runs with ours and {both[1]} with lookahead, too few to compare."
+        yield (
+            f"- lookahead, as a share of ours: {', '.join(parts)}; "
+            "with 95 % intervals of a bootstrap over runs."
+        )
 
 
 def _noise_table(experiments: Sequence[Results]) -> str:
