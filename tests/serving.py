@@ -43,7 +43,13 @@ def serving(data_dir: Path, *options: str, ready: bool = True, **environment: st
     with open(log, "ab") as output:
         process = subprocess.Popen(
             [sys.executable, "-m", "specshield.cli", "serve", "--port", str(port), *options],
-            env={**kept, "SPECSHIELD_DATA_DIR": str(data_dir), "SPECSHIELD_WORKER": "false", **environment},
+            env={
+                **kept,
+                "SPECSHIELD_DATA_DIR": str(data_dir),
+                "SPECSHIELD_WORKER": "false",
+                "TMPDIR": str(data_dir),  # what a killed server leaves goes with the test
+                **environment,
+            },
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=output,

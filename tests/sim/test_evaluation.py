@@ -76,6 +76,7 @@ def test_processes_and_a_second_go_make_the_same_records(serial, tmp_path):
     assert same(first) == same(serial[:1])
     path = tmp_path / "runs.jsonl"
     path.write_bytes(path.read_bytes() + b'{"run": 1, "method"')  # killed while it wrote
+    assert same(read(tmp_path)) == same(first)
     seen = []
     again = evaluate(EXPERIMENT, RUNS, METHODS, tmp_path, processes=2, on_progress=seen.append)
     assert same(again) == same(serial)

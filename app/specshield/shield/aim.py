@@ -1,7 +1,7 @@
 """What J asks for beyond satisfaction, so that noise does not break the rule: a margin [m] and slack [steps].
 
-Both are about what is still open. Where they cannot be had, the most that can: of the slack first, then of
-the margin.
+The margin is asked of the whole trajectory first; where no future has that, and with slack, of what is still
+open. Where they cannot be had, the most that can: of the slack first, then of the margin.
 """
 
 from __future__ import annotations

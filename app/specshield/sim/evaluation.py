@@ -130,9 +130,9 @@ def read_about(folder: Path) -> tuple[Experiment, dict[str, Any] | None]:
 
 
 def read(folder: Path) -> list[Record]:
-    """The records kept in a folder, one a run and method: the last."""
+    """The records kept in a folder, one a run and method: the last. A line that was cut off is none."""
     with open(folder / "runs.jsonl") as lines:
-        records = [Record.from_json(json.loads(line)) for line in lines]
+        records = [Record.from_json(json.loads(line)) for line in lines if line.endswith("\n")]
     return list({(record.run, record.method): record for record in records}.values())
 
 
