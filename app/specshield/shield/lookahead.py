@@ -15,6 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from specshield.compiled import kernel
 from specshield.errors import Unsupported
@@ -38,7 +39,8 @@ PRICE = 0.4  # [nats] of a step while the rule is pending: the model's own task 
 LEAD_GAP = 1.0  # [m] along free space between the places that have a table
 WORK = 200_000_000  # entries solved for a task, at most, where that leaves a few places
 MOST, FEWEST = 64, 8  # places
-LEADERS = 8  # tables asked in a decision
+REACH = 0.3  # [m] further than the nearest at which a place with a table stands for a goal, less and less
+LEADERS = 16  # tables asked in a decision
 NEGLIGIBLE = 0.02  # a probability, or trust, not worth the work
 WORST = 10.0  # [nats] more than the worst action that has a D, for those that have none
 
@@ -47,8 +49,8 @@ WORST = 10.0  # [nats] more than the worst action that has a D, for those that h
 class LookAhead:
     """A task as the look-ahead sees it, prepared once.
 
-    leads [B]: the goals that have a table of D and, last, WANDER; lead_of [G + 1]: which of them stands for
-    each goal, and for wandering. tables [B, kept, H, rows].
+    leads [B]: the goals that have a table of D and, last, WANDER; shares [G + 1, B]: how far each of them
+    stands for each goal, and for wandering. tables [B, kept, H, rows].
     """
 
     task: Task
@@ -57,7 +59,7 @@ class LookAhead:
     goals: Goals
     planes: Planes
     leads: Integers
-    lead_of: Integers
+    shares: Floats
     tables: NDArray[np.uint16]
 
     def begin(self) -> Belief:
@@ -95,7 +97,7 @@ class LookAhead:
         status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
         replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
         mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
-        weights = np.bincount(self.lead_of, belief.probabilities(), len(self.leads))
+        weights = belief.probabilities() @ self.shares
         asked = np.argsort(-weights, kind="stable")[:LEADERS]
         asked = asked[weights[asked] >= NEGLIGIBLE]
         costs = np.empty((len(asked), len(self.task.robot.motions)))
@@ -128,7 +130,7 @@ def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
         )  # fmt: skip
     planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
     entries = int((planes.slot >= 0).sum()) * planes.valid.size
-    places, lead_of = _leads(goals, min(max(WORK // entries, FEWEST), MOST))
+    places, shares = _leads(goals, min(max(WORK // entries, FEWEST), MOST))
     leads = np.append(places, WANDER)
     shape = (len(leads), int(planes.kept.max()) + 1, len(planes.valid), int(planes.row.max()) + 1)
     tables = np.empty(shape, np.uint16)
@@ -137,11 +139,11 @@ def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
     for table, lead in zip(tables, leads, strict=True):
         _react_everywhere(body, goals, planes, int(lead), STYLE, motions, ends)
         table[:] = solve(body, planes, motions, ends, PRICE)
-    return LookAhead(task, body, rules, goals, planes, leads, np.append(lead_of, len(places)), tables)
+    return LookAhead(task, body, rules, goals, planes, leads, block_diag(shares, 1.0), tables)
 
 
-def _leads(goals: Goals, most: int) -> tuple[Integers, Integers]:
-    """At most `most` goals that lie apart, [B], and which of them is nearest to each goal, [G]."""
+def _leads(goals: Goals, most: int) -> tuple[Integers, Floats]:
+    """At most `most` goals that lie apart, [B], and how far each stands for each goal, [G, B]."""
     cells = np.array([np.argwhere(distance == 0)[0] for distance in goals.distance])
     between = goals.distance[:, cells[:, 0], cells[:, 1]].astype(np.float64) / 100.0
     gap = LEAD_GAP
@@ -151,7 +153,9 @@ def _leads(goals: Goals, most: int) -> tuple[Integers, Integers]:
             if np.all(between[chosen, g] >= gap):
                 chosen.append(g)
         if len(chosen) <= most:
-            return np.array(chosen), np.argmin(between[chosen], axis=0)
+            further = between[chosen] - between[chosen].min(axis=0)
+            near = np.exp(-further.T / REACH)
+            return np.array(chosen), near / near.sum(axis=1, keepdims=True)
         gap *= 1.1
 
 
