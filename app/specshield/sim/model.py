@@ -90,7 +90,20 @@ class GoalSeeker:
         return np.where(observation.blocked, -1.0, saved)
 
 
-class Jumper(GoalSeeker):
+class Errant(GoalSeeker):
+    """A goal-seeker that knows of other places than its target."""
+
+    PLACES = 8
+
+    def __init__(self, case: Case) -> None:
+        self._elsewhere = elsewhere(case, self.PLACES)
+        super().__init__(case.task.robot)
+
+    def _any(self) -> Case:
+        return self._elsewhere[int(self._random.integers(self.PLACES))]
+
+
+class Jumper(Errant):
     """A goal-seeker that changes its mind: at random steps, wherever it is, it sets out for another place.
 
     In the end that is the target, which it keeps to. When it jumps, and where to, is the same however it is
@@ -99,11 +112,6 @@ class Jumper(GoalSeeker):
 
     JUMP = 0.05  # a step
     HOME = 0.2  # of the jumps go to the target
-    PLACES = 8
-
-    def __init__(self, case: Case) -> None:
-        self._elsewhere = elsewhere(case, self.PLACES)
-        super().__init__(case.task.robot)
 
     def reset(self, random: np.random.Generator) -> None:
         super().reset(random)
@@ -114,25 +122,17 @@ class Jumper(GoalSeeker):
             self._errand = None if self._random.random() < self.HOME else self._any()
         return self.react(_sent(robot, self._errand))
 
-    def _any(self) -> Case:
-        return self._elsewhere[int(self._random.integers(self.PLACES))]
 
-
-class Decoyed(GoalSeeker):
+class Decoyed(Errant):
     """A goal-seeker with a wrong target: it goes there first, stays about it for some tens of steps without
     ending, and then turns to the right one.
     """
 
     STAY = 30.0  # steps near the decoy, in the mean
-    PLACES = 8
-
-    def __init__(self, case: Case) -> None:
-        self._elsewhere = elsewhere(case, self.PLACES)
-        super().__init__(case.task.robot)
 
     def reset(self, random: np.random.Generator) -> None:
         super().reset(random)
-        self._decoy = self._elsewhere[int(random.integers(self.PLACES))]
+        self._decoy = self._any()
         self._left = int(random.geometric(1.0 / self.STAY))  # steps near the decoy
 
     def logits(self, robot: SimulatedRobot) -> Floats:
