@@ -101,6 +101,7 @@ def test_the_picture_shows_both_ways(campaign, case, tmp_path):
         colors = {color for _, color in image.getcolors(1 << 20)}
         assert {picture.SHIELDED, picture.UNSHIELDED, picture.TARGET, picture.WALL, picture.GOOD} <= colors
         assert (picture.BAD in colors) == (case.name == "case2")
+        assert picture.AFTER in colors  # the rule's horizon has an end
         u, v = (
             picture.BORDER + (case.target[0] - xmin) * picture.PIXELS,
             picture.BORDER + (ymax - case.target[1]) * picture.PIXELS,

@@ -27,6 +27,7 @@ from matplotlib.patheffects import Normal, Stroke
 
 WAYS = 6  # runs drawn on a map
 INK, FAINT, WALL, PAPER = "#282b32", "#9ea0a5", "#343840", "#faf9f6"
+AFTER = "#b4b4b4"  # a way where the rule asks nothing any more
 GOOD, BAD, TARGET = "#2b8a5a", "#c63c3c", "#f6be28"
 COLORS = ("#8a8d94", "#e27d22", "#b0479a", "#5f9ea0", "#7a5cc8", "#2563c8", "#2b8a5a", "#c63c3c")
 LOOKS = tuple(product(("-", "--", ":"), COLORS))  # of methods, in their order
@@ -61,7 +62,8 @@ def draw(case: Case, records: Sequence[Record], folder: Path) -> list[Path]:
 
 
 def _ways(case: Case, by_method: ByMethod) -> Any:
-    """The first WAYS runs over the map, one panel a method."""
+    """The first WAYS runs over the map, one panel a method; grey where the rule asks nothing any more."""
+    asked = case.task.horizon + 1
     columns = min(len(by_method), 4)
     rows = -(-len(by_method) // columns)
     xmin, ymin, xmax, ymax = case.task.grid.bounds
@@ -74,11 +76,14 @@ def _ways(case: Case, by_method: ByMethod) -> Any:
         drawn = records[:WAYS]
         for record in drawn:
             x, y, _ = np.array(record.poses).T
-            axis.plot(x, y, color="#2563c8" if record.satisfied else "#e27d22", lw=1.0, alpha=0.8)
+            color = "#2563c8" if record.satisfied else "#e27d22"
+            axis.plot(x[asked - 1 :], y[asked - 1 :], color=AFTER, lw=0.8)
+            axis.plot(x[:asked], y[:asked], color=color, lw=1.0, alpha=0.8)
             axis.plot(x[0], y[0], "o", color=INK, ms=2.6)
         axis.plot(*case.target, "*", color=TARGET, mec=INK, mew=0.6, ms=10)
         kept = sum(record.satisfied for record in drawn)
         axis.set_title(f"{name}: {kept} of {len(drawn)} kept")
+    figure.supxlabel("blue: the rule is kept, orange: it is not, grey: after its horizon", fontsize=9)
     figure.tight_layout()
     return figure
 

@@ -21,7 +21,7 @@ BORDER = 14
 LEGEND = 86
 PAPER, WALL, INK, FAINT = (250, 249, 246), (52, 56, 64), (40, 43, 50), (158, 160, 165)
 GOOD, BAD = (43, 138, 90), (198, 60, 60)
-SHIELDED, UNSHIELDED, TARGET = (37, 99, 200), (226, 125, 34), (246, 190, 40)
+SHIELDED, UNSHIELDED, AFTER, TARGET = (37, 99, 200), (226, 125, 34), (180, 180, 180), (246, 190, 40)
 
 Color = tuple[int, int, int]
 
@@ -32,8 +32,10 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
     canvas.floor()
     for name, region in case.task.regions.items():
         canvas.region(name, region, BAD if name in avoided(case.task.formula) else GOOD)
-    canvas.way(unshielded.poses, UNSHIELDED, 2.2)
-    canvas.way(shielded.poses, SHIELDED, 3.0)
+    asked = case.task.horizon + 1  # states that the rule is about
+    for episode, color, thickness in ((unshielded, UNSHIELDED, 2.2), (shielded, SHIELDED, 3.0)):
+        canvas.way(episode.poses[asked - 1 :], AFTER, thickness)
+        canvas.way(episode.poses[:asked], color, thickness)
     for t, (x, y, _) in _kept_at(case, shielded.poses):
         canvas.dot((x, y), 5.0, SHIELDED, PAPER)
         canvas.text((x, y), f"t={t}", 12, SHIELDED, shift=(9, -9), anchor="ls")
@@ -123,6 +125,8 @@ class _Canvas:
 
     def way(self, poses: Sequence[Pose], color: Color, thickness: float) -> None:
         line = [self._at(pose) for pose in poses]
+        if len(line) < 2:
+            return
         width = round(thickness * FINE)
         self._pen.line(line, fill=color, width=width, joint="curve")
         for u, v in line:
@@ -171,6 +175,8 @@ class _Canvas:
             self._pen.rectangle(box, fill=tint, outline=color, width=2 * FINE)
             self._write((right + 30 * FINE, v), said, 14, INK, "lm")
             right += 120 * FINE
+        self._pen.line((right, v, right + 34 * FINE, v), fill=AFTER, width=4 * FINE)
+        self._write((right + 44 * FINE, v), f"after t={case.task.horizon}, the rule's last", 14, INK, "lm")
         self._write((left + 560 * FINE, top + 56 * FINE), f'"{case.instruction}"', 14, INK, "lm")
 
     def save(self, path: Path) -> None:
