@@ -43,8 +43,11 @@ def settled(mask, state, t):
     return mask | 2 * (cell == WORLD.regions["B"] and 5 <= t <= 9)
 
 
-def exact(r, e):
-    """The least KL of a path that keeps the rule, {(t, mask): [states]}; what comes after an end is free."""
+def exact(r, e, price, left):
+    """The least KL of a path that keeps the rule, {(t, mask): [states]}; what comes after an end is free.
+
+    price: of a step while A or B is not settled; left [states]: of being where the last of them is.
+    """
     found = {(HORIZON, m): np.where(m == 3, 0.0, np.inf) * np.ones(len(STATES)) for m in range(4)}
     for t, mask in itertools.product(reversed(range(HORIZON)), range(4)):
         values = np.full(len(STATES), np.inf)
@@ -53,29 +56,34 @@ def exact(r, e):
             for m in range(MOTIONS):
                 after = int(WORLD.table[s, m])
                 then = settled(mask, after, t + 1)
-                weight += 0.0 if then is None else r[s, m] * np.exp(-found[t + 1, then][after])
-            values[s] = -(1.0 - e[s]) * np.log(weight) if weight > 0.0 else np.inf
+                if then is not None:
+                    due = left[after] if then == 3 and mask != 3 else 0.0
+                    weight += r[s, m] * np.exp(-found[t + 1, then][after] - due)
+            due = price if mask != 3 else 0.0
+            values[s] = due - (1.0 - e[s]) * np.log(weight) if weight > 0.0 else np.inf
         found[t, mask] = values
     return found
 
 
-@pytest.fixture(scope="module")
-def solved():
-    """D on the lattice for a random model of the cells, which are the lattice's own; and the model."""
-    r, e = model(np.random.default_rng(5))
+def solve_cells(r, e, price, left):
+    """D of a model of the cells, which are the lattice's own."""
     planes = make_planes(WORLD.body, make_rules(WORLD.task), HORIZON, pitch=0.2)
     headings, cells = planes.valid.shape
     assert headings == 4
     motions, ends = np.zeros((MOTIONS, headings, cells), np.float32), np.zeros((headings, cells), np.float32)
+    remaining = np.zeros(cells, np.float32)
     for s, (i, j, h) in enumerate(STATES):
         at = (j + planes.pad) * planes.width + i + planes.pad
-        motions[:, h, at], ends[h, at] = np.log(r[s]), e[s]
-    return planes, solve(WORLD.body, planes, motions, ends, 0.0), r, e
+        motions[:, h, at], ends[h, at], remaining[at] = np.log(r[s]), e[s], left[s]
+    return planes, solve(WORLD.body, planes, motions, ends, price, remaining)
 
 
-def test_desirability_is_exact_where_the_lattice_is(solved):
-    planes, table, r, e = solved
-    wanted, seen = exact(r, e), 0
+@pytest.mark.parametrize(("price", "slope"), [(0.0, 0.0), (0.5, 1.5)])
+def test_desirability_is_exact_where_the_lattice_is(price, slope):
+    r, e = model(np.random.default_rng(5))
+    left = np.array([slope * (2 - i + j) for i, j, _ in STATES])
+    planes, table = solve_cells(r, e, price, left)
+    wanted, seen = exact(r, e, price, left), 0
     for t, mask in ((0, 0), (3, 0), (2, 1), (6, 1), (7, 3)):
         for s, state in enumerate(STATES):
             pose = WORLD.pose(*state)
@@ -89,10 +97,12 @@ def test_desirability_is_exact_where_the_lattice_is(solved):
     assert seen > 100
 
 
-def test_following_it_costs_what_the_best_path_does(solved):
+def test_following_it_costs_what_the_best_path_does():
     """Path KL of restrict(r exp(-D), S_t), worked out over all its ways, within 5 % of the least there is."""
-    planes, table, r, e = solved
-    wanted, checked = exact(r, e), 0
+    r, e = model(np.random.default_rng(5))
+    free = np.zeros(len(STATES))
+    planes, table = solve_cells(r, e, 0.0, free)
+    wanted, checked = exact(r, e, 0.0, free), 0
 
     def cost(t, mask, s):
         if t == HORIZON:
@@ -122,8 +132,7 @@ def test_following_it_costs_what_the_best_path_does(solved):
     for s in range(len(STATES)):
         mask = settled(0, s, 0)
         i, j, _ = STATES[s]
-        free = WORLD.body.occupied[j, i] == 0
-        if free and mask is not None and np.isfinite(wanted[0, mask][s]):
+        if not WORLD.body.occupied[j, i] and mask is not None and np.isfinite(wanted[0, mask][s]):
             assert memo(0, mask, s) <= 1.05 * wanted[0, mask][s] + 1e-3
             checked += 1
     assert checked >= 8

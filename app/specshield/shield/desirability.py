@@ -3,7 +3,8 @@
     D_t(s, p) = c(p) - (1 - e(s)) log sum_a r(a | s) exp(-D_{t+1}(f(s, a), p'))     [nats]
 
 r: the surrogate's motions, given that it does not end; e: the chance that it does, after which the rule
-costs nothing; p: the goals of the formula that are settled; c: the price of a step while some are not.
+costs nothing; p: the goals of the formula that are settled; c: the price of a step while some are not. The
+way that is left to the model's own goal where the last of them is settled is paid there and then, in L(s).
 Without a price exp(-D) is the probability that the surrogate itself would keep the rule, and following r
 exp(-D) costs D in KL over the whole path: the least there is (Todorov, 2009). On a coarse lattice; the
 feasible set keeps the rule, D only orders what is in it.
@@ -25,13 +26,18 @@ Singles = NDArray[np.float32]
 
 NEVER = np.float32(1e6)  # D where the rule cannot be kept
 TIGHT = np.float32(6.0)  # [nats] what it costs to be where no neighbour of the lattice can: walls, deadlines
-CODES = 64.0  # table codes a nat
+CODES = 32.0  # table codes a nat, which reach to 2,047 nats
 NO_CODE = 65535
 
 
 @kernel
-def solve(body: Body, planes: Planes, motions: Singles, ends: Singles, price: float) -> NDArray[np.uint16]:
-    """D as codes [kept, H, rows]. motions [M, H, N]: log r; ends [H, N]: e; price: c, a step [nats]."""
+def solve(
+    body: Body, planes: Planes, motions: Singles, ends: Singles, price: float, left: Singles
+) -> NDArray[np.uint16]:
+    """D as codes [kept, H, rows].
+
+    motions [M, H, N]: log r; ends [H, N]: e; price: c, a step [nats]; left [N]: L [nats].
+    """
     headings, cells = planes.valid.shape
     edge = planes.pad * planes.width + planes.pad
     horizon, sets = planes.slot.shape[0] - 2, planes.slot.shape[1]
@@ -53,7 +59,7 @@ def solve(body: Body, planes: Planes, motions: Singles, ends: Singles, price: fl
                 if mask == sets - 1:
                     here[:] = 0.0
             else:
-                _gather(planes, t + 1, mask, following, ahead)
+                _gather(planes, t + 1, mask, following, left, ahead)
                 for h in range(headings):
                     _back(body, planes, h, edge, motions, ends, ahead, due, cost, least, total, here)
             _bar(planes.possible[slot] if planes.possible.shape[0] > 0 else planes.valid, here)
@@ -64,9 +70,9 @@ def solve(body: Body, planes: Planes, motions: Singles, ends: Singles, price: fl
 
 
 @kernel
-def _gather(planes: Planes, t: int, mask: int, following: Singles, ahead: Singles) -> None:
+def _gather(planes: Planes, t: int, mask: int, following: Singles, left: Singles, ahead: Singles) -> None:
     """D at step t once its own state is taken into the progress, [H, N]."""
-    due, opened = planes.due[t], planes.open[t] & ~mask
+    due, opened, last = planes.due[t], planes.open[t] & ~mask, following.shape[0] - 1
     for h in range(ahead.shape[0]):
         row, plain = ahead[h], following[mask, h]
         for c in range(row.shape[0]):
@@ -78,7 +84,8 @@ def _gather(planes: Planes, t: int, mask: int, following: Singles, ahead: Single
             if keeps[c] & due != due:
                 row[c] = NEVER
             elif holds[c] & opened:
-                row[c] = following[mask | (holds[c] & opened), h, c]
+                after = mask | (holds[c] & opened)
+                row[c] = following[after, h, c] + (left[c] if after == last else np.float32(0.0))
 
 
 @kernel
@@ -209,8 +216,8 @@ def _encode(row: NDArray[np.int64], values: Singles, out: NDArray[np.uint16]) ->
         if row[c] >= 0:
             for h in range(values.shape[0]):
                 value = max(min(values[h, c], top), np.float32(0.0))
-                code = np.uint16(NO_CODE) if values[h, c] >= NEVER else np.uint16(value * np.float32(CODES))
-                out[h, row[c]] = code
+                code = np.uint16(value * np.float32(CODES) + np.float32(0.5))
+                out[h, row[c]] = np.uint16(NO_CODE) if values[h, c] >= NEVER else code
 
 
 @leaf

@@ -12,7 +12,7 @@ from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, va
 from specshield.robot.unicycle import Body, step
 from specshield.shield.desirability import NEVER, desirability
 from specshield.shield.planes import Planes
-from specshield.shield.surrogate import FEATURES, Goals, follow, is_blocked
+from specshield.shield.surrogate import FEATURES, Goals, follow, is_blocked, left, price
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +29,6 @@ def expand_all(
     leads: NDArray[np.int64],
     asked: NDArray[np.int64],
     style: Floats,
-    price: float,
     t: int,
     mask: int,
     pose_t: Floats,
@@ -62,29 +61,41 @@ def expand_all(
                 read_predicates(rules, pose[child, 0], pose[child, 1], pose[child, 2], values, stack, read)
                 settled[child] = _settle(rules, planes, t + d + 1, settled[n], read)
     cost, log_r, features = np.empty(start[-1]), np.empty(motions), np.empty((motions, FEATURES))
+    full = planes.slot.shape[1] - 1
     for k in range(asked.shape[0]):
-        for n in range(start[levels], start[levels + 1]):
-            u, v, w = pose[n]
-            cost[n] = desirability(body, planes, tables[asked[k]], t + levels, settled[n], u, v, w)
-        for d in range(levels - 1, 0, -1):
+        lead = leads[asked[k]]
+        for d in range(levels, 0, -1):
             for n in range(start[d], start[d + 1]):
                 cost[n] = float(NEVER)
                 if settled[n] < 0:
                     continue
                 u, v, w = pose[n]
-                ends = follow(body, goals, leads[asked[k]], style, u, v, w, blocked[n], features, log_r)
-                first = start[d + 1] + (n - start[d]) * motions
-                least, total = float(NEVER), 0.0
-                for m in range(motions):
-                    if cost[first + m] < NEVER:
-                        least = min(least, cost[first + m] - log_r[m])
-                for m in range(motions):
-                    if cost[first + m] < NEVER:
-                        total += math.exp(least - cost[first + m] + log_r[m])
-                if total > 0.0:
-                    due = price if settled[n] != planes.slot.shape[1] - 1 else 0.0
-                    cost[n] = due + (1.0 - ends) * (least - math.log(total))
+                if d == levels:
+                    cost[n] = desirability(body, planes, tables[asked[k]], t + d, settled[n], u, v, w)
+                else:
+                    ends = follow(body, goals, lead, style, u, v, w, blocked[n], features, log_r)
+                    first = start[d + 1] + (n - start[d]) * motions
+                    total = _log_sum(log_r, cost[first : first + motions])
+                    if total > -float(NEVER):
+                        due = price(lead) if settled[n] != full else 0.0
+                        cost[n] = due - (1.0 - ends) * total
+                before = start[d - 1] + (n - start[d]) // motions
+                if cost[n] < NEVER and settled[n] == full and settled[before] != full:
+                    cost[n] += left(body, goals, lead, u, v)
         out[k] = cost[start[1] : start[2]]
+
+
+@leaf
+def _log_sum(log_r: Floats, cost: Floats) -> float:
+    """log sum_m r_m exp(-cost_m) over the motions that have a cost; -NEVER where none has."""
+    least, total = float(NEVER), 0.0
+    for m in range(cost.shape[0]):
+        if cost[m] < NEVER:
+            least = min(least, cost[m] - log_r[m])
+    for m in range(cost.shape[0]):
+        if cost[m] < NEVER:
+            total += math.exp(least - cost[m] + log_r[m])
+    return math.log(total) - least if total > 0.0 else -float(NEVER)
 
 
 @leaf

@@ -28,14 +28,13 @@ from specshield.shield.belief import STYLE, Belief
 from specshield.shield.desirability import NEVER, solve
 from specshield.shield.expansion import expand_all
 from specshield.shield.planes import Planes, make_planes
-from specshield.shield.surrogate import FEATURES, WANDER, Goals, follow, is_blocked, make_goals
+from specshield.shield.surrogate import FEATURES, WANDER, Goals, follow, is_blocked, left, make_goals, price
 from specshield.task import Task
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 AHEADS = 8  # tasks kept prepared in a process
-PRICE = 0.4  # [nats] of a step while the rule is pending: the model's own task waits
 LEAD_GAP = 1.0  # [m] along free space between the places that have a table
 WORK = 200_000_000  # entries solved for a task, at most, where that leaves a few places
 MOST, FEWEST = 64, 8  # places
@@ -102,7 +101,7 @@ class LookAhead:
         asked = asked[weights[asked] >= NEGLIGIBLE]
         costs = np.empty((len(asked), len(self.task.robot.motions)))
         expand_all(
-            self.body, rules, self.goals, self.planes, self.tables, self.leads, asked, STYLE, PRICE, t, mask,
+            self.body, rules, self.goals, self.planes, self.tables, self.leads, asked, STYLE, t, mask,
             history[-1], costs,
         )  # fmt: skip
         known = np.all(costs < NEVER, axis=0)
@@ -136,9 +135,10 @@ def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
     tables = np.empty(shape, np.uint16)
     motions = np.zeros((len(task.robot.motions), *planes.valid.shape), np.float32)
     ends = np.zeros(planes.valid.shape, np.float32)
+    remaining = np.zeros(planes.valid.shape[1], np.float32)
     for table, lead in zip(tables, leads, strict=True):
-        _react_everywhere(body, goals, planes, int(lead), STYLE, motions, ends)
-        table[:] = solve(body, planes, motions, ends, PRICE)
+        _react_everywhere(body, goals, planes, int(lead), STYLE, motions, ends, remaining)
+        table[:] = solve(body, planes, motions, ends, price(int(lead)), remaining)
     return LookAhead(task, body, rules, goals, planes, leads, block_diag(shares, 1.0), tables)
 
 
@@ -168,8 +168,9 @@ def _react_everywhere(
     style: Floats,
     motions: NDArray[np.float32],
     ends: NDArray[np.float32],
+    remaining: NDArray[np.float32],
 ) -> None:
-    """The surrogate at each pose of the lattice: motions [M, H, N], ends [H, N]."""
+    """The surrogate at each pose of the lattice: motions [M, H, N], ends [H, N], remaining [N]."""
     headings, cells = planes.valid.shape
     features, log_r = np.empty((motions.shape[0], FEATURES)), np.empty(motions.shape[0])
     blocked = np.empty(motions.shape[0], np.bool_)
@@ -179,6 +180,7 @@ def _react_everywhere(
                 continue
             j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
             x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
+            remaining[c] = left(body, goals, goal, x, y)
             for m in range(motions.shape[0]):
                 blocked[m] = planes.free[m, h, c] == 0.0
             ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, features, log_r)

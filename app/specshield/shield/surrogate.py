@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from specshield.compiled import kernel, leaf
 from specshield.robot.unicycle import Body
@@ -34,13 +35,15 @@ END_WITHIN, END_SLOPE, END_CHANCE = 1.0, 0.07, 0.25  # [m], [m], a step: an end 
 WANDER = -1  # in place of a goal
 AHEAD, TURN, OTHER = 3.3, 2.0, -2.0  # logits of one that wanders: the longest move ahead, the largest turn
 WANDER_END = 0.01  # a step
+PRICE = 1.0  # [nats] of a step that the rule keeps the model from its goal
+SEARCH_PRICE = 10.0  # the same where it wanders: what it would search it searches once the rule is settled
 
 
 class Goals(NamedTuple):
     """G places that the model may be going to, and the way to each, in the grid frame; cells of `pitch` [m].
 
-    distance [G, h, w]: along free space [cm], FAR where there is no way. way [G, h, w, 2]: the direction (u,
-    v) to go, times UNIT; zero at the goal.
+    distance [G, h, w]: along space with room to turn, and from beside an obstacle to it [cm]; FAR where there
+    is no way. way [G, h, w, 2]: the direction (u, v) to go, times UNIT; zero at the goal.
     """
 
     pitch: float
@@ -58,14 +61,16 @@ def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
     free = clearance > 0.0
     roomy = clearance > body.radius + math.hypot(body.offset_x, body.offset_y)
     places = _places(roomy, max(round(GAP / pitch), 1))
+    beside, nearest = distance_transform_edt(~roomy, sampling=pitch, return_indices=True)
     distance = np.empty((len(places), *free.shape), np.uint16)
     way = np.empty((len(places), *free.shape, 2), np.int8)
     for g, (row, column) in enumerate(places):
         goal = np.zeros_like(free)
         goal[row, column] = True
-        to_go = _to_go(free, roomy, goal, pitch)
-        distance[g] = np.where(np.isfinite(to_go), np.minimum(100.0 * to_go, FAR - 1), FAR)
-        _steer(to_go, way[g])
+        onward = geodesic_distance(roomy, goal, pitch)
+        to_go = onward[tuple(nearest)] + beside
+        distance[g] = np.where(free & np.isfinite(to_go), np.minimum(100.0 * to_go, FAR - 1), FAR)
+        _steer(_off_first(free, onward, pitch), way[g])
     return Goals(pitch, distance, way)
 
 
@@ -81,11 +86,8 @@ def _places(roomy: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
     return places if len(places) <= MAX_GOALS else _places(roomy, gap + 1)
 
 
-def _to_go(
-    free: NDArray[np.bool_], roomy: NDArray[np.bool_], goal: NDArray[np.bool_], pitch: float
-) -> Floats:
-    """Metres to the goal through roomy space [h, w]; from beside an obstacle, off it first."""
-    onward = geodesic_distance(roomy, goal, pitch)
+def _off_first(free: NDArray[np.bool_], onward: Floats, pitch: float) -> Floats:
+    """What falls along the way to a goal [h, w]: through roomy space; from beside a wall, off it first."""
     reached = np.isfinite(onward)
     off = geodesic_distance(free, reached, pitch)
     return np.where(reached, onward, onward[reached].max(initial=0.0) + pitch + off)
@@ -162,6 +164,24 @@ def follow(
             out[m] += style[k] * features[m, k]
     _normalise(out)
     return end_chance(goals.distance[goal, row, column])
+
+
+@leaf
+def price(goal: int) -> float:
+    """Of a step while the rule is pending [nats]. goal: or WANDER."""
+    return SEARCH_PRICE if goal == WANDER else PRICE
+
+
+@leaf
+def left(body: Body, goals: Goals, goal: int, x: float, y: float) -> float:
+    """The price of the steps from (x, y) to where the model ends [nats]; 0 where that cannot be told."""
+    if goal == WANDER:
+        return 0.0
+    row, column = cell_of(body, goals.pitch, goals.distance.shape[1], goals.distance.shape[2], x, y)
+    distance, stride = goals.distance[goal, row, column], 1e-9
+    for m in range(body.translate.shape[0]):
+        stride = max(stride, abs(body.translate[m]))
+    return 0.0 if distance == FAR else PRICE * max(distance / 100.0 - END_WITHIN, 0.0) / stride
 
 
 @leaf
