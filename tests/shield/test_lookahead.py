@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 
 import numpy as np
 import pytest
@@ -11,13 +12,25 @@ from tests.oracles.cells import MOTIONS, STATES, Cells
 from tests.policy.rooms import flat
 
 from specshield.policy.progress import make_rules
+from specshield.robot import STRETCH
 from specshield.robot.unicycle import make_body, step, successors
-from specshield.shield.belief import Belief
+from specshield.shield.belief import STYLE, Belief
 from specshield.shield.desirability import NEVER, desirability, solve
+from specshield.shield.expansion import expand_all
 from specshield.shield.lookahead import prepare
 from specshield.shield.planes import make_planes
 from specshield.shield.shaping import log_softmax, restrict
-from specshield.shield.surrogate import FEATURES, WANDER, end_chance, follow, is_blocked, make_goals
+from specshield.shield.surrogate import (
+    FEATURES,
+    WANDER,
+    end_chance,
+    follow,
+    is_blocked,
+    make_goals,
+    price_left,
+    step_price,
+)
+from specshield.world.occupancy import OccupancyGrid
 
 WORLD = Cells(
     "F[0,4] A and F[5,9] B and G[0,9] not C",
@@ -81,7 +94,7 @@ def solve_cells(r, e, price, left):
 @pytest.mark.parametrize(("price", "slope"), [(0.0, 0.0), (0.5, 1.5)])
 def test_desirability_is_exact_where_the_lattice_is(price, slope):
     r, e = model(np.random.default_rng(5))
-    left = np.array([slope * (2 - i + j) for i, j, _ in STATES])
+    left = np.array([slope * (4 - i + j) for i, j, _ in STATES])
     planes, table = solve_cells(r, e, price, left)
     wanted, seen = exact(r, e, price, left), 0
     for t, mask in ((0, 0), (3, 0), (2, 1), (6, 1), (7, 3)):
@@ -95,6 +108,66 @@ def test_desirability_is_exact_where_the_lattice_is(price, slope):
             assert found == pytest.approx(wanted[t, mask][s], rel=0.03, abs=0.03)
             seen += 1
     assert seen > 100
+
+
+@pytest.mark.parametrize("which", [0, -1, None])
+def test_exact_steps_and_the_lattice_charge_alike(which):
+    """A stand-in's D after each motion, two exact steps before the lattice, on the cells that are exact."""
+    body, rules, goals = WORLD.body, make_rules(WORLD.task), make_goals(WORLD.body, WORLD.task.grid)
+    lead = WANDER if which is None else range(len(goals.distance))[which]
+    nexts, scratch, log_r = np.empty((MOTIONS, 3)), np.empty((MOTIONS, FEATURES)), np.empty(MOTIONS)
+    r, e, left = np.full((len(STATES), MOTIONS), 1 / MOTIONS), np.zeros(len(STATES)), np.zeros(len(STATES))
+    free = [s for s, (i, j, _) in enumerate(STATES) if not body.occupied[j, i]]
+    for s in free:
+        pose = WORLD.pose(*STATES[s])
+        successors(body, np.array(pose), nexts)
+        blocked = np.array([is_blocked(body, m, *pose, after) for m, after in enumerate(nexts)])
+        e[s] = follow(body, goals, lead, STYLE, *pose, blocked, scratch, log_r)
+        r[s], left[s] = np.exp(log_r), price_left(body, goals, lead, *pose[:2])
+    assert np.ptp(left) > 1.0 or lead != len(goals.distance) - 1
+    planes, table = solve_cells(r, e, step_price(lead), left)
+    wanted, seen = exact(r, e, step_price(lead), left), 0
+    for t, mask, s in itertools.product(range(HORIZON), range(4), free):
+        if settled(mask, s, t) != mask or planes.slot[t, mask] < 0:
+            continue
+        found = np.empty((1, MOTIONS))
+        asked = np.array([0])
+        pose = np.array(WORLD.pose(*STATES[s]))
+        expand_all(
+            body, rules, goals, planes, table[None], np.array([lead]), asked, STYLE, t, mask, pose, found
+        )
+        for m in range(MOTIONS):
+            after = int(WORLD.table[s, m])
+            then = settled(mask, after, t + 1)
+            best = np.inf if then is None else wanted[t + 1, then][after]
+            due = left[after] if then == 3 and mask != 3 else 0.0
+            assert (found[0, m] < NEVER) == np.isfinite(best)
+            if np.isfinite(best):
+                assert found[0, m] == pytest.approx(best + due, rel=0.03, abs=0.03)
+                seen += 1
+    assert seen > 1000
+
+
+def test_the_way_that_is_left_has_a_price_round_walls_and_through_narrow_doors():
+    """West of a wall with a door, in the open and beside another wall; steps of 0.2 m."""
+    for door in ((18, 28), (20, 25)):  # 1 m, and 0.5 m: a Stretch cannot turn in it
+        occupied = np.zeros((30, 40), bool)
+        occupied[:, 20] = True
+        occupied[slice(*door), 20] = False
+        grid = OccupancyGrid(occupied, 0.1, (0.0, 0.0, 0.0))
+        body = make_body(STRETCH, grid)
+        goals = make_goals(body, grid)
+        cells = np.array([np.argwhere(distance == 0)[0] for distance in goals.distance])
+        goal = int(np.argmin(np.abs(cells - (4, 35)).sum(axis=1)))  # far corner, east
+        x, y = 0.1 * (cells[goal][1] + 0.5), 0.1 * (cells[goal][0] + 0.5)
+        for at in ((0.75, 0.75), (0.75, 0.15)):  # the second beside the lower wall
+            through = math.hypot(2.05 - at[0], 2.1 - at[1]) + math.hypot(x - 2.05, y - 2.1)
+            straight = math.hypot(x - at[0], y - at[1])
+            assert (through - straight) / 0.2 > 4.0
+            least = (through - 1.0) / 0.2  # corners are taken wider
+            assert least - 0.5 <= price_left(body, goals, goal, *at) <= 1.2 * least
+        assert price_left(body, goals, goal, x, y) == 0.0
+        assert price_left(body, goals, WANDER, 0.75, 0.75) == 0.0
 
 
 def test_following_it_costs_what_the_best_path_does():

@@ -1,11 +1,11 @@
 """What the rule will still cost a surrogate of the model: its desirability function, solved backwards.
 
-    D_t(s, p) = c(p) - (1 - e(s)) log sum_a r(a | s) exp(-D_{t+1}(f(s, a), p'))     [nats]
+    D_t(s, p) = c(p) - (1 - e(s)) log sum_a r(a | s) exp(-D_{t+1}(s', p') - L(s'; p, p')),  s' = f(s, a)
 
 r: the surrogate's motions, given that it does not end; e: the chance that it does, after which the rule
-costs nothing; p: the goals of the formula that are settled; c: the price of a step while some are not. The
-way that is left to the model's own goal where the last of them is settled is paid there and then, in L(s).
-Without a price exp(-D) is the probability that the surrogate itself would keep the rule, and following r
+costs nothing; p: the goals of the formula that are settled; c: the price of a step while some are not; L: of
+the steps that are left to the model's own goal where the last of them is settled, 0 elsewhere. All in nats.
+Without prices exp(-D) is the probability that the surrogate itself would keep the rule, and following r
 exp(-D) costs D in KL over the whole path: the least there is (Todorov, 2009). On a coarse lattice; the
 feasible set keeps the rule, D only orders what is in it.
 """

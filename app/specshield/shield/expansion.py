@@ -12,7 +12,7 @@ from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, va
 from specshield.robot.unicycle import Body, step
 from specshield.shield.desirability import NEVER, desirability
 from specshield.shield.planes import Planes
-from specshield.shield.surrogate import FEATURES, Goals, follow, is_blocked, left, price
+from specshield.shield.surrogate import FEATURES, Goals, follow, is_blocked, price_left, step_price
 
 Floats = NDArray[np.float64]
 
@@ -77,11 +77,11 @@ def expand_all(
                     first = start[d + 1] + (n - start[d]) * motions
                     total = _log_sum(log_r, cost[first : first + motions])
                     if total > -float(NEVER):
-                        due = price(lead) if settled[n] != full else 0.0
+                        due = step_price(lead) if settled[n] != full else 0.0
                         cost[n] = due - (1.0 - ends) * total
                 before = start[d - 1] + (n - start[d]) // motions
                 if cost[n] < NEVER and settled[n] == full and settled[before] != full:
-                    cost[n] += left(body, goals, lead, u, v)
+                    cost[n] += price_left(body, goals, lead, u, v)
         out[k] = cost[start[1] : start[2]]
 
 

@@ -2,9 +2,9 @@
 
 Projection lets the model put a visit off until it is forced, step after step. Stand-ins for the model, one
 for each of some places that it may be going to and one that wanders, have each a table of what the rule will
-still cost from every pose: D (desirability.py), solved once a task. Weighing by exp(-D), D the mean over what
-the session's logits say that the model is, spreads the cost over the path as the closest path distribution
-would. Only the preference inside S_t changes: safety rests on S_t alone.
+still cost from every pose, in KL and in steps: D (desirability.py), solved once a task. Weighing by exp(-D),
+D the mean over what the session's logits say that the model is, spreads that over the path. Only the
+preference inside S_t changes: safety rests on S_t alone.
 """
 
 from __future__ import annotations
@@ -28,7 +28,16 @@ from specshield.shield.belief import STYLE, Belief
 from specshield.shield.desirability import NEVER, solve
 from specshield.shield.expansion import expand_all
 from specshield.shield.planes import Planes, make_planes
-from specshield.shield.surrogate import FEATURES, WANDER, Goals, follow, is_blocked, left, make_goals, price
+from specshield.shield.surrogate import (
+    FEATURES,
+    WANDER,
+    Goals,
+    follow,
+    is_blocked,
+    make_goals,
+    price_left,
+    step_price,
+)
 from specshield.task import Task
 
 Floats = NDArray[np.float64]
@@ -107,7 +116,7 @@ class LookAhead:
         known = np.all(costs < NEVER, axis=0)
         if not known.any():
             return np.zeros(costs.shape[1])
-        # a model twice as sharp costs twice as much to bend
+        # a model twice as sharp costs twice as much to bend, which is most of D
         sharp = np.where(self.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
         total = (weights[asked] / weights[asked].sum() * sharp) @ np.where(known, costs, 0.0)
         result: Floats = np.where(known, total - total[known].min(), np.ptp(total[known]) + WORST)
@@ -138,7 +147,7 @@ def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
     remaining = np.zeros(planes.valid.shape[1], np.float32)
     for table, lead in zip(tables, leads, strict=True):
         _react_everywhere(body, goals, planes, int(lead), STYLE, motions, ends, remaining)
-        table[:] = solve(body, planes, motions, ends, price(int(lead)), remaining)
+        table[:] = solve(body, planes, motions, ends, step_price(int(lead)), remaining)
     return LookAhead(task, body, rules, goals, planes, leads, block_diag(shares, 1.0), tables)
 
 
@@ -180,7 +189,7 @@ def _react_everywhere(
                 continue
             j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
             x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
-            remaining[c] = left(body, goals, goal, x, y)
+            remaining[c] = price_left(body, goals, goal, x, y)
             for m in range(motions.shape[0]):
                 blocked[m] = planes.free[m, h, c] == 0.0
             ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, features, log_r)

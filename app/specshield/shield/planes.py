@@ -108,12 +108,15 @@ def make_planes(
 
 
 def _slots(first: NDArray[np.int64], last: NDArray[np.int64], horizon: int, every: int) -> NDArray[np.int64]:
-    """The sets of settled goals that can be had at each step, numbered; `every` steps share a number."""
+    """The sets of settled goals that can be had at each step, numbered; `every` steps share a number.
+
+    But for the first of a set: what comes before a window opens is paid there.
+    """
     settled = np.arange(1 << len(first))[:, None] >> np.arange(len(first)) & 1 == 1
     slot, n = np.full((horizon + 2, len(settled)), -1), 0
     for t in range(horizon + 1):
         for mask in np.flatnonzero(np.all(np.where(settled, first <= t, last > t), axis=1)):
-            slot[t, mask] = slot[t - 1, mask] if t % every and slot[t - 1, mask] >= 0 else n
+            slot[t, mask] = slot[t - 1, mask] if t % every and slot[t - 2, mask] >= 0 else n
             n = max(n, slot[t, mask] + 1)
     return slot
 

@@ -2,8 +2,9 @@
 
 The logit of a motion of the first is linear in what it saves: metres towards the goal, along free space, and
 turning towards the way there. The second goes ahead where it can, else turns, and hardly ever backs up or
-stands still, as whatever searches. Which of them the model is like, where it goes and how sharply is what a
-session learns (belief.py). Motions are conditional on not ending.
+stands still, as whatever searches. The steps that the rule takes from either have a price. Which of them the
+model is like, where it goes and how sharply is what a session learns (belief.py). Motions are conditional on
+not ending.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ SEARCH_PRICE = 10.0  # the same where it wanders: what it would search it search
 class Goals(NamedTuple):
     """G places that the model may be going to, and the way to each, in the grid frame; cells of `pitch` [m].
 
-    distance [G, h, w]: along space with room to turn, and from beside an obstacle to it [cm]; FAR where there
-    is no way. way [G, h, w, 2]: the direction (u, v) to go, times UNIT; zero at the goal.
+    distance [G, h, w]: along space with room to turn, from beside an obstacle to it, and through narrow doors
+    where there is no other way [cm]; FAR where there is none at all. way [G, h, w, 2]: the direction (u, v)
+    to go, times UNIT; zero at the goal.
     """
 
     pitch: float
@@ -69,7 +71,9 @@ def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
         goal[row, column] = True
         onward = geodesic_distance(roomy, goal, pitch)
         to_go = onward[tuple(nearest)] + beside
-        distance[g] = np.where(free & np.isfinite(to_go), np.minimum(100.0 * to_go, FAR - 1), FAR)
+        if np.any(free & np.isinf(to_go)):  # through a door too narrow to turn in
+            to_go = np.where(np.isinf(to_go), geodesic_distance(free, goal, pitch), to_go)
+        distance[g] = np.where(np.isfinite(to_go), np.minimum(100.0 * to_go, FAR - 1), FAR)
         _steer(_off_first(free, onward, pitch), way[g])
     return Goals(pitch, distance, way)
 
@@ -167,21 +171,23 @@ def follow(
 
 
 @leaf
-def price(goal: int) -> float:
+def step_price(goal: int) -> float:
     """Of a step while the rule is pending [nats]. goal: or WANDER."""
     return SEARCH_PRICE if goal == WANDER else PRICE
 
 
 @leaf
-def left(body: Body, goals: Goals, goal: int, x: float, y: float) -> float:
+def price_left(body: Body, goals: Goals, goal: int, x: float, y: float) -> float:
     """The price of the steps from (x, y) to where the model ends [nats]; 0 where that cannot be told."""
     if goal == WANDER:
         return 0.0
     row, column = cell_of(body, goals.pitch, goals.distance.shape[1], goals.distance.shape[2], x, y)
-    distance, stride = goals.distance[goal, row, column], 1e-9
+    distance, stride = goals.distance[goal, row, column], 0.0
     for m in range(body.translate.shape[0]):
         stride = max(stride, abs(body.translate[m]))
-    return 0.0 if distance == FAR else PRICE * max(distance / 100.0 - END_WITHIN, 0.0) / stride
+    if distance == FAR or stride < 1e-6:
+        return 0.0
+    return PRICE * max(float(distance) / 100.0 - END_WITHIN, 0.0) / stride
 
 
 @leaf

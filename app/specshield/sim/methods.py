@@ -5,7 +5,7 @@ hcd, rcd     SafeDec's next-step decoding (sim/decoding.py)
 simplex      the model's draw where it is feasible, else the certified continuation takes over
 paper        a learned pi_phi alone, rolled out literally at every step; hard projection
 ours         reachability and the learned pi_phi, witnesses carried on; hard projection
-lookahead    ours, weighted inside S_t by how likely the model is to satisfy the rule from there
+lookahead    ours, weighted inside S_t by what the rule will still cost the model from there
 """
 
 from __future__ import annotations
