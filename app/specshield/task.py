@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from specshield.errors import FormulaError, MapError, SampleError
+from specshield.errors import FormulaError, InputError, MapError, SampleError
 from specshield.robot import Robot, robot_to_json
 from specshield.stl import Formula, is_name, parse
 from specshield.world.occupancy import OccupancyGrid
@@ -136,17 +136,17 @@ def parse_regions(regions: Mapping[str, Any]) -> dict[str, Region]:
         )
     result: dict[str, Region] = {}
     for name, region in regions.items():
-        _check_name(name, f"regions.{name}")
+        _check_name(name, f"regions.{name}", MapError)
         result[name] = region_from_json(region, f"regions.{name}") if isinstance(region, dict) else region
     return result
 
 
 def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dict[str, float]:
-    """Signals with their initial values. Raises MapError or SampleError with the path of the field."""
+    """Signals with their initial values. Raises SampleError with the path of the field."""
     for name, value in signals.items():
-        _check_name(name, f"signals.{name}")
+        _check_name(name, f"signals.{name}", SampleError)
         if name in taken:
-            raise MapError(
+            raise SampleError(
                 "a region has this name", path=f"signals.{name}", got=name, expected="a name of its own"
             )
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not -LARGEST <= value <= LARGEST:
@@ -159,9 +159,9 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
     return {name: float(value) for name, value in signals.items()}
 
 
-def _check_name(name: str, path: str) -> None:
+def _check_name(name: str, path: str, error: type[InputError]) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
-        raise MapError(
+        raise error(
             f"{name!r} cannot be a name", path=path, got=name,
             expected=f"up to {MAX_NAME} letters, digits and _; no keyword of formulas, no x, y, theta",
         )  # fmt: skip

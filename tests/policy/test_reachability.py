@@ -12,7 +12,7 @@ from tests.oracles.cells import MOTIONS, ROBOT, WAIT, Cells
 from specshield.errors import FragmentError, PolicyError
 from specshield.policy.load import load_policy
 from specshield.policy.reachability import Settings, read_settings, synthesise
-from specshield.robot import STRETCH
+from specshield.robot import STRETCH, robot_from_json
 from specshield.shield.episode import decide, make_shield
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -147,6 +147,14 @@ def test_a_robot_that_cannot_wait_has_its_exact_feasible_set_too(cells):
             motion = int(random.choice(np.flatnonzero(expected) if expected.any() else WAIT))
             history.append(decision.next_poses[motion])
     assert len(seen) > 3
+
+
+def test_a_robot_that_fits_nowhere_can_start_nowhere():
+    cannot_wait = {"actions": [{"name": "go", "translate": 0.2}, {"name": "left", "rotate": 0.5}]}
+    for robot in (STRETCH, robot_from_json({"footprint": {"radius": 1.0}, **cannot_wait})):
+        grid = OccupancyGrid(np.ones((12, 12), bool) if robot is STRETCH else np.zeros((12, 12), bool), 0.1)
+        policy = synthesise(make_task(grid, robot, "F[0,9] x > 0.5"))
+        assert policy.card["metrics"]["feasible_start"] == 0.0
 
 
 def test_a_policy_comes_back_from_its_files_as_it_was():

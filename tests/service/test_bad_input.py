@@ -8,9 +8,13 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
-from tests.service.world import LOGITS, ROBOT, SPEC, START, ahead, grid_json, policy_files
+from tests.service.world import LOGITS, RESOLUTION, ROBOT, SPEC, START, ahead, cells, grid_json, policy_files
 
+from specshield.policy import planner
+from specshield.robot import robot_from_json
 from specshield.service.schemas import Problem
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 
 YAML = b"resolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
 PGM = b"P5\n4 3\n255\n" + bytes([254] * 12)
@@ -96,6 +100,11 @@ def test_bodies_that_are_no_json_object(client, unchanged, content):
     )
     assert response.status_code == 422, response.text
     problem(response, 422, response.json()["type"])
+
+
+def test_json_that_is_not_said_to_be(client, unchanged):
+    response = client.post("/v1/specs/validate", content=json.dumps({"formula": "x > 0"}))
+    assert "application/json" in problem(response, 422, "invalid-input", "Content-Type")["expected"]
 
 
 def png(width, height):
@@ -258,6 +267,7 @@ def sent(weights=None, **card):
         (sent(spec={**SPEC, "formula": "F[0,7] Goal"}), "card.task_hash"),
         (sent(seed="zero"), "card.seed"),
         (sent(robot="spot"), "card.robot"),
+        ({**sent(), "card": ("c", b"{")}, "card"),
         (sent(weights=b"\x80\x04\x95pickle"), "weights"),
         (sent(weights=policy_files()["weights"][:-8]), "weights"),
         (sent(weights=b"\xff" * 8 + b"{}"), "weights"),
@@ -294,6 +304,19 @@ def test_policies_trained_elsewhere(client, unchanged, files, path):
 def test_sessions(client, policy, unchanged, fields, type, path):
     body = {"policy_id": policy["id"], "initial_pose": START, **fields}
     problem(client.post("/v1/sessions", json=body), 422, type, path)
+
+
+def test_look_ahead_where_it_cannot_be_had(client, policy):
+    spec = {**SPEC, "formula": "G[0,6] F[0,4] Goal"}
+    grid, robot = OccupancyGrid(cells(), RESOLUTION), robot_from_json(ROBOT)
+    task = make_task(grid, robot, spec["formula"], spec["regions"], None, spec["signals"])
+    made = planner.synthesise(task, spec=spec)
+    files = {"weights": ("w", made.weights()), "card": ("c", json.dumps(made.card).encode())}
+    id = client.post("/v1/policies", files=files).json()["id"]
+    body = {"policy_id": id, "initial_pose": [1.8, 1.5, 0.0], "allow_infeasible": True}
+    refused = client.post("/v1/sessions", json={**body, "shaping": "lookahead"})
+    assert "'projection'" in problem(refused, 422, "outside-fragment", "shaping")["expected"]
+    assert client.post("/v1/sessions", json=body).status_code == 201
 
 
 def test_policies_for_different_tasks_do_not_share_a_session(client, policy, unchanged):

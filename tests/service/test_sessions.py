@@ -1,10 +1,12 @@
 """Steps over HTTP: answers, replay, races, history, the end, reading back."""
 
 import json
+import os
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from tests.service.world import LOGITS, START, ahead
+from tests.service.world import LOGITS, SPEC, START, ahead, send_policy
 
 
 def problem(response, status, type):
@@ -55,6 +57,26 @@ def test_a_session_that_looks_ahead(begin, step):
         assert answer["distribution"][4] == 0.0
         poses.append(answer["next_poses"][0])
     assert answer["spec_status"] == "satisfied"
+
+
+def test_sessions_that_are_prepared_keep_no_step_waiting(client, policy, begin, step):
+    """As many at once as there are threads for decisions, each for a task of its own: they take seconds."""
+    session, count = begin(), (os.cpu_count() or 1) + 1
+    formulas = [f"F[0,{250 + k}] Goal and F[{300 + k},{590 + k}] x < 1.2" for k in range(count)]
+    made = [send_policy(client, spec={**SPEC, "formula": formula})["id"] for formula in formulas]
+
+    def create(id):
+        body = {"policy_id": id, "initial_pose": START, "shaping": "lookahead", "allow_infeasible": True}
+        answer = client.post("/v1/sessions", json=body, timeout=60.0)
+        assert answer.status_code == 201, answer.text
+        return time.monotonic()
+
+    with ThreadPoolExecutor(count) as pool:
+        creating = [pool.submit(create, id) for id in made]
+        time.sleep(0.1)
+        assert step(session, 0, [START]).status_code == 200
+        stepped = time.monotonic()
+        assert stepped < min(each.result() for each in creating)
 
 
 def test_timings_are_told(begin, step):
@@ -191,6 +213,8 @@ def test_close_gives_the_verdict_and_keeps_the_trajectory(client, begin, step):
     assert low == high > 0
     assert client.post(path, json={}).json() == verdict.json()
     assert client.post(path, json={"t": 8, "poses": ahead(8)[-1:]}).json() == verdict.json()
+    late = client.post(path, json={"t": 602, "poses": ahead(602)[9:]})
+    assert problem(late, 422, "invalid-input")["path"] == "t"
     problem(client.post(path, json={"t": 9, "poses": ahead(9)[-1:]}), 409, "session-finished")
     problem(step(session, 9, ahead(9)[-1:]), 409, "session-finished")
     assert step(session, 0, [START]).status_code == 200  # a replay

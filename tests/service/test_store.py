@@ -1,5 +1,6 @@
 """The embedded store: durable, shared, never left behind; a store that is away; one of the operator's own."""
 
+import asyncio
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from tests.serving import serving, wait_for
 from specshield.errors import StoreError
 from specshield.service import keeper
 from specshield.service.embedded import EmbeddedStore
+from specshield.service.store import Change, Store
 
 
 def begin(client, **options):
@@ -221,6 +223,31 @@ def test_a_store_of_ones_own_and_sessions_that_expire(tmp_path):
                 with redis.Redis(unix_socket_path=str(own.socket)) as connection:
                     assert connection.keys("specshield:*") == []
                 assert begin(client)["next_t"] == 0  # there is room again
+    finally:
+        own.leave()
+
+
+def test_an_answer_that_is_late_is_not_written_into_the_next_session_of_its_name(tmp_path):
+    own = EmbeddedStore(tmp_path)
+    own.join()
+
+    async def scene():
+        store = Store(own.url, timeout=5.0, ttl=60)
+        change = Change(b"state", bytes(24))
+        await store.create("a", b"the first", change)
+        seen = await store.load("a", 0)
+        assert await store.append("a", seen.version, change)
+        assert not await store.append("a", seen.version, change)
+        await store.delete("a")
+        await store.create("a", b"the second", change)
+        assert not await store.append("a", seen.version, Change(b"late", bytes(24)))
+        new = await store.load("a", 0)
+        assert (new.config, new.state) == (b"the second", b"state")
+        assert await store.append("a", new.version, change)
+        await store.aclose()
+
+    try:
+        asyncio.run(scene())
     finally:
         own.leave()
 

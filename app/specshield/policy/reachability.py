@@ -65,8 +65,9 @@ def read_settings(options: Mapping[str, Any]) -> Settings:
             or not low <= value <= high
         ):
             raise PolicyError(
-                "not in range", path=f"options.{name}", got=value, expected=f"from {low:g} to {high:g}"
-            )
+                "not in range", path=f"options.{name}", got=value,
+                expected=f"a {'whole ' if whole else ''}number from {low:g} to {high:g}",
+            )  # fmt: skip
     return Settings(**options)
 
 

@@ -95,7 +95,7 @@ def feasible_steps(
         asked = sum(
             1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS) if rules.a[k] <= t <= rules.b[k]
         )
-        after = np.array([transitions(rules, t, int(p)) for p in patterns])
+        after = np.array([transitions(rules, t, int(p)) for p in patterns], np.int64).reshape(-1, states)
         after[(patterns & asked & always) != asked] = BROKEN_STATE
         before = np.zeros_like(bits[t])
         _before(bits[t], valid, of, after, before)

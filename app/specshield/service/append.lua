@@ -6,7 +6,12 @@
 if (redis.call('HGET', KEYS[1], 'version') or '') ~= ARGV[1] then
   return 0
 end
-redis.call('HSET', KEYS[1], 'version', (tonumber(ARGV[1]) or 0) + 1, 'state', ARGV[6])
+-- A version tells apart two sessions of one id too: no other has this config.
+local begun, n = string.match(ARGV[1], '^(%x+):(%d+)$')
+if ARGV[1] == '' then
+  begun = redis.sha1hex(ARGV[7])
+end
+redis.call('HSET', KEYS[1], 'version', (begun or '0') .. ':' .. (tonumber(n) or 0) + 1, 'state', ARGV[6])
 if ARGV[7] ~= '' then
   redis.call('HSET', KEYS[1], 'config', ARGV[7])
 end

@@ -122,6 +122,13 @@ class Recent(Generic[V]):
                 self._values.popitem(last=False)
         return value
 
+    def peek(self, key: Hashable) -> V | None:
+        """The value, if it is kept; it has been used then."""
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+            return self._values.get(key)
+
     def drop(self, key: Hashable) -> None:
         with self._lock:
             self._values.pop(key, None)

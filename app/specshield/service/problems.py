@@ -95,7 +95,12 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
     """
     if found[0]["type"] == "json_invalid":
         reason = found[0].get("ctx", {}).get("error", "")
-        return InputError(f"the body is not JSON: {reason}", expected="a JSON object")
+        what = below or "the body"
+        return InputError(f"{what} is not JSON: {reason}", path=below or None, expected="a JSON object")
+    if isinstance(body, bytes):  # not read at all
+        return InputError(
+            "the body was not taken for JSON", path="Content-Type", expected="Content-Type: application/json"
+        )
     listed = [
         {
             "path": ".".join(filter(None, (below, _path(item, body)[:200]))),

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from specshield.errors import Conflict, InfeasibleStart, InputError, LimitReached, NotFound
+from specshield.errors import Conflict, FragmentError, InfeasibleStart, InputError, LimitReached, NotFound
 from specshield.policy.view import view_of
 from specshield.robot.unicycle import make_body
 from specshield.service import files
@@ -56,25 +56,26 @@ class Sessions:
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
         self._ahead = files.Recent[Future[None]](AHEADS)
         self._preparing = ThreadPoolExecutor(1, "prepare")
+        self._latest: Future[None] | None = None  # asked of it
 
     async def create(self, request: SessionRequest) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
         await self._check_room()
+        if request.shaping == "lookahead":
+            await self._foresee(request)
         config, state, rows = await self._run(self._begin, request)
         change = Change(files.to_json(asdict(state)), pack(rows))
         await self._store.create(config["id"], files.to_json(config), change)
         return describe(config, state)
 
     def _begin(self, request: SessionRequest) -> tuple[dict[str, Any], State, Floats]:
-        settings = {name: getattr(request, name) for name in CONFIG}
         if (request.max_steps or 0) > self._settings.max_steps:
             expected = f"at most {self._settings.max_steps}"
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
+        settings = {name: getattr(request, name) for name in CONFIG}
         records = [self._policies.record(key) for key in request.policies]
         ids = [record.id for record in records]
         shield = self._shield(ids, Config(**settings))
-        if shield.config.shaping == "lookahead":
-            self._prepare(ids, shield, np.array([request.initial_pose])).result()
         feasible = True
         try:
             episode.start(shield, request.initial_pose)
@@ -158,10 +159,8 @@ class Sessions:
         if request.logits is not None:
             logits = [-np.inf if value is None else value for value in request.logits]
         carry = None if session.state.carry is None else Carry.from_json(session.state.carry)
-        if shield.config.shaping == "lookahead":  # projection, until it is prepared in this process too
-            prepared = self._prepare(session.config["policy_ids"], shield, session.poses[-1:])
-            if not prepared.done() or prepared.exception() is not None:
-                shield = replace(shield, config=replace(shield.config, shaping="projection"))
+        if shield.config.shaping == "lookahead" and not self._foreseen(shield, session):
+            shield = replace(shield, config=replace(shield.config, shaping="projection"))
         with _clock(timing, "rollout"):
             decision = episode.decide(
                 shield,
@@ -180,6 +179,12 @@ class Sessions:
             session = Session.of(await self._load(id))
             state = session.state
             if request.t is not None and request.poses is not None:
+                last = session.config["max_steps"] + 1  # where the last step led
+                if request.t > last:
+                    raise InputError(
+                        f"step {request.t} is past the session's last", path="t", got=request.t,
+                        expected=f"at most {last}",
+                    )  # fmt: skip
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
                     raise over(session, request.t)
@@ -258,11 +263,37 @@ class Sessions:
 
         return replace(self._shields.get(tuple(policy_ids), make), config=config)
 
+    async def _foresee(self, request: SessionRequest) -> None:
+        """Prepares a task's look-ahead, which takes seconds, and keeps none of the decisions' threads."""
+
+        def begin() -> Future[None]:
+            ids = [self._policies.record(key).id for key in request.policies]
+            return self._prepare(ids, self._shield(ids, Config()), np.array([request.initial_pose]))
+
+        try:
+            await asyncio.shield(asyncio.wrap_future(await self._run(begin)))
+        except FragmentError as error:
+            raise FragmentError(
+                f"look-ahead cannot be had for this formula: {error.message}", path="shaping",
+                got="lookahead", expected="'projection', or a formula that 'reachability' takes",
+            ) from None  # fmt: skip
+
     def _prepare(self, policy_ids: Sequence[str], shield: Shield, poses: Floats) -> Future[None]:
-        """The look-ahead of a task takes seconds: it is prepared beside the decisions, one at a time."""
-        return self._ahead.get(
-            tuple(policy_ids), lambda: self._preparing.submit(episode.prepare_ahead, shield, poses)
-        )
+        def begin() -> Future[None]:
+            self._latest = self._preparing.submit(episode.prepare_ahead, shield, poses)
+            return self._latest
+
+        return self._ahead.get(tuple(policy_ids), begin)
+
+    def _foreseen(self, shield: Shield, session: Session) -> bool:
+        """Whether this process has the task's look-ahead. If not it is begun, unless another is under way:
+        with more tasks than are kept they would pile up, and whoever creates a session would wait for all.
+        """
+        ids = tuple(session.config["policy_ids"])
+        found = self._ahead.peek(ids)
+        if found is None and (self._latest is None or self._latest.done()):
+            found = self._prepare(ids, shield, session.poses[-1:])
+        return found is not None and found.done() and found.exception() is None
 
     async def _run(self, function: Callable[..., R], *args: Any) -> R:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)

@@ -119,7 +119,8 @@ def train(id: str, attempt: str) -> None:
             if cancelled.is_set():
                 return
             log.exception("training of %s", id)
-            done = {"status": "failed", "error": f"{type(error).__name__}: {error}", "eta_s": ""}
+            name = type(error).__name__  # what it says may be of the inside: paths, lines of code
+            done = {"status": "failed", "error": f"{name}; the worker's log says more", "eta_s": ""}
         jobs.report(id, attempt, **done)  # of no effect once cancelled
 
 
