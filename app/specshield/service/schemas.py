@@ -314,7 +314,10 @@ class SessionRequest(Strict):
         "the rule may keep some probability; where no action reaches the threshold, as often with 1 m, the "
         "answer is a `fallback`: choose one that fits the rule.",
     )
-    shaping: Literal["projection", "lookahead"] = Field("projection", description="How the prior is bent.")
+    shaping: Literal["projection", "lookahead"] = Field(
+        "projection",
+        description="How the prior is bent. `lookahead` is for formulas that `reachability` takes.",
+    )
     max_steps: int | None = Field(
         None, ge=1, description="The session ends there [steps]. Default: max(600, T + 1)."
     )
