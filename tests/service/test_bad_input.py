@@ -241,6 +241,7 @@ def ask(**fields):
         (ask(robot={**ROBOT, "actions": [{"name": "go", "translate": 0.1}]}), "training-unavailable", ...),
         (ask(method="ppo"), "invalid-input", "method"),
         (ask(method="reachability", options={"pitch": 9}), "invalid-policy", "options.pitch"),
+        (ask(method="reachability", options={"beam": {"a": 1}}), "invalid-input", "options.beam"),
         (ask(method="reachability"), "training-unavailable", ...),
         (ask(options={"units": 1024}), "invalid-policy", "options.units"),
         (ask(options={"depth": 3}), "invalid-policy", "options.depth"),
@@ -383,6 +384,8 @@ def test_a_long_list_of_errors_stays_a_list(client, begin):
     assert len(listed) == 8
     assert all(error.path.startswith("card.") for error in listed)
     assert len(client.post("/v1/specs/validate", json={"formula": "x > 1", "y" * 5000: 1}).text) < 2000
+    answer = client.post("/v1/policies", json=ask(method="q" * 5000))
+    assert problem(answer, 422, "invalid-input", "method")["got"] == "q" * 400 + "…"
 
 
 @pytest.mark.parametrize("chunked", [False, True])

@@ -70,11 +70,12 @@ def plain(value: Any, room: int = 400) -> Any:
     """`value` as finite JSON of bounded size; what is neither is shown as text."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
+    if isinstance(value, str):
+        return value if len(value) <= room + 1 else value[:room] + "…"
     try:
         text = json.dumps(value, allow_nan=False)
     except (TypeError, ValueError, RecursionError):
-        text = value if isinstance(value, str) else f"{value!r:.{room}}"
-        return text[:room]
+        return f"{value!r:.{room}}"[:room]
     return value if len(text) <= room else text[:room] + "…"
 
 
@@ -134,8 +135,8 @@ def _path(item: Mapping[str, Any], body: Any) -> str:
     here = body
     for i, part in enumerate(rest):
         held = _held(here, part)
-        last_of_object = i == len(rest) - 1 and isinstance(here, Mapping)  # missing there, or not to be there
-        if held is _ABSENT and source == "body" and not last_of_object:
+        missing = i == len(rest) - 1 and item["type"].startswith(("missing", "union_tag"))
+        if held is _ABSENT and source == "body" and not missing:
             continue
         here = held
         parts.append(f"[{part}]" if isinstance(part, int) else f".{part}")
@@ -188,7 +189,7 @@ def install(app: FastAPI) -> None:
             return response(
                 errors.MethodNotAllowed(message, got=request.method, expected=allowed), {"Allow": allowed}
             )
-        return response(InputError(str(error.detail)))
+        return response(InputError(str(error.detail), expected="a body as /docs has it"))
 
     async def unknown(request: Request, error: Exception) -> Response:
         # The traceback goes to the log: starlette raises the error again after this answer.
