@@ -34,6 +34,7 @@ UNIT = 127  # of a direction's components, as stored
 FAR = 65535  # [cm] no way
 END_WITHIN, END_SLOPE, END_CHANCE = 1.0, 0.07, 0.25  # [m], [m], a step: an end near the goal
 WANDER = -1  # in place of a goal
+LEAST = 1e-9  # [m], [rad]: of a robot that has no move, or no turn
 AHEAD, TURN, OTHER = 3.3, 2.0, -2.0  # logits of one that wanders: the longest move ahead, the largest turn
 WANDER_END = 0.01  # a step
 PRICE = 1.0  # [nats] of a step that the rule keeps the model from its goal
@@ -171,6 +172,15 @@ def follow(
 
 
 @leaf
+def _largest(body: Body) -> tuple[float, float]:
+    """The longest move [m] and the largest turn [rad] of the robot's motions, LEAST where it has none."""
+    stride, turn = LEAST, LEAST
+    for m in range(body.translate.shape[0]):
+        stride, turn = max(stride, abs(body.translate[m])), max(turn, abs(body.rotate[m]))
+    return stride, turn
+
+
+@leaf
 def step_price(goal: int) -> float:
     """Of a step while the rule is pending [nats]. goal: or WANDER."""
     return SEARCH_PRICE if goal == WANDER else PRICE
@@ -182,19 +192,15 @@ def price_left(body: Body, goals: Goals, goal: int, x: float, y: float) -> float
     if goal == WANDER:
         return 0.0
     row, column = cell_of(body, goals.pitch, goals.distance.shape[1], goals.distance.shape[2], x, y)
-    distance, stride = goals.distance[goal, row, column], 0.0
-    for m in range(body.translate.shape[0]):
-        stride = max(stride, abs(body.translate[m]))
-    if distance == FAR or stride < 1e-6:
+    distance, (stride, _) = goals.distance[goal, row, column], _largest(body)
+    if distance == FAR or stride <= LEAST:
         return 0.0
     return PRICE * max(float(distance) / 100.0 - END_WITHIN, 0.0) / stride
 
 
 @leaf
 def _wander(body: Body, blocked: NDArray[np.bool_], out: Floats) -> None:
-    stride, turn = 1e-9, 1e-9
-    for m in range(out.shape[0]):
-        stride, turn = max(stride, abs(body.translate[m])), max(turn, abs(body.rotate[m]))
+    stride, turn = _largest(body)
     for m in range(out.shape[0]):
         move, rotation = body.translate[m], body.rotate[m]
         if move > 0.0:
@@ -219,9 +225,7 @@ def describe(body: Body, wu: float, wv: float, theta: float, blocked: NDArray[np
     here = wu == 0.0 and wv == 0.0
     bearing = math.atan2(wv, wu) + math.atan2(body.sin_yaw, body.cos_yaw) - theta
     bearing = (bearing + math.pi) % (2.0 * math.pi) - math.pi
-    stride, turn = 1e-9, 1e-9
-    for m in range(out.shape[0]):
-        stride, turn = max(stride, abs(body.translate[m])), max(turn, abs(body.rotate[m]))
+    stride, turn = _largest(body)
     for m in range(out.shape[0]):
         for k in range(FEATURES):
             out[m, k] = 0.0
