@@ -61,18 +61,18 @@ class Sessions:
     async def create(self, request: SessionRequest) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
         await self._check_room()
-        config, state, rows = await self._run(self._begin, request)
         if request.shaping == "lookahead":
-            await self._foresee(config["policy_ids"], rows[:, :3])
+            await self._foresee(request)
+        config, state, rows = await self._run(self._begin, request)
         change = Change(files.to_json(asdict(state)), pack(rows))
         await self._store.create(config["id"], files.to_json(config), change)
         return describe(config, state)
 
     def _begin(self, request: SessionRequest) -> tuple[dict[str, Any], State, Floats]:
-        settings = {name: getattr(request, name) for name in CONFIG}
         if (request.max_steps or 0) > self._settings.max_steps:
             expected = f"at most {self._settings.max_steps}"
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
+        settings = {name: getattr(request, name) for name in CONFIG}
         records = [self._policies.record(key) for key in request.policies]
         ids = [record.id for record in records]
         shield = self._shield(ids, Config(**settings))
@@ -263,11 +263,15 @@ class Sessions:
 
         return replace(self._shields.get(tuple(policy_ids), make), config=config)
 
-    async def _foresee(self, policy_ids: Sequence[str], poses: Floats) -> None:
+    async def _foresee(self, request: SessionRequest) -> None:
         """Prepares a task's look-ahead, which takes seconds, and keeps none of the decisions' threads."""
-        shield = self._shield(policy_ids, Config())
+
+        def begin() -> Future[None]:
+            ids = [self._policies.record(key).id for key in request.policies]
+            return self._prepare(ids, self._shield(ids, Config()), np.array([request.initial_pose]))
+
         try:
-            await asyncio.shield(asyncio.wrap_future(self._prepare(policy_ids, shield, poses)))
+            await asyncio.shield(asyncio.wrap_future(await self._run(begin)))
         except FragmentError as error:
             raise FragmentError(
                 f"look-ahead cannot be had for this formula: {error.message}", path="shaping",
