@@ -30,8 +30,8 @@ test: .venv/.dev
 	$(BIN)/python -m pytest
 
 lint: .venv/.dev
-	$(BIN)/ruff check app tests benchmarks
-	$(BIN)/ruff format --check app tests benchmarks
+	$(BIN)/ruff check app evaluation tests benchmarks
+	$(BIN)/ruff format --check app evaluation tests benchmarks
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 

@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.plain import Plain
 from benchmarks.states import Floats, State, along, shipped_dqn, starts
 from benchmarks.timing import quietest, summary
-from specshield.policy import reachability
+from specshield.policy.reachability import policy as reachability
 from specshield.shield.episode import Shield, decide, make_shield
 from specshield.shield.feasibility import futures, prefix_of, rho
 from specshield.shield.shaping import log_softmax, restrict

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from specshield.errors import SpecshieldError
-from specshield.policy.environment import free_poses
-from specshield.policy.load import load_policy
-from specshield.policy.reachability import synthesise
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.methods import load_policy
+from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.unicycle import make_body
 from specshield.sim.cases import REPOSITORY

@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from benchmarks.judge import Judge
 from benchmarks.worlds import KINDS, NEAR, SHAPES, explore, make_world, sample
 from specshield.errors import InfeasibleStart
-from specshield.policy.environment import free_poses
-from specshield.policy.policy import Proposer, wait_motion
-from specshield.policy.progress import STACK, advance, make_rules, read_predicates, replay, value_count
-from specshield.policy.reachability import ReachabilityPolicy, Settings, synthesise
-from specshield.policy.tables import slack
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.dqn.policy import Proposer, wait_motion
+from specshield.policy.reachability.policy import ReachabilityPolicy, Settings, synthesise
+from specshield.policy.reachability.tables import slack
 from specshield.robot.unicycle import Body, in_collision, simulate, step
+from specshield.rule.progress import STACK, advance, make_rules, read_predicates, replay, value_count
 from specshield.shield.episode import Config, Decision, Shield, decide, make_shield, start
 from specshield.sim.cases import Case, case_names, load_case, shipped
 from specshield.sim.model import GoalSeeker

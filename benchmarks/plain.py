@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 from benchmarks.plain_world import Floats, World, predicate
-from specshield.policy.network import NAMES
-from specshield.policy.observation import FAR, NEAR_ALWAYS, make_sight
-from specshield.policy.policy import Policy, wait_motion
-from specshield.policy.progress import make_rules
+from specshield.policy.dqn.network import NAMES
+from specshield.policy.dqn.observation import FAR, NEAR_ALWAYS, make_sight
+from specshield.policy.dqn.policy import Policy, wait_motion
 from specshield.robot.unicycle import make_body
+from specshield.rule.progress import make_rules
 from specshield.stl import SATISFIED_ABOVE, Atom, obligations, robustness
 
 Ints = NDArray[np.int64]

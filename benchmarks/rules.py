@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import InfeasibleStart
-from specshield.policy.environment import free_poses
-from specshield.policy.planner import PlannerPolicy, Settings, synthesise
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.planner.policy import PlannerPolicy, Settings, synthesise
 from specshield.robot import STRETCH
 from specshield.shield.episode import Carry, Config, Shield, close, decide, make_shield, start
 from specshield.sim.cases import Case, load_case

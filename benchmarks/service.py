@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.timing import summary
 from specshield.client import ShieldClient
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
 from specshield.sim.cases import MAPS, Case, load_case
 from specshield.sim.episodes import with_shield
 from specshield.sim.model import make_model

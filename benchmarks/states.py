@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import InfeasibleStart
-from specshield.policy.environment import free_poses
-from specshield.policy.policy import Policy
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.dqn.policy import Policy
 from specshield.shield.episode import Carry, Shield, decide, start
 from specshield.sim.cases import Case, shipped
 from specshield.sim.model import GoalSeeker

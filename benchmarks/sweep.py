@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from benchmarks.decisions import ask, warm
 from benchmarks.states import State, shipped_dqn
 from benchmarks.timing import summary
-from specshield.policy import reachability
-from specshield.policy.environment import free_poses
-from specshield.policy.network import NAMES, make_network
-from specshield.policy.observation import PER_MOTION, observation_size
-from specshield.policy.policy import Policy, make_card
-from specshield.policy.progress import make_rules
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.dqn.network import NAMES, make_network
+from specshield.policy.dqn.observation import PER_MOTION, observation_size
+from specshield.policy.dqn.policy import Policy, make_card
+from specshield.policy.reachability import policy as reachability
 from specshield.robot import STRETCH, Robot
 from specshield.robot.actions import Action
 from specshield.robot.unicycle import make_body
+from specshield.rule.progress import make_rules
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
 from specshield.stl import SATISFIED_ABOVE, robustness_bounds

@@ -12,13 +12,13 @@ import numpy as np
 from benchmarks.houses import RESTLESS
 from benchmarks.states import shipped_dqn
 from benchmarks.timing import quietest
-from specshield.policy import reachability
-from specshield.policy.environment import Environment, free_poses
-from specshield.policy.network import NAMES, make_network
-from specshield.policy.policy import wait_motion
-from specshield.policy.reachability import load_reachability
-from specshield.policy.rollout import satisfies
-from specshield.policy.settings import Settings
+from specshield.policy.dqn.environment import Environment, free_poses
+from specshield.policy.dqn.network import NAMES, make_network
+from specshield.policy.dqn.policy import wait_motion
+from specshield.policy.dqn.rollout import satisfies
+from specshield.policy.dqn.settings import Settings
+from specshield.policy.reachability import policy as reachability
+from specshield.policy.reachability.policy import load_reachability
 from specshield.sim.cases import Case, load_case
 
 STARTS = 1000
@@ -59,7 +59,7 @@ def race(case_name: str, rate: float, minutes: float, seed: int) -> dict[str, An
 
 
 def _ours(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]]:
-    from specshield.policy.dqn import Progress, Stopped, train
+    from specshield.policy.dqn.train import Progress, Stopped, train
 
     curve: list[list[float]] = []
     began = time.perf_counter()

@@ -18,15 +18,15 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from specshield.policy.reachability import ReachabilityPolicy
-from specshield.shield.belief import Belief
-from specshield.shield.lookahead import prepare
-from specshield.shield.surrogate import cell_of
-from specshield.sim import runs
-from specshield.sim.experiment import Experiment, experiments
+from evaluation import runs
+from evaluation.experiment import Experiment, experiments
+from evaluation.runs import Record
+from specshield.lookahead.belief import Belief
+from specshield.lookahead.lookahead import prepare
+from specshield.lookahead.surrogate import cell_of
+from specshield.policy.reachability.policy import ReachabilityPolicy
 from specshield.sim.learned.model import LearnedModel
 from specshield.sim.robot import SimulatedRobot
-from specshield.sim.runs import Record
 
 WHEN = ("never", "seen", "start")
 

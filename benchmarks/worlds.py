@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.judge import distance
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
 from specshield.robot import robot_from_json
 from specshield.robot.unicycle import make_body, successors
 from specshield.task import Task, make_task

@@ -1,10 +1,13 @@
-"""The server that tests share."""
+"""What tests share: a server, and the cases with the shields that came for them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
+
+from specshield.shield.episode import Shield, make_shield
+from specshield.sim.cases import Case, case_names, load_case, shipped
 from tests.serving import RunningServer, serving
 
 
@@ -13,3 +16,14 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
     """A real process with a data folder and an embedded store of its own; it trains nothing."""
     with serving(tmp_path_factory.mktemp("server") / "data") as running:
         yield running
+
+
+@pytest.fixture(scope="session", params=case_names())
+def case(request: pytest.FixtureRequest) -> Case:
+    return load_case(request.param)
+
+
+@pytest.fixture(scope="session", params=["dqn", "reachability"])
+def shield(case: Case, request: pytest.FixtureRequest) -> Shield:
+    """The case's shield: with the policy that came for it, computed or learned."""
+    return make_shield([shipped(case, request.param)])

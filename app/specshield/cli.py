@@ -72,7 +72,7 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
-    from specshield.service.embedded import EmbeddedStore
+    from specshield.service.storage.embedded import EmbeddedStore
 
     settings = _settings()  # what is wrong with them is said here, in one line
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
@@ -98,8 +98,8 @@ def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
 ) -> None:
     """Make the policies and do the runs that are asked for, until stopped; policies that learn need torch."""
-    from specshield.service.worker import serve as work
-    from specshield.sim.jobs import QUEUE
+    from evaluation.jobs import QUEUE
+    from specshield.service.training.worker import serve as work
 
     work(_settings(), until_eof, [QUEUE])
 
@@ -146,8 +146,8 @@ def evaluate(
     json: Annotated[bool, typer.Option("--json", help="Print figures and records as JSON.")] = False,
 ) -> None:
     """Methods side by side on one case, over any number of runs."""
+    from evaluation.experiment import available, experiments
     from specshield.sim import commands
-    from specshield.sim.experiment import available, experiments
 
     raise typer.Exit(
         commands.evaluate(
@@ -169,7 +169,7 @@ def report(
     ),
 ) -> None:
     """Write up what evaluate has measured. Needs matplotlib."""
-    from specshield.sim import writeup
+    from evaluation import writeup
 
     writeup.write_up(results, out)
 
@@ -193,9 +193,9 @@ def train(
 
 def _settings() -> Settings:
     """The settings, and a data folder that will do. Raises InputError and StoreError."""
-    from specshield.service.embedded import EmbeddedStore
-    from specshield.service.files import check_writable
+    from specshield.service.library.files import check_writable
     from specshield.service.settings import read_settings
+    from specshield.service.storage.embedded import EmbeddedStore
 
     settings = read_settings()
     check_writable(settings.data_dir, "SPECSHIELD_DATA_DIR")

@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from specshield.policy.policy import Proposal
+from specshield.policy.dqn.policy import Proposal
 from specshield.robot import robot_from_json
 from specshield.robot.unicycle import make_body, simulate
 from specshield.task import make_task

@@ -6,9 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from tests.oracles.brute_stl import brute_robustness
-
 from specshield import stl
+from tests.oracles.brute_stl import brute_robustness
 
 
 def margin(spec: Mapping[str, Any], poses: Sequence[Sequence[float]]) -> float:

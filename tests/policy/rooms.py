@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from specshield.policy.network import NAMES, make_network
-from specshield.policy.observation import observation_size
-from specshield.policy.policy import Policy, make_card
-from specshield.policy.progress import make_rules
+from specshield.policy.dqn.network import NAMES, make_network
+from specshield.policy.dqn.observation import observation_size
+from specshield.policy.dqn.policy import Policy, make_card
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.unicycle import make_body
+from specshield.rule.progress import make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

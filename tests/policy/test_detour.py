@@ -6,20 +6,20 @@ import math
 
 import numpy as np
 import pytest
+
 from benchmarks.states import shipped_dqn
 from benchmarks.sweep import made_robot, widened
-from tests.oracles.judge import margin
-from tests.policy.rooms import OCCUPIED, REGIONS
-
-from specshield.policy import reachability
 from specshield.policy.detour import find_sibling, find_twins, join
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.reachability import policy as reachability
 from specshield.robot import robot_from_json
 from specshield.robot.unicycle import make_body, simulate
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
+from tests.oracles.judge import margin
+from tests.policy.rooms import OCCUPIED, REGIONS
 
 HALF, THIRD = math.pi / 2.0, math.pi / 3.0
 ACTIONS = [{"name": "stay"}, {"name": "go", "translate": 0.2}, {"name": "back", "translate": -0.2}]

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from tests.oracles.disc import DiscWorld
 
 from specshield.robot import STRETCH, Action, Robot
 from specshield.robot.unicycle import in_collision, make_body, overlap, simulate, step, successors, wrap
 from specshield.sim.cases import case_names, load_case
 from specshield.world.occupancy import OccupancyGrid
+from tests.oracles.disc import DiscWorld
 
 TOUCH = 2e-6
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import httpx
 import pytest
+
 from tests.service.world import LOGITS, START, grid_json, send_policy
 
 

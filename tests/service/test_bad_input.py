@@ -8,13 +8,13 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
-from tests.service.world import LOGITS, RESOLUTION, ROBOT, SPEC, START, ahead, cells, grid_json, policy_files
 
-from specshield.policy import planner
+from specshield.policy.planner import policy as planner
 from specshield.robot import robot_from_json
 from specshield.service.schemas import Problem
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
+from tests.service.world import LOGITS, RESOLUTION, ROBOT, SPEC, START, ahead, cells, grid_json, policy_files
 
 YAML = b"resolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
 PGM = b"P5\n4 3\n255\n" + bytes([254] * 12)

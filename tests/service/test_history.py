@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from specshield.errors import HistoryConflict, HistoryGap, PoseError
-from specshield.service.history import join
+from specshield.service.sessions.history import join
 
 TRAJECTORY = np.array([[0.2 * t, -0.1 * t, 0.5 * t] for t in range(8)])
 

@@ -8,13 +8,13 @@ import httpx
 import pytest
 from rq import Queue
 from rq.exceptions import DequeueTimeout
+
+from specshield.service.settings import Settings
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.training.jobs import Jobs
+from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
 from tests.serving import serving, wait_for
-
-from specshield.service.embedded import EmbeddedStore
-from specshield.service.jobs import Jobs
-from specshield.service.settings import Settings
-from specshield.service.worker import _Worker
 
 pytest.importorskip("torch")
 

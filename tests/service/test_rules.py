@@ -6,11 +6,11 @@ import random
 
 import httpx
 import pytest
-from tests.service.world import ROBOT, START, grid_json
-from tests.serving import serving
 
 from specshield.client import ShieldClient
 from specshield.errors import InfeasibleStart
+from tests.service.world import ROBOT, START, grid_json
+from tests.serving import serving
 
 WITHIN, UNTIL = 30, 45  # steps
 SAFE = {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}

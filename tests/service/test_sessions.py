@@ -6,6 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+
 from tests.service.world import LOGITS, SPEC, START, ahead, send_policy
 
 

@@ -12,13 +12,13 @@ import httpx
 import numpy as np
 import pytest
 import redis
-from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import serving, wait_for
 
 from specshield.errors import StoreError
-from specshield.service import keeper
-from specshield.service.embedded import EmbeddedStore
-from specshield.service.store import Change, Store
+from specshield.service.storage import keeper
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.store import Change, Store
+from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
+from tests.serving import serving, wait_for
 
 
 def begin(client, **options):

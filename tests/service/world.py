@@ -9,11 +9,11 @@ import httpx
 import numpy as np
 from safetensors.numpy import save
 
-from specshield.policy.observation import observation_size
-from specshield.policy.policy import make_card
-from specshield.policy.progress import make_rules
+from specshield.policy.dqn.observation import observation_size
+from specshield.policy.dqn.policy import make_card
 from specshield.robot import robot_from_json
 from specshield.robot.unicycle import make_body
+from specshield.rule.progress import make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+
+from specshield.policy.dqn.network import make_network
+from specshield.policy.dqn.policy import Policy, Proposal
+from specshield.policy.planner import policy as planner
+from specshield.policy.reachability import policy as reachability
+from specshield.rule.residual import still_open
+from specshield.shield.episode import Config, decide, make_shield
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted, ways
 from tests.policy.rooms import random_weights, sizes
-
-from specshield.policy import planner, reachability
-from specshield.policy.network import make_network
-from specshield.policy.policy import Policy, Proposal
-from specshield.policy.residual import still_open
-from specshield.shield.episode import Config, decide, make_shield
 
 EVEN = np.zeros(5)
 SHORTEST = {WAIT: [FORWARD], LEFT: [RIGHT, FORWARD], RIGHT: [LEFT, FORWARD]}

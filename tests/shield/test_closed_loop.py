@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.oracles.brute_stl import brute_robustness
-from tests.policy.rooms import flat
 
 from specshield.errors import InfeasibleStart
-from specshield.policy.dqn import train
-from specshield.policy.environment import free_poses
-from specshield.policy.settings import Settings
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.dqn.settings import Settings
+from specshield.policy.dqn.train import train
 from specshield.robot.unicycle import in_collision, make_body, successors
 from specshield.shield.episode import Config, decide, make_shield, start
 from specshield.world.regions import signed_distance
+from tests.oracles.brute_stl import brute_robustness
+from tests.policy.rooms import flat
 
 EPISODES = 200
 TASK = flat("F[0,12] West and F[8,20] not West and G[0,10] not Hole")

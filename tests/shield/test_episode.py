@@ -16,12 +16,12 @@ import math
 
 import numpy as np
 import pytest
-from tests.oracles.cells import END, FORWARD, LEFT, MOTIONS, RIGHT, WAIT, Cells, Exhaustive, Scripted, waits
 
 from specshield.errors import InputError, LogitsError, PolicyError, PoseError, SampleError
 from specshield.shield.episode import Carry, Config, close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
 from specshield.stl import robustness
+from tests.oracles.cells import END, FORWARD, LEFT, MOTIONS, RIGHT, WAIT, Cells, Exhaustive, Scripted, waits
 
 AT = {"A": (1, 0), "B": (2, 0), "C": (0, 1)}
 EVEN = np.zeros(5)

@@ -8,7 +8,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from specshield.policy import planner, reachability
+from specshield.policy.planner import policy as planner
+from specshield.policy.reachability import policy as reachability
 from specshield.robot import robot_from_json
 from specshield.robot.unicycle import simulate
 from specshield.shield.episode import decide, make_shield

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.oracles.cells import END, MOTIONS, ROBOT, Cells, Exhaustive, Scripted, waits
 
 from specshield.errors import InfeasibleStart
 from specshield.shield.episode import Carry, decide, make_shield, start
 from specshield.stl import robustness
+from tests.oracles.cells import END, MOTIONS, ROBOT, Cells, Exhaustive, Scripted, waits
 
 REGIONS = {"A": (2, 0), "B": (0, 2), "C": (1, 2)}
 WORLDS = {

@@ -8,7 +8,7 @@ import pytest
 
 from specshield.client import ShieldClient
 from specshield.errors import InfeasibleStart, LogitsError, PoseError, RobotError
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
 from specshield.sim import adapters
 from specshield.sim.robot import SimulatedRobot

@@ -6,11 +6,11 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from tests.oracles.judge import margin
 
 from specshield.client import ShieldClient
 from specshield.sim import picture, report
 from specshield.sim.campaign import run
+from tests.oracles.judge import margin
 
 RUNS = 20  # with seed 0: the episodes of `make demo`
 SEED = 0

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
+from evaluation.experiment import experiments
 from specshield import errors
 from specshield.sim.cases import MAPS, load_case, shipped
-from specshield.sim.experiment import experiments
 from specshield.stl import parse
 
 

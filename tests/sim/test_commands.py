@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from specshield.policy.load import load_policy
+from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
 
 SPECSHIELD = (sys.executable, "-m", "specshield.cli")

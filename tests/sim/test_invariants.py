@@ -7,14 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from tests.oracles.judge import margin
 
 from specshield.errors import InfeasibleStart
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
 from specshield.shield.episode import decide, start
 from specshield.shield.shaping import log_softmax
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
+from tests.oracles.judge import margin
 
 EPISODES = {  # 212 of them; learned policies take longer to ask
     ("case1", "dqn"): 64, ("case2", "dqn"): 20, ("case1", "reachability"): 64, ("case2", "reachability"): 64,

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from specshield.policy.environment import free_poses
-from specshield.shield import lookahead
+from specshield.lookahead import lookahead
+from specshield.policy.dqn.environment import free_poses
 from specshield.shield.decision import Carry, Config
 from specshield.shield.episode import close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax

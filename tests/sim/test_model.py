@@ -2,13 +2,13 @@ import math
 
 import numpy as np
 import pytest
-from tests.oracles.judge import margin
 
 from specshield.errors import NotFound
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
 from specshield.sim.model import MODELS, Decoyed, Drifter, GoalSeeker, Jumper, elsewhere, make_model, softmax
 from specshield.sim.robot import COMFORT, NEAR, Observation, SimulatedRobot
+from tests.oracles.judge import margin
 
 NAMES = list(STRETCH.action_names)
 

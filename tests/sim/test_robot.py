@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
 from specshield.robot.unicycle import in_collision
 from specshield.sim.robot import SimulatedRobot, waypoints

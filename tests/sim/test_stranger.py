@@ -8,9 +8,9 @@ import urllib.request
 
 import numpy as np
 import pytest
-from tests.oracles.judge import margin
 
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
+from tests.oracles.judge import margin
 
 
 def post(url, body):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.stl.formulas import finite, formulas, terms, traces
 
 from specshield.errors import SampleError
 from specshield.stl import SATISFIED_ABOVE, parse, robustness, robustness_bounds, verdict
+from tests.stl.formulas import finite, formulas, terms, traces
 
 INF = math.inf
 

@@ -3,10 +3,10 @@ from __future__ import annotations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.stl.formulas import formulas, traces
 
 from specshield.errors import FragmentError
 from specshield.stl import Always, Eventually, Formula, Obligation, conjuncts, obligations, parse, robustness
+from tests.stl.formulas import formulas, traces
 
 
 def show(obligation: Obligation) -> str:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.stl.formulas import finite, formulas, terms
 
 from specshield.errors import FormulaError, HorizonError
 from specshield.stl import (
@@ -26,6 +25,7 @@ from specshield.stl import (
     parse,
 )
 from specshield.stl.parser import MAX_DEPTH
+from tests.stl.formulas import finite, formulas, terms
 
 a, b, c = Atom("a"), Atom("b"), Atom("c")
 x, y = Name("x"), Name("y")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.stl.formulas import NAMES, finite, predicates, terms
 
 from specshield.errors import FormulaError, FragmentError, SampleError
 from specshield.stl import Abs, Comparison, Formula, Name, Neg, Number, Term, parse, robustness
 from specshield.stl.program import STACK_SIZE, compile_predicate, evaluate, evaluate_packed, pack
+from tests.stl.formulas import NAMES, finite, predicates, terms
 
 SLOTS = {name: i for i, name in enumerate(NAMES)}
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.oracles.brute_stl import brute_robustness
-from tests.stl.formulas import formulas, traces
 
 from specshield.errors import SampleError
 from specshield.stl import parse, robustness
+from tests.oracles.brute_stl import brute_robustness
+from tests.stl.formulas import formulas, traces
 
 A = [1.0, -2.0, 3.0, 0.5, -1.0]
 B = [-3.0, -1.0, 2.0, 4.0, 0.25]

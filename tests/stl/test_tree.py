@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.stl.formulas import NAMES, formulas, traces
 
 from specshield.errors import FormulaError
 from specshield.stl import Formula, parse, robustness, robustness_bounds
 from specshield.stl.program import STACK_SIZE, evaluate_packed
 from specshield.stl.tree import compile_tree, tree_bounds, tree_value
+from tests.stl.formulas import NAMES, formulas, traces
 
 SLOTS = {name: i for i, name in enumerate(NAMES)}
 LENGTH = 24

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel, leaf
-from specshield.policy.progress import STACK, Rules, read_predicates, value_count
 from specshield.robot.unicycle import TOUCH, Body, free_distance, in_collision, step, wrap
+from specshield.rule.progress import STACK, Rules, read_predicates, value_count
 from specshield.stl.program import VALUE
 from specshield.task import POSE_NAMES
 

@@ -16,19 +16,19 @@ from fastapi_offline import FastAPIOffline
 
 from specshield import __version__
 from specshield.service import problems
-from specshield.service.children import TrainingWorker, tend, wants_worker
-from specshield.service.embedded import EmbeddedStore
-from specshield.service.jobs import Jobs
-from specshield.service.keeper import follow_parent
-from specshield.service.maps import Maps
+from specshield.service.library.maps import Maps
+from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe, guarded
-from specshield.service.policies import Policies
 from specshield.service.routes import maps, policies, sessions, specs, system
 from specshield.service.schemas import Problem
-from specshield.service.sessions import Sessions
+from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
 from specshield.service.state import Server, problem_documents
-from specshield.service.store import Store
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.keeper import follow_parent
+from specshield.service.storage.store import Store
+from specshield.service.training.children import TrainingWorker, tend, wants_worker
+from specshield.service.training.jobs import Jobs
 from specshield.service.warmup import warm_up
 
 DESCRIPTION = """\

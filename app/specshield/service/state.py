@@ -7,13 +7,13 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from specshield.service.children import TrainingWorker
-from specshield.service.jobs import Jobs
-from specshield.service.maps import Maps
-from specshield.service.policies import Policies
-from specshield.service.sessions import Sessions
+from specshield.service.library.maps import Maps
+from specshield.service.library.policies import Policies
+from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
-from specshield.service.store import Store
+from specshield.service.storage.store import Store
+from specshield.service.training.children import TrainingWorker
+from specshield.service.training.jobs import Jobs
 
 
 @dataclass

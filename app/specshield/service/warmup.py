@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from specshield.policy.network import make_network
-from specshield.policy.observation import observation_size
-from specshield.policy.policy import Policy
-from specshield.policy.progress import make_rules
-from specshield.policy.reachability import synthesise
+from specshield.policy.dqn.network import make_network
+from specshield.policy.dqn.observation import observation_size
+from specshield.policy.dqn.policy import Policy
+from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.unicycle import make_body
+from specshield.rule.progress import make_rules
 from specshield.shield import episode
 from specshield.shield.decision import make_shield
 from specshield.task import Task, make_task

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.policy.residual import still_open
-from specshield.policy.view import view_of
+from specshield.rule.residual import still_open
+from specshield.rule.view import view_of
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, prefix_of, rho
 from specshield.stl import SATISFIED_ABOVE

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import InputError, PolicyError
-from specshield.policy.policy import Proposer
-from specshield.policy.view import View, view_of
+from specshield.lookahead.belief import Belief
+from specshield.policy.dqn.policy import Proposer
 from specshield.robot.unicycle import Body, make_body
-from specshield.shield.belief import Belief
+from specshield.rule.view import View, view_of
 from specshield.stl import Verdict
 from specshield.task import Task
 

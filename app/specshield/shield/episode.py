@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
-from specshield.policy.reachability import ReachabilityPolicy
+from specshield.lookahead.lookahead import LookAhead, prepare
+from specshield.policy.reachability.policy import ReachabilityPolicy
 from specshield.robot.unicycle import in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
@@ -30,7 +31,6 @@ from specshield.shield.judgement import (
     robustness_of,
     witnesses_of,
 )
-from specshield.shield.lookahead import LookAhead, prepare
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "close", "decide", "make_shield", "start"]

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.policy.policy import Proposer
-from specshield.policy.progress import signal_rows
-from specshield.policy.view import View, best_rows, look, rate
+from specshield.policy.dqn.policy import Proposer
 from specshield.robot.unicycle import Body, simulate
+from specshield.rule.progress import signal_rows
+from specshield.rule.view import View, best_rows, look, rate
 from specshield.stl import Formula, robustness, robustness_bounds
 from specshield.task import Task
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.policy.residual import again, joined, left_over
-from specshield.policy.view import view_of
+from specshield.rule.residual import again, joined, left_over
+from specshield.rule.view import view_of
 from specshield.shield import shaping
 from specshield.shield.aim import aim
 from specshield.shield.decision import Shield

@@ -11,7 +11,7 @@ import numpy as np
 
 from specshield.client import Session, ShieldClient
 from specshield.errors import InfeasibleStart
-from specshield.policy.environment import free_poses
+from specshield.policy.dqn.environment import free_poses
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode, with_shield, without_shield
 from specshield.sim.model import make_model

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import NotFound
-from specshield.policy.load import load_policy
-from specshield.policy.policy import Proposer
+from specshield.policy.dqn.policy import Proposer
+from specshield.policy.methods import load_policy
 from specshield.robot import STRETCH
 from specshield.robot.unicycle import Body, make_body
 from specshield.task import Task, make_task

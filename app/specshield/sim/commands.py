@@ -8,12 +8,13 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from evaluation import evaluation, results
+from evaluation.calibration import calibrated
+from evaluation.experiment import CERTIFYING, Experiment, split
 from specshield.client import ShieldClient
-from specshield.sim import evaluation, picture, report, results
-from specshield.sim.calibration import calibrated
+from specshield.sim import picture, report
 from specshield.sim.campaign import Campaign, run
 from specshield.sim.cases import Case, case_names, load_case
-from specshield.sim.experiment import CERTIFYING, Experiment, split
 from specshield.sim.progress import StatusLine, bar, duration
 from specshield.sim.service import own_server
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.statistics import extra_steps
 from specshield.sim.campaign import Campaign
 from specshield.sim.episodes import Episode
-from specshield.sim.statistics import extra_steps
 
 MODES = ("shaped", "completion", "prior", "fallback", "violated")
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from specshield.errors import Unsupported
-from specshield.policy import planner, reachability
-from specshield.policy.settings import read_settings
+from specshield.policy.dqn.settings import read_settings
+from specshield.policy.planner import policy as planner
+from specshield.policy.reachability import policy as reachability
 from specshield.policy.tensors import replace_file
 from specshield.sim.cases import MODELS, Case, load_case
 from specshield.sim.progress import StatusLine, duration
@@ -58,7 +59,7 @@ def train(
 def _learn(
     case: Case, seed: int, updates: int | None, options: dict[str, Any], checkpoint: Path, resume: bool
 ) -> tuple[bytes, dict[str, Any]]:
-    from specshield.policy.dqn import Progress, train
+    from specshield.policy.dqn.train import Progress, train
 
     settings = read_settings(options | ({} if updates is None else {"updates": updates}))
     status = StatusLine()

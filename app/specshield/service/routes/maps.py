@@ -10,7 +10,7 @@ from pydantic import TypeAdapter
 
 from specshield.errors import MapError
 from specshield.service import examples
-from specshield.service.maps import Map
+from specshield.service.library.maps import Map
 from specshield.service.routes import uploads
 from specshield.service.schemas import GridMap, HouseMap, Id, MapList, MapResponse, MapUpload
 from specshield.service.state import Cursor, Limit, Server, ServerState, problems

@@ -9,12 +9,13 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import TypeAdapter
 
 from specshield.errors import FragmentError, InUse, TrainingUnavailable
-from specshield.service import examples, methods
-from specshield.service.jobs import Training
-from specshield.service.policies import Description, Record, describe
+from specshield.service import examples
+from specshield.service.library.policies import Description, Record, describe
 from specshield.service.routes import uploads
 from specshield.service.schemas import Card, Id, PolicyList, PolicyRequest, PolicyResponse
 from specshield.service.state import Cursor, Limit, Server, ServerState, problems
+from specshield.service.training import methods
+from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
 MODELS = (PolicyRequest,)  # documented by hand

@@ -1,0 +1,160 @@
+"""What a session has learned of its model: where it goes, if anywhere, how sharply, how far to trust that.
+
+Each goal, and wandering, is charged the KL of what the model said from what the surrogate (surrogate.py)
+would have said. Where the model's own habits predict it far better than those do, look-ahead vanishes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel
+from specshield.lookahead.surrogate import FEATURES, WANDER, Goals, cell_of, describe, follow
+from specshield.robot.unicycle import Body
+
+Floats = NDArray[np.float64]
+
+STYLE = np.array([2.0, 2.0, -2.0, -1.0])  # of an unknown model: the logit of each feature
+SURE = 3.0  # observations that STYLE counts for
+KEEP = 0.97  # of the charges from one step to the next: models change their minds
+TRACK = 0.95  # of the record of predictions, likewise
+HABITS = 0.1  # how fast the running average of the model's motions follows
+DOUBT = 6.0  # [nats] by which habits may predict better, over the last 1 / (1 - TRACK) steps
+WARY = 6.0  # of them before anything is seen: a model that ends soon by itself is best left alone
+SHARP = 20.0  # a KL is charged for a whole distribution, which tells more than one draw from it would
+POSSIBLE = 0.03  # of the leading goal's probability: goals below that are left out
+FLOOR = 0.03  # of the surrogate's mass is spread over all motions: no observation rules a goal out
+LEAST = 1e-6  # of a motion's probability
+FLATTEST, STEEPEST = 0.5, 4.0  # logits a feature
+
+
+@dataclass(frozen=True)
+class Belief:
+    """cost [G + 1]: charges [nats] of each goal and, last, of wandering. normal [F, F], moment [F]: of the
+    least squares that fit the model's style. habit [M]: running average of the probabilities of its motions.
+    excess: running sum of what the surrogate was charged above what the habit was [nats].
+    """
+
+    cost: Floats
+    normal: Floats
+    moment: Floats
+    habit: Floats
+    excess: float
+
+    @property
+    def trust(self) -> float:
+        """How far the surrogate can be trusted, 0 to 1."""
+        return 0.5 * (1.0 + math.tanh(0.5 * (DOUBT - self.excess)))
+
+    @property
+    def style(self) -> Floats:
+        """The logit of each feature, shape (F,): one number for progress, turning and being blocked."""
+        fitted = np.linalg.solve(self.normal, self.moment)
+        sharp = min(max(float(fitted[:2].mean()), FLATTEST), STEEPEST)
+        return np.array([sharp, sharp, -sharp, fitted[3]])
+
+    def probabilities(self) -> Floats:
+        """Of each goal, 0 for those that hardly can be it, and of wandering. Shape (G + 1,)."""
+        goals, wander = self.cost[:-1], self.cost[-1]
+        odds = np.exp(SHARP * (goals.min() - goals))
+        odds[odds < POSSIBLE] = 0.0
+        going = 0.5 * (1.0 + math.tanh(0.5 * float(wander - goals.min())))
+        return np.append(going * odds / odds.sum(), 1.0 - going)
+
+    def to_json(self) -> dict[str, Any]:
+        arrays = {name: getattr(self, name).tolist() for name in ("cost", "normal", "moment", "habit")}
+        return {**arrays, "excess": self.excess}
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Belief:
+        cost, normal, moment, habit = (
+            np.array(value[name], dtype=np.float64) for name in ("cost", "normal", "moment", "habit")
+        )
+        return Belief(cost, normal, moment, habit, value["excess"])
+
+
+def begin(goals: int, motions: int) -> Belief:
+    """Before the first observation."""
+    habit = np.full(motions, 1.0 / motions)
+    return Belief(np.zeros(goals + 1), SURE * np.eye(FEATURES), SURE * STYLE, habit, WARY)
+
+
+def observe(
+    belief: Belief,
+    body: Body,
+    goals: Goals,
+    pose: Floats,
+    blocked: NDArray[np.bool_],
+    said: Floats,
+    end: float,
+) -> Belief:
+    """After what the model said at x_t (3,).
+
+    blocked [M]: motions that something would stop short. said [M]: the motions' probabilities, given that it
+    does not end; end: the probability that it does.
+    """
+    said = np.maximum(said, LEAST) / np.maximum(said, LEAST).sum()
+    log_said = np.log(said)
+    charges = np.empty(len(belief.cost))
+    x, y, theta = (float(v) for v in pose)
+    _charge(body, goals, belief.style, x, y, theta, blocked, said, log_said, end, charges)
+    usual = float(said @ (log_said - np.log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
+    sided = _sided(body, said)  # one that wanders turns to either side, and which is no error
+    excess = TRACK * belief.excess + float(belief.probabilities() @ charges) - usual
+    excess -= float(belief.probabilities()[-1]) * sided
+    cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
+    lead, features = int(np.argmin(cost[:-1])), np.empty((len(said), FEATURES))
+    row, column = cell_of(body, goals.pitch, goals.distance.shape[1], goals.distance.shape[2], x, y)
+    wu, wv = (float(w) for w in goals.way[lead, row, column])
+    describe(body, wu, wv, theta, blocked, features)
+    weight = 0.5 * said + 0.5 / len(said)
+    features -= weight @ features
+    wanted = np.maximum(log_said, log_said.max() - 10.0)
+    wanted -= weight @ wanted
+    return Belief(
+        cost,
+        KEEP * belief.normal + (1.0 - KEEP) * SURE * np.eye(FEATURES) + (features.T * weight) @ features,
+        KEEP * belief.moment + (1.0 - KEEP) * SURE * STYLE + (features.T * weight) @ wanted,
+        (1.0 - HABITS) * belief.habit + HABITS * said,
+        excess,
+    )
+
+
+def _sided(body: Body, said: Floats) -> float:
+    """The KL of the motions said from the same with no side preferred to the other [nats]."""
+    alike = body.translate[:, None] == body.translate
+    mirrored = alike & (np.abs(body.rotate[:, None] + body.rotate) < 1e-9)
+    even = np.where(mirrored.any(axis=0), 0.5 * (said + mirrored @ said), said)
+    return float(said @ np.log(said / even))
+
+
+@kernel
+def _charge(
+    body: Body,
+    goals: Goals,
+    style: Floats,
+    x: float,
+    y: float,
+    theta: float,
+    blocked: NDArray[np.bool_],
+    said: Floats,
+    log_said: Floats,
+    end: float,
+    charges: Floats,
+) -> None:
+    """The KL of the motions said from each goal's, and from wandering, and the log loss of the end."""
+    motions, wander = said.shape[0], charges.shape[0] - 1
+    features, log_r = np.empty((motions, FEATURES)), np.empty(motions)
+    for g in range(charges.shape[0]):
+        ends = follow(body, goals, g if g < wander else WANDER, style, x, y, theta, blocked, features, log_r)
+        chance = 0.98 * ends + 0.005
+        charges[g] = -(end * math.log(chance) + (1.0 - end) * math.log(1.0 - chance))
+        for m in range(motions):
+            r = (1.0 - FLOOR) * math.exp(log_r[m]) + FLOOR / motions
+            charges[g] += said[m] * (log_said[m] - math.log(r))

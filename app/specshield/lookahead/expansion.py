@@ -1,0 +1,110 @@
+"""D at the next poses, by exact steps of the surrogates first: beside a wall the lattice knows little."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel, leaf
+from specshield.lookahead.desirability import NEVER, desirability
+from specshield.lookahead.lattice import Planes
+from specshield.lookahead.surrogate import FEATURES, Goals, follow, is_blocked, price_left, step_price
+from specshield.robot.unicycle import Body, step
+from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
+
+Floats = NDArray[np.float64]
+
+DEPTH = 2  # exact steps before the lattice is asked
+
+
+@kernel
+def expand_all(
+    body: Body,
+    rules: Rules,
+    goals: Goals,
+    planes: Planes,
+    tables: NDArray[np.uint16],
+    leads: NDArray[np.int64],
+    asked: NDArray[np.int64],
+    style: Floats,
+    t: int,
+    mask: int,
+    pose_t: Floats,
+    out: Floats,
+) -> None:
+    """D after each motion from x_t, out (K, M), for the K tables asked for.
+
+    tables [B, kept, H, rows], leads [B]: the goal that each is for, or WANDER. mask: the goals of the
+    formula settled at t. A tree of poses: level d holds the M^d poses at t + d, the children of its node n
+    being nodes M n to M n + M - 1 of the next.
+    """
+    motions, horizon = out.shape[1], planes.slot.shape[0] - 2
+    levels = min(DEPTH + 1, horizon - t)
+    start = np.zeros(levels + 2, np.int64)
+    for d in range(levels + 1):
+        start[d + 1] = start[d] + motions**d
+    pose, settled = np.empty((start[-1], 3)), np.full(start[-1], -1)
+    blocked = np.zeros((start[-1], motions), np.bool_)
+    values, stack, read = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
+    pose[0], settled[0] = pose_t, mask
+    for d in range(levels):
+        for n in range(start[d], start[d + 1]):
+            if settled[n] < 0:
+                continue
+            u, v, w = pose[n]
+            for m in range(motions):
+                child = start[d + 1] + (n - start[d]) * motions + m
+                pose[child, 0], pose[child, 1], pose[child, 2] = step(body, u, v, w, m)
+                blocked[n, m] = is_blocked(body, m, u, v, w, pose[child])
+                read_predicates(rules, pose[child, 0], pose[child, 1], pose[child, 2], values, stack, read)
+                settled[child] = _settle(rules, planes, t + d + 1, settled[n], read)
+    cost, log_r, features = np.empty(start[-1]), np.empty(motions), np.empty((motions, FEATURES))
+    full = planes.slot.shape[1] - 1
+    for k in range(asked.shape[0]):
+        lead = leads[asked[k]]
+        for d in range(levels, 0, -1):
+            for n in range(start[d], start[d + 1]):
+                cost[n] = float(NEVER)
+                if settled[n] < 0:
+                    continue
+                u, v, w = pose[n]
+                if d == levels:
+                    cost[n] = desirability(body, planes, tables[asked[k]], t + d, settled[n], u, v, w)
+                else:
+                    ends = follow(body, goals, lead, style, u, v, w, blocked[n], features, log_r)
+                    first = start[d + 1] + (n - start[d]) * motions
+                    total = _log_sum(log_r, cost[first : first + motions])
+                    if total > -float(NEVER):
+                        due = step_price(lead) if settled[n] != full else 0.0
+                        cost[n] = due - (1.0 - ends) * total
+                before = start[d - 1] + (n - start[d]) // motions
+                if cost[n] < NEVER and settled[n] == full and settled[before] != full:
+                    cost[n] += price_left(body, goals, lead, u, v)
+        out[k] = cost[start[1] : start[2]]
+
+
+@leaf
+def _log_sum(log_r: Floats, cost: Floats) -> float:
+    """log sum_m r_m exp(-cost_m) over the motions that have a cost; -NEVER where none has."""
+    least, total = float(NEVER), 0.0
+    for m in range(cost.shape[0]):
+        if cost[m] < NEVER:
+            least = min(least, cost[m] - log_r[m])
+    for m in range(cost.shape[0]):
+        if cost[m] < NEVER:
+            total += math.exp(least - cost[m] + log_r[m])
+    return math.log(total) - least if total > 0.0 else -float(NEVER)
+
+
+@leaf
+def _settle(rules: Rules, planes: Planes, t: int, mask: int, read: Floats) -> int:
+    """The goals settled once the state at step t is taken in; -1 where it breaks an `always`."""
+    for k in range(rules.kind.shape[0]):
+        if rules.kind[k] == ALWAYS and rules.a[k] <= t <= rules.b[k] and read[k] <= rules.margin:
+            return -1
+    for g in range(planes.goal.shape[0]):
+        if planes.first[g] <= t <= planes.last[g] and read[planes.goal[g]] > rules.margin:
+            mask |= 1 << g
+    return mask

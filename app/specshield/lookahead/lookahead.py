@@ -1,0 +1,197 @@
+"""Look-ahead shaping: inside S_t, weigh what the model wants by what it will cost the model later.
+
+Projection lets the model put a visit off until it is forced, step after step. Stand-ins for the model, one
+for each of some places that it may be going to and one that wanders, have each a table of what the rule will
+still cost from every pose, in KL and in steps: D (desirability.py), solved once a task. Weighing by exp(-D),
+D the mean over what the session's logits say that the model is, spreads that over the path. Only the
+preference inside S_t changes: safety rests on S_t alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from specshield.compiled import kernel
+from specshield.errors import Unsupported
+from specshield.lookahead import belief as beliefs
+from specshield.lookahead.belief import STYLE, Belief
+from specshield.lookahead.desirability import NEVER, solve
+from specshield.lookahead.expansion import expand_all
+from specshield.lookahead.lattice import Planes, make_planes
+from specshield.lookahead.surrogate import (
+    FEATURES,
+    WANDER,
+    Goals,
+    follow,
+    is_blocked,
+    make_goals,
+    price_left,
+    step_price,
+)
+from specshield.policy.lattice import pose_of
+from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
+from specshield.robot.unicycle import Body, make_body, successors
+from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
+from specshield.task import Task
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+AHEADS = 8  # tasks kept prepared in a process
+LEAD_GAP = 1.0  # [m] along free space between the places that have a table
+WORK = 200_000_000  # entries solved for a task, at most, where that leaves a few places
+MOST, FEWEST = 64, 8  # places
+REACH = 0.3  # [m] further than the nearest at which a place with a table stands for a goal, less and less
+LEADERS = 16  # tables asked in a decision
+NEGLIGIBLE = 0.02  # a probability, or trust, not worth the work
+WORST = 10.0  # [nats] more than the worst action that has a D, for those that have none
+
+
+@dataclass(frozen=True, eq=False)
+class LookAhead:
+    """A task as the look-ahead sees it, prepared once.
+
+    leads [B]: the goals that have a table of D and, last, WANDER; shares [G + 1, B]: how far each of them
+    stands for each goal, and for wandering. tables [B, kept, H, rows].
+    """
+
+    task: Task
+    body: Body
+    rules: Rules
+    goals: Goals
+    planes: Planes
+    leads: Integers
+    shares: Floats
+    tables: NDArray[np.uint16]
+
+    def begin(self) -> Belief:
+        return beliefs.begin(len(self.goals.distance), len(self.task.robot.motions))
+
+    def step(
+        self, belief: Belief, history: Floats, signals: Mapping[str, Floats], log_prior: Floats
+    ) -> tuple[Belief, Floats]:
+        """What is believed after the model's log_prior [A] at x_t, and what to add to it inside S_t, [A].
+
+        history [t + 1, 3] with t < T; signals {name: [t + 1]}. The addition is -trust * D of the next pose, D
+        above the least: at most 0, and 0 for a terminal action and where nothing is known.
+        """
+        robot, pose = self.task.robot, history[-1]
+        x, y, theta = (float(v) for v in pose)
+        nexts = np.empty((len(robot.motions), 3))
+        successors(self.body, pose, nexts)
+        prior = np.exp(log_prior)
+        going_on = prior[~robot.terminal]
+        if going_on.sum() <= 0.0:  # the model ends for certain: it says nothing of where it would go
+            return belief, np.zeros(len(prior))
+        said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(nexts)) / going_on.sum()
+        blocked = np.array([is_blocked(self.body, m, x, y, theta, after) for m, after in enumerate(nexts)])
+        end = float(prior[robot.terminal].sum())
+        belief = beliefs.observe(belief, self.body, self.goals, pose, blocked, said, end)
+        if belief.trust < NEGLIGIBLE:
+            return belief, np.zeros(len(prior))
+        costs = self._costs(belief, history, signals)
+        return belief, np.where(robot.terminal, 0.0, -belief.trust * costs[robot.motion_of])
+
+    def _costs(self, belief: Belief, history: Floats, signals: Mapping[str, Floats]) -> Floats:
+        """D after each motion [M], above the least."""
+        t = len(history) - 1
+        rules = self.rules._replace(signals=self.rules.signals.copy())
+        status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
+        replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
+        mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
+        weights = belief.probabilities() @ self.shares
+        asked = np.argsort(-weights, kind="stable")[:LEADERS]
+        asked = asked[weights[asked] >= NEGLIGIBLE]
+        costs = np.empty((len(asked), len(self.task.robot.motions)))
+        expand_all(
+            self.body, rules, self.goals, self.planes, self.tables, self.leads, asked, STYLE, t, mask,
+            history[-1], costs,
+        )  # fmt: skip
+        known = np.all(costs < NEVER, axis=0)
+        if not known.any():
+            return np.zeros(costs.shape[1])
+        # a model twice as sharp costs twice as much to bend, which is most of D
+        sharp = np.where(self.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
+        total = (weights[asked] / weights[asked].sum() * sharp) @ np.where(known, costs, 0.0)
+        result: Floats = np.where(known, total - total[known].min(), np.ptp(total[known]) + WORST)
+        return result
+
+
+@lru_cache(AHEADS)
+def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
+    """The look-ahead for a task; `policy`: one made for it, if there is any.
+
+    Raises FragmentError outside the fragment, PolicyError or Unsupported for a task too large.
+    """
+    body, rules = make_body(task.robot, task.grid), make_rules(task)
+    goals = make_goals(body, task.grid)
+    if len(goals.distance) == 0:
+        raise Unsupported(
+            "the robot can turn freely nowhere on this map, so there is nowhere to think of it as going",
+            path="shaping", got="lookahead", expected="'projection'",
+        )  # fmt: skip
+    planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
+    entries = int((planes.slot >= 0).sum()) * planes.valid.size
+    places, shares = _leads(goals, min(max(WORK // entries, FEWEST), MOST))
+    leads = np.append(places, WANDER)
+    shape = (len(leads), int(planes.kept.max()) + 1, len(planes.valid), int(planes.row.max()) + 1)
+    tables = np.empty(shape, np.uint16)
+    motions = np.zeros((len(task.robot.motions), *planes.valid.shape), np.float32)
+    ends = np.zeros(planes.valid.shape, np.float32)
+    remaining = np.zeros(planes.valid.shape[1], np.float32)
+    for table, lead in zip(tables, leads, strict=True):
+        _react_everywhere(body, goals, planes, int(lead), STYLE, motions, ends, remaining)
+        table[:] = solve(body, planes, motions, ends, step_price(int(lead)), remaining)
+    return LookAhead(task, body, rules, goals, planes, leads, block_diag(shares, 1.0), tables)
+
+
+def _leads(goals: Goals, most: int) -> tuple[Integers, Floats]:
+    """At most `most` goals that lie apart, [B], and how far each stands for each goal, [G, B]."""
+    cells = np.array([np.argwhere(distance == 0)[0] for distance in goals.distance])
+    between = goals.distance[:, cells[:, 0], cells[:, 1]].astype(np.float64) / 100.0
+    gap = LEAD_GAP
+    while True:
+        chosen: list[int] = []
+        for g in range(len(cells)):
+            if np.all(between[chosen, g] >= gap):
+                chosen.append(g)
+        if len(chosen) <= most:
+            further = between[chosen] - between[chosen].min(axis=0)
+            near = np.exp(-further.T / REACH)
+            return np.array(chosen), near / near.sum(axis=1, keepdims=True)
+        gap *= 1.1
+
+
+@kernel
+def _react_everywhere(
+    body: Body,
+    goals: Goals,
+    planes: Planes,
+    goal: int,
+    style: Floats,
+    motions: NDArray[np.float32],
+    ends: NDArray[np.float32],
+    remaining: NDArray[np.float32],
+) -> None:
+    """The surrogate at each pose of the lattice: motions [M, H, N], ends [H, N], remaining [N]."""
+    headings, cells = planes.valid.shape
+    features, log_r = np.empty((motions.shape[0], FEATURES)), np.empty(motions.shape[0])
+    blocked = np.empty(motions.shape[0], np.bool_)
+    for h in range(headings):
+        for c in range(cells):
+            if not planes.valid[h, c]:
+                continue
+            j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
+            x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
+            remaining[c] = price_left(body, goals, goal, x, y)
+            for m in range(motions.shape[0]):
+                blocked[m] = planes.free[m, h, c] == 0.0
+            ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, features, log_r)
+            for m in range(motions.shape[0]):
+                motions[m, h, c] = log_r[m]

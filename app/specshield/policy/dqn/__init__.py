@@ -1,0 +1,1 @@
+"""pi_phi by deep Q-learning (paper, section IV-A)."""

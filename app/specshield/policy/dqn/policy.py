@@ -1,0 +1,187 @@
+"""A trained pi_phi: its card, its weights, and what it proposes. Weights are safetensors; nothing is
+unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_tensors
+
+from specshield.policy.dqn.network import Network, make_network
+from specshield.policy.dqn.observation import Sight, make_sight, observation_size
+from specshield.policy.dqn.rollout import propose_all
+from specshield.policy.tensors import read_tensors
+from specshield.robot import Robot, robot_to_json
+from specshield.robot.unicycle import Body, make_body
+from specshield.rule.progress import Rules, make_rules, pasts, signal_rows
+from specshield.task import Task
+from specshield.world.regions import region_to_json
+
+Card = dict[str, Any]
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Continuations to the horizon, one after each first motion; several where a margin may be had in several
+    ways.
+
+    motions [N, T - t]: row m < M begins with motion m; indices into `Robot.motions`. poses [N, T - t, 3]:
+    after each. preferred: the motion pi_phi itself takes at x_t.
+    """
+
+    motions: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    preferred: int
+
+
+def as_one(proposals: Sequence[Proposal]) -> Proposal:
+    """The continuations of all of `proposals`, as the first prefers."""
+    first = proposals[0]
+    if len(proposals) == 1:
+        return first
+    motions, poses = [each.motions for each in proposals], [each.poses for each in proposals]
+    return Proposal(np.concatenate(motions), np.concatenate(poses), first.preferred)
+
+
+class Proposer(Protocol):
+    """A policy as the shield sees it: it proposes, exact simulation certifies."""
+
+    @property
+    def id(self) -> str: ...
+
+    @property
+    def task(self) -> Task: ...
+
+    def propose(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> Proposal:
+        """history [t + 1, 3] with t < T; signals {name: [t + 1]}; margin: robustness to aim above."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A DQN's greedy policy pi_phi(x, t) = argmax_a Q(x, a, t), with the formula's progress in its
+    observation.
+
+    After the motion it prefers it proposes its own rollout; after another, to undo it and go the same way if
+    that satisfies the formula, else its own rollout too. literal: its own rollout after every motion, as in
+    the paper: slower, and J is less often 1.
+    """
+
+    task: Task
+    card: Card
+    network: Network
+    literal: bool = False
+
+    @property
+    def id(self) -> str:
+        return str(self.card["id"])
+
+    @cached_property
+    def _prepared(self) -> tuple[Body, Rules, Sight]:
+        body, rules = make_body(self.task.robot, self.task.grid), make_rules(self.task)
+        return body, rules, make_sight(self.task, rules, body)
+
+    @cached_property
+    def _undoing(self) -> NDArray[np.int64]:
+        return undoing_motions(self.task.robot)
+
+    def propose(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> Proposal:
+        body, rules, sight = self._prepared
+        rules = rules._replace(signals=rules.signals.copy(), margin=margin)
+        t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
+        proposals = []
+        for past in pasts(rules, history, rows):
+            motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
+            poses = np.empty((*motions.shape, 3))
+            preferred = propose_all(
+                body, rules, sight, self.network, past, history, rows, wait_motion(self.task.robot),
+                self._undoing, self.literal, motions, poses,
+            )  # fmt: skip
+            proposals.append(Proposal(motions, poses, preferred))
+        return as_one(proposals)
+
+    def weights(self) -> bytes:
+        """The safetensors file."""
+        return save_tensors(self.network._asdict())
+
+
+def wait_motion(robot: Robot) -> int:
+    """The motion that leaves the pose as it is, -1 where the robot cannot stand still."""
+    return robot.motions.index((0.0, 0.0)) if (0.0, 0.0) in robot.motions else -1
+
+
+def undoing_motions(robot: Robot) -> NDArray[np.int64]:
+    """The motions that undo each of the robot's, as nearly as two can: (M, 2), in order, -1: no more."""
+    turns = [(0.0, -1), *((a, m) for m, (d, a) in enumerate(robot.motions) if d == 0.0)]
+    moves = [(0.0, -1), *((d, m) for m, (d, a) in enumerate(robot.motions) if a == 0.0)]
+
+    def back(amount: float, choices: list[tuple[float, int]]) -> int:
+        return min(choices, key=lambda choice: abs(amount + choice[0]))[1]
+
+    both = [(back(rotate, turns), back(translate, moves)) for translate, rotate in robot.motions]
+    return np.array([(a, b) if a >= 0 else (b, a) for a, b in both], np.int64).reshape(-1, 2)
+
+
+def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:
+    """The hash of task, method, options and seed, as hex."""
+    content = json.dumps(
+        {"task": task_hash, "method": method, "options": options, "seed": seed}, sort_keys=True
+    )
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def make_card(
+    task: Task,
+    method: str,
+    options: Mapping[str, Any],
+    seed: int,
+    metrics: Mapping[str, Any],
+    spec: Mapping[str, Any] | None = None,
+) -> Card:
+    """What is told of a policy beside its weights. `metrics` holds measured figures and the wall time.
+
+    spec: the spec as it was given; by default the canonical formula and every region it uses, rooms included.
+    """
+    return {
+        "format": FORMAT,
+        "id": policy_id(task.content_hash, method, options, seed),
+        "method": method,
+        "map_id": task.grid.content_hash,
+        "robot": robot_to_json(task.robot),
+        "spec": dict(spec) if spec else task_spec(task),
+        "task_hash": task.content_hash,
+        "horizon": task.horizon,
+        "options": dict(options),
+        "seed": seed,
+        "metrics": dict(metrics),
+    }
+
+
+def task_spec(task: Task) -> dict[str, Any]:
+    """The task's rule as a self-contained spec."""
+    spec: dict[str, Any] = {
+        "formula": str(task.formula),
+        "regions": {name: region_to_json(region) for name, region in task.regions.items()},
+    }
+    return spec | ({"signals": dict(task.signals)} if task.signals else {})
+
+
+def load_dqn(weights: bytes | Path, card: Card, task: Task) -> Policy:
+    """A policy from its two files. Raises PolicyError where the weights do not fit the task."""
+    body, rules = make_body(task.robot, task.grid), make_rules(task)
+    inputs, outputs = observation_size(rules, body), len(body.translate)
+    return Policy(task, card, make_network(read_tensors(weights), inputs, outputs))

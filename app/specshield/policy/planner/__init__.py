@@ -1,0 +1,1 @@
+"""pi_phi for any formula: a plan at every decision."""

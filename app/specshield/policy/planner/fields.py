@@ -1,0 +1,138 @@
+"""Fields of steps to go: how far it is from each pose to where a predicate holds.
+
+They are computed on the lattice, by the sweeps of reachability.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel, leaf
+from specshield.policy.lattice import Lattice, coordinates, pose_of
+from specshield.policy.reachability.latest import NEVER, sweep
+from specshield.robot.unicycle import Body
+from specshield.stl.program import STACK_SIZE, Programs, evaluate_packed
+from specshield.world.regions import PackedRegions, region_distance
+
+FAR = 1000.0  # [steps] what is farther is out of reach
+SCALE = 64.0  # codes a step
+UNREACHED, INVALID = 65534, 65535
+
+Floats = NDArray[np.float64]
+
+
+class Fields(NamedTuple):
+    """Steps to go, stored over the cells that have a free pose.
+
+    cell [ny, nx]: row of `code`, -1 where no pose is free. code [F, cells, H]: SCALE steps to go, UNREACHED,
+    or INVALID for a pose that is in collision or breaks what the field keeps.
+    """
+
+    cell: NDArray[np.int32]
+    code: NDArray[np.uint16]
+    pitch: float
+
+
+@kernel
+def values_at(
+    body: Body, lattice: Lattice, areas: PackedRegions, programs: Programs, signals: Floats
+) -> NDArray[np.float32]:
+    """Each predicate's robustness over the lattice, [P, ny, nx, H]; -inf where the pose is not valid.
+
+    The programs read x, y, theta, the regions, then `signals` (S,).
+    """
+    ny, nx, headings = lattice.valid.shape
+    count, regions = programs.starts.shape[0] - 1, areas.starts.shape[0] - 1
+    out = np.full((count, ny, nx, headings), -np.inf, np.float32)
+    values, stack = np.empty(3 + regions + signals.shape[0]), np.empty(STACK_SIZE)
+    values[3 + regions :] = signals
+    for j in range(ny):
+        for i in range(nx):
+            fresh = True
+            for h in range(headings):
+                if not lattice.valid[j, i, h]:
+                    continue
+                x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
+                values[0], values[1], values[2] = x, y, theta
+                if fresh:
+                    for r in range(regions):
+                        values[3 + r] = region_distance(
+                            r, areas.starts, areas.kinds, areas.offsets, areas.data, x, y
+                        )
+                    fresh = False
+                for p in range(count):
+                    out[p, j, i, h] = evaluate_packed(
+                        p, programs.ops, programs.args, programs.starts, values, stack
+                    )
+    return out
+
+
+def steps_to(lattice: Lattice, goal: NDArray[np.bool_], keeps: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """The field of one goal as codes [ny, nx, H], over the free poses that `keeps` allows."""
+    valid = np.ascontiguousarray(lattice.valid & keeps)
+    latest = np.where(goal & (valid == 1), np.float32(FAR), np.float32(NEVER))
+    sweep(lattice, valid, 0.0, latest)
+    code = np.where(latest >= 0.0, np.ceil(SCALE * (FAR - latest)), UNREACHED).astype(np.uint16)
+    code[valid == 0] = INVALID
+    return code
+
+
+@leaf
+def to_go(fields: Fields, f: int, v: float, u: float, h: float) -> float:
+    """Steps to go at lattice coordinates: linear over the corners that are valid; inf where none is near."""
+    ny, nx = fields.cell.shape
+    headings = fields.code.shape[2]
+    j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
+    q, p, r = v - j, u - i, h - k
+    low, high = k % headings, (k + 1) % headings
+    total, weights = 0.0, 0.0
+    for dj in range(2):
+        wj = q if dj else 1.0 - q
+        if j + dj < 0 or j + dj >= ny or wj == 0.0:
+            continue
+        for di in range(2):
+            wi = wj * (p if di else 1.0 - p)
+            if i + di < 0 or i + di >= nx or wi == 0.0:
+                continue
+            row = fields.cell[j + dj, i + di]
+            if row < 0:
+                continue
+            code = fields.code[f, row, low]
+            if wi * (1.0 - r) >= 1e-9 and code != INVALID:
+                total += wi * (1.0 - r) * (code if code != UNREACHED else SCALE * FAR)
+                weights += wi * (1.0 - r)
+            code = fields.code[f, row, high]
+            if wi * r >= 1e-9 and code != INVALID:
+                total += wi * r * (code if code != UNREACHED else SCALE * FAR)
+                weights += wi * r
+    return total / (SCALE * weights) if weights > 1e-6 else np.inf
+
+
+@leaf
+def to_go_at(body: Body, fields: Fields, f: int, x: float, y: float, theta: float) -> float:
+    """Steps to go from a pose of the map frame."""
+    v, u, h = coordinates(body, fields.pitch, fields.code.shape[2], x, y, theta)
+    return to_go(fields, f, v, u, h)
+
+
+@leaf
+def to_go_after(
+    body: Body, fields: Fields, f: int, x: float, y: float, theta: float, last: int, out: Floats
+) -> None:
+    """Steps to go after each motion (M,), contact left out; inf for what leads straight back after `last`."""
+    headings = fields.code.shape[2]
+    v, u, h = coordinates(body, fields.pitch, headings, x, y, theta)
+    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
+    cos, sin = math.cos(grid_theta) / fields.pitch, math.sin(grid_theta) / fields.pitch
+    moved, turned = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
+    for m in range(out.shape[0]):
+        d, angle = body.translate[m], body.rotate[m]
+        if d * moved < 0.0 or angle * turned < 0.0 or (d == 0.0 and angle == 0.0):
+            out[m] = np.inf
+            continue
+        w = h + angle * headings / (2.0 * math.pi)
+        out[m] = to_go(fields, f, v + d * sin, u + d * cos, w if w >= 0.0 else w + headings)

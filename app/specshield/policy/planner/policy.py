@@ -1,0 +1,338 @@
+"""pi_phi for any formula: no tables of its progress, but a plan at every decision (policy/plan.py).
+
+For each predicate of the formula, and its negation where that is asked for, a field of the steps to go is
+computed once (policy/fields.py). A decision asks the formula what is due (policy/agenda.py), and searches for
+a way that serves it. What it proposes is certified by the shield like anything else; how often it finds a way
+that exists is measured. It covers what reachability does not: reactive rules over signals, patrols (G F),
+until, disjunctions of temporal parts, nested mixes.
+
+A robot that cannot stand still, or cannot turn in place, is planned for too. Of the first motions that some
+future of 7 or 8 steps keeps the rule after, in random rooms with one to three random conjuncts, it certifies
+0.99 for one that moves on arcs and cannot stand, 0.99 or more for one that turns but cannot stand and for one
+that goes to and fro on a line (one that stands and turns: 0.99 or more). Longer horizons are not measured.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_tensors
+
+from specshield.errors import PolicyError
+from specshield.policy.dqn.policy import Card, Proposal, as_one, make_card
+from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
+from specshield.policy.planner.agenda import (
+    Agenda,
+    Bounds,
+    Literal,
+    agenda_of,
+    foresee,
+    is_open,
+    read_signals,
+)
+from specshield.policy.planner.approach import World
+from specshield.policy.planner.fields import FAR, Fields, steps_to, values_at
+from specshield.policy.planner.plans import propose_all
+from specshield.policy.tensors import read_tensors
+from specshield.robot.unicycle import Body, make_body
+from specshield.rule.progress import signal_rows
+from specshield.rule.residual import bounds_after, residuals, still_open
+from specshield.rule.view import look
+from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
+from specshield.stl.program import STACK_SIZE, compile_predicate, pack
+from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL
+from specshield.task import POSE_NAMES, Task
+from specshield.world.regions import pack_regions
+
+MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
+MAX_FIELDS = 32
+USUAL = 150
+BAND = 6.0  # [steps] how far the fields may err; without a turn in place, a lattice has few of the ways
+STARTS = 50  # poses that a new policy is tried from
+
+
+@dataclass(frozen=True)
+class Settings:
+    """pitch: of the lattice [m]. effort: what one plan may cost [about us], a decision 2 to 3 times that.
+
+    Over USUAL steps of horizon it grows with the horizon's square: a way has more legs, and each costs more.
+    """
+
+    pitch: float = 0.1
+    effort: float = 10_000.0
+
+
+def read_settings(options: Mapping[str, Any]) -> Settings:
+    """Settings from JSON. Raises PolicyError with the path of the option at fault."""
+    limits = {"pitch": (0.02, 1.0), "effort": (100.0, 1e7)}
+    for name, value in options.items():
+        if name not in limits:
+            raise PolicyError(
+                f"unknown option {name!r}", path=f"options.{name}", got=name,
+                expected=f"one of {sorted(limits)}",
+            )  # fmt: skip
+        low, high = limits[name]
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise PolicyError(
+                "not in range", path=f"options.{name}", got=value, expected=f"from {low:g} to {high:g}"
+            )
+    return Settings(**{name: float(value) for name, value in options.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class PlannerPolicy:
+    """Plans at every decision.
+
+    chosen [L, 2]: of each literal of the formula, which field leads to it freely, and which keeps to what has
+    to hold for a while; -1 for none.
+    """
+
+    task: Task
+    card: Card
+    settings: Settings
+    fields: Fields
+    chosen: NDArray[np.int32]
+
+    @property
+    def id(self) -> str:
+        return str(self.card["id"])
+
+    @cached_property
+    def _body(self) -> Body:
+        return make_body(self.task.robot, self.task.grid)
+
+    @cached_property
+    def _world(self) -> World:
+        return self._world_of(self.task.formula)
+
+    def _world_of(self, formula: Formula) -> World:
+        """The world as a search sees it for the task's formula, or for what is left of it."""
+        agenda, literals = agenda_of(self.task, formula)
+        _, all_literals = agenda_of(self.task, self.task.formula)
+        index = {(found.predicate, found.side): i for i, found in enumerate(all_literals)}
+        known = [index.get((each.predicate, each.side), -1) for each in literals]
+        field = np.full((len(literals), 2), -1, np.int64)
+        for k, i in enumerate(known):
+            if i >= 0:
+                field[k] = self.chosen[i]
+        pad = _pad_motion(self._body)
+        stands = bool(self._body.translate[pad] == 0.0 and self._body.rotate[pad] == 0.0)
+        turns = bool(np.any((self._body.translate == 0.0) & (self._body.rotate != 0.0)))
+        band = BAND if turns else 2.0 * FAR
+        return World(self._body, self.fields, agenda, field, band, pad, stands, cost_of(agenda), 0.0)
+
+    def propose(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> Proposal:
+        """A plan from x_t, and one after each other first motion."""
+        return self._plan(history, signals, margin)[0]
+
+    def _plan(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> tuple[Proposal, bool]:
+        """The proposal, and whether a plan of it satisfies the formula, or what can still be kept of it."""
+        t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
+        _, high = look(self._world.agenda.rule, history, rows, np.empty(self._world.agenda.rule.tree.size))
+        parts: Iterable[Formula] = (self.task.formula,)
+        if high <= SATISFIED_ABOVE:
+            left = residuals(self.task.formula, self.task.samples(history, signals), t)
+            parts = chain((part for part in left if part.horizon > t), parts)
+        for part in parts:
+            asked = self._asked(part, history, rows, margin) if margin > 0.0 else (part,)
+            worlds = (self._world if each is self.task.formula else self._world_of(each) for each in asked)
+            plans = [self._plan_in(world, history, rows, margin) for world in worlds]
+            found = any(found for _, found in plans)
+            if found:
+                break
+        return as_one([proposal for proposal, _ in plans]), found
+
+    def _asked(
+        self, formula: Formula, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
+    ) -> tuple[Formula, ...]:
+        """What J asks the margin of: the whole trajectory where that can be had, else what is still open."""
+        bounds = [bounds_after(self.task, part, history, rows) for part in conjuncts(formula)]
+        lost = any(SATISFIED_ABOVE < high <= margin for _, high in bounds)
+        if not lost and not any(SATISFIED_ABOVE < low <= margin for low, _ in bounds):
+            return (formula,)
+        left = still_open(self.task, formula, history, rows, 0)
+        return (left,) if lost else (formula, left)
+
+    def _plan_in(
+        self, world: World, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
+    ) -> tuple[Proposal, bool]:
+        t = len(history) - 1
+        known = np.empty(world.agenda.rule.tree.size)
+        look(world.agenda.rule, history, rows, known)
+        motions = np.empty((len(self._body.translate), self.task.horizon - t), np.int64)
+        poses = np.empty((len(motions), motions.shape[1] + 1, 3))
+        effort = self.settings.effort * max(1.0, self.task.horizon / USUAL) ** 2
+        world = world._replace(margin=margin)
+        first, found = propose_all(world, t, history[-1], rows[-1], known, effort, motions, poses)
+        return Proposal(motions, np.ascontiguousarray(poses[:, 1:]), int(first)), bool(found)
+
+    def feasible_start(self, lattice: Lattice) -> float:
+        """The share of poses drawn from the lattice (the same each time) that some plan begins at."""
+        free, random = np.argwhere(lattice.valid == 1), np.random.default_rng(0)
+        if not len(free):
+            return 0.0
+        poses = (
+            pose_of(self._body, lattice.pitch, lattice.headings, *map(float, free[i]))
+            for i in random.integers(len(free), size=STARTS)
+        )
+        return sum(self._plan(np.array([pose]), {}, 0.0)[1] for pose in poses) / STARTS
+
+    def weights(self) -> bytes:
+        """The safetensors file."""
+        return save_tensors({"cell": self.fields.cell, "code": self.fields.code, "chosen": self.chosen})
+
+
+def synthesise(
+    task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
+) -> PlannerPolicy:
+    """Computes the fields. Raises PolicyError for a map too large."""
+    began = time.perf_counter()
+    settings = settings or Settings()
+    check(task, settings)
+    agenda, literals = agenda_of(task, task.formula)
+    lattice = make_lattice(make_body(task.robot, task.grid), settings.pitch)
+    holds, free = _holding(task, lattice, literals), lattice.valid == 1
+    used = free.any(axis=2)
+    codes: dict[tuple[int, tuple[int, ...]], NDArray[np.uint16]] = {}
+    chosen = np.full((len(literals), 2), -1, np.int32)
+    for column, kept in enumerate(_kept(task, agenda, literals)):
+        for k in range(len(literals)):
+            keeps = tuple(g for g in kept if literals[g].predicate != literals[k].predicate)
+            if (k, keeps) not in codes and len(codes) < MAX_FIELDS:
+                allowed = free.copy()
+                for g in keeps:  # the left of an `until` need not hold where the right does
+                    ended = (literals[k].predicate, literals[k].side) in literals[g].ends
+                    allowed &= holds[g] | holds[k] if ended else holds[g]
+                codes[k, keeps] = steps_to(lattice, holds[k], allowed)[used]
+            chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
+    cell = np.full(used.shape, -1, np.int32)
+    cell[used] = np.arange(int(used.sum()))
+    code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
+    fields = Fields(cell, code, settings.pitch)
+    # Trying it also leaves its kernels compiled where a server finds them.
+    feasible = PlannerPolicy(task, {}, settings, fields, chosen).feasible_start(lattice)
+    metrics = {
+        "feasible_start": round(feasible, 4),
+        "fields": len(codes),
+        "size_bytes": int(code.nbytes + cell.nbytes),
+        "wall_time_s": round(time.perf_counter() - began, 3),
+    }
+    card = make_card(task, "planner", asdict(settings), 0, metrics, spec)
+    return PlannerPolicy(task, card, settings, fields, chosen)
+
+
+def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy:
+    """A policy from its two files. Raises PolicyError where they do not fit the task."""
+    settings = read_settings(card.get("options", {}))
+    _, literals = agenda_of(task, task.formula)
+    tensors = read_tensors(weights)
+    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "chosen": (np.int32, 2)}
+    for name, (dtype, rank) in wanted.items():
+        array = tensors.get(name)
+        if array is None or array.dtype != dtype or array.ndim != rank:
+            raise PolicyError(
+                f"the field {name!r} is missing or of another kind", path=f"weights.{name}",
+                got=None if array is None else f"{array.dtype} {list(array.shape)}",
+                expected=f"{dtype.__name__}, rank {rank}",
+            )  # fmt: skip
+    cell, code, chosen = (np.require(tensors[name], requirements=["C", "W"]) for name in wanted)
+    ny, nx, headings = _shape(task, settings)
+    fits = (
+        cell.shape == (ny, nx) and code.shape[2] == headings and chosen.shape == (len(literals), 2)
+        and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
+        and chosen.min(initial=-1) >= -1 and chosen.max(initial=-1) < code.shape[0]
+    )  # fmt: skip
+    if not fits:
+        raise PolicyError(
+            "the fields do not fit the task", path="weights",
+            got=[list(cell.shape), list(code.shape), list(chosen.shape)],
+            expected=f"cell {[ny, nx]}, code [fields, cells, {headings}], chosen [{len(literals)}, 2]",
+        )  # fmt: skip
+    return PlannerPolicy(task, card, settings, Fields(cell, code, settings.pitch), chosen)
+
+
+def check(task: Task, settings: Settings) -> None:
+    """Raises what `synthesise` would for a task it cannot serve, without making anything."""
+    _, literals = agenda_of(task, task.formula)
+    ny, nx, headings = _shape(task, settings)
+    fields = min(2 * len(literals), MAX_FIELDS)
+    if ny * nx * headings * fields > MAX_ENTRIES:
+        raise PolicyError(
+            "the fields are too large", path="options.pitch",
+            got=f"{fields} fields of {ny} x {nx} x {headings} poses",
+            expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer predicates",
+        )  # fmt: skip
+
+
+def _shape(task: Task, settings: Settings) -> tuple[int, int, int]:
+    ny, nx = (
+        max(math.ceil(n * task.grid.resolution / settings.pitch - 1e-9), 1)
+        for n in (task.grid.height, task.grid.width)
+    )
+    return ny, nx, heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
+
+
+def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> NDArray[np.bool_]:
+    """Where each literal holds, [L, ny, nx, H], with the signals at their initial values."""
+    names = [*POSE_NAMES, *task.regions, *task.signals]
+    slots = {name: i for i, name in enumerate(names)}
+    programs = pack([compile_predicate(each.predicate, slots) for each in literals])
+    signals = np.array([task.signals[name] for name in task.signals], np.float64)
+    areas = pack_regions(list(task.regions.values()))
+    values = values_at(make_body(task.robot, task.grid), lattice, areas, programs, signals)
+    sides = np.array([each.side for each in literals]).reshape(-1, 1, 1, 1)
+    holds: NDArray[np.bool_] = (values * sides > SATISFIED_ABOVE) & (lattice.valid == 1)
+    return holds
+
+
+def _kept(task: Task, agenda: Agenda, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
+    """The literals that every way to a goal has to keep, and those that some have to, for a while.
+
+    The first have to hold, whatever else happens, at half of all steps or more.
+    """
+    size = agenda.rule.tree.size
+    bounds = Bounds(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
+    values = np.concatenate([np.zeros(3 + len(task.regions)), list(task.signals.values())])
+    held = np.empty(len(agenda.leaf))
+    read_signals(agenda, values, np.empty(STACK_SIZE), held)
+    foresee(agenda, -1, np.empty(size), held, bounds.low, bounds.high)
+    always = []
+    for k in range(len(literals)):
+        needed = [
+            not is_open(agenda, k, -1, -1, t, t, SATISFIED_ABOVE, bounds) for t in range(task.horizon + 1)
+        ]
+        if 2 * sum(needed) >= len(needed):
+            always.append(k)
+    return always, [k for k in range(len(literals)) if k in always or literals[k].guards]
+
+
+def cost_of(agenda: Agenda) -> float:
+    """What one evaluation of the bounds costs [about us]."""
+    tree = agenda.rule.tree
+    work = 4.0 * tree.size
+    for op, length, a, b in zip(tree.op, tree.length, tree.a, tree.b, strict=True):
+        if op in (ALWAYS, EVENTUALLY):
+            passes = math.log2(b - a + 1) + 1 if length > 1 else b - a + 1
+        else:
+            passes = b + 1 if op == UNTIL else 1
+        work += 2.0 * length * passes
+    return 1e-3 * work
+
+
+def _pad_motion(body: Body) -> int:
+    """The motion that stays where the robot is, or what comes nearest: a turn on the spot, else the first."""
+    travel = np.abs(body.translate) + 1e-3 * np.abs(body.rotate)
+    return int(np.argmin(travel))

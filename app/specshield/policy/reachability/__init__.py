@@ -1,0 +1,1 @@
+"""pi_phi by backward dynamic programming over pose and progress."""

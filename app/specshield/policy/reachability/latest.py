@@ -1,0 +1,260 @@
+"""The latest feasible time: one number a pose and progress from which a formula can still be satisfied.
+
+Where the robot can wait, and as long as no `always` begins or ends, feasibility is monotone in time: what
+can be
+done from time t can be done from any earlier one, by waiting. So time falls into phases, in which the same
+`always` hold, and in each phase, with p the set of settled goals,
+
+    L(s, p) = max( max_a L(f(s, a), p) - 1,   max_J m(s, p, J),   the phase's end if the next one can be
+    entered )
+
+m(s, p, J) is the latest time from which waiting at s settles all of the goals J and leaves L(s, p + J)
+ahead: for
+F[a,b] at most b, with L >= a; for F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, at most c1 + c2 and L -
+n + 1,
+with L >= a + b. Backward dynamic programming, by in-place semi-Lagrangian sweeps (values off the lattice
+bilinear).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel, leaf
+from specshield.policy.lattice import Lattice
+from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
+
+NEVER = -1.0
+SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged
+
+
+def masks_of(rules: Rules, goals: NDArray[np.int64]) -> list[int]:
+    """The sets of settled goals (bit g for goals[g]) that some trajectory can have, the fullest first.
+
+    j cannot be settled before k where j's window begins after k's ends.
+    """
+    possible = []
+    for mask in range(1 << len(goals)):
+        missing = [goals[g] for g in range(len(goals)) if not mask >> g & 1]
+        have = [goals[g] for g in range(len(goals)) if mask >> g & 1]
+        if all(_earliest(rules, j) <= _latest(rules, k) for j in have for k in missing):
+            possible.append(mask)
+    return sorted(possible, key=lambda m: -bin(m).count("1"))
+
+
+def _earliest(rules: Rules, k: int) -> int:
+    return int(rules.a[k] + (rules.b[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0))
+
+
+def _latest(rules: Rules, k: int) -> int:
+    return int(rules.last[k])
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Steps `start` to `end`, in which the same `always` (indices) hold."""
+
+    start: int
+    end: int
+    always: tuple[int, ...]
+
+
+def phases_of(rules: Rules, horizon: int) -> tuple[Phase, ...]:
+    """The phases of [0, horizon], in order."""
+
+    def holding(t: int) -> tuple[int, ...]:
+        return tuple(
+            k for k in np.flatnonzero(rules.kind == ALWAYS).tolist() if rules.a[k] <= t <= rules.b[k]
+        )
+
+    starts = [t for t in range(horizon + 1) if t == 0 or holding(t) != holding(t - 1)]
+    ends = [*(t - 1 for t in starts[1:]), horizon]
+    return tuple(Phase(start, end, holding(start)) for start, end in zip(starts, ends, strict=True))
+
+
+def latest_times(
+    lattice: Lattice,
+    rules: Rules,
+    holds: NDArray[np.uint8],
+    goals: NDArray[np.int64],
+    masks: list[int],
+    phases: tuple[Phase, ...],
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """L for each phase and mask, [phases, masks, ny, nx, H], NEVER where there is no such time in the phase.
+
+    Also where a pose is free and keeps the phase's `always`, [phases, ny, nx, H].
+    """
+    index = {mask: n for n, mask in enumerate(masks)}
+    tables = np.full((len(phases), len(masks), *lattice.valid.shape), NEVER, np.float32)
+    valid = np.stack([lattice.valid & np.all(holds[list(phase.always)], axis=0) for phase in phases])
+    for i in reversed(range(len(phases))):
+        phase = phases[i]
+        for mask in masks:
+            table = tables[i, index[mask]]
+            if i + 1 < len(phases):
+                following = phases[i + 1].start
+                _enter(lattice, valid[i + 1], tables[i + 1, index[mask]], following, table)
+            elif mask == masks[0]:
+                table[:] = phase.end
+            for after in masks:
+                if after & mask == mask and after != mask:
+                    added = np.array([g for n, g in enumerate(goals) if (after ^ mask) >> n & 1])
+                    _settle(rules, holds, added, tables[i, index[after]], float(phase.start), table)
+                    if np.any(rules.kind[added] == EVENTUALLY_ALWAYS):
+                        through = np.ones_like(lattice.valid)
+                        for j in range(i + 1, len(phases)):  # a dwell that goes on in a later phase
+                            through &= valid[j]
+                            later = np.where(through, tables[j, index[after]], np.float32(NEVER))
+                            _settle(rules, holds, added, later, float(phases[j].start), table)
+            table[table > phase.end] = phase.end
+            table[(table < phase.start) | (valid[i] == 0)] = NEVER
+            sweep(lattice, valid[i], float(phase.start), table)
+    return tables, valid
+
+
+@kernel
+def _enter(
+    lattice: Lattice,
+    valid: NDArray[np.uint8],
+    following: NDArray[np.float32],
+    start: int,
+    table: NDArray[np.float32],
+) -> None:
+    """The last step before the next phase's `start`, where some motion leads to a pose feasible at it."""
+    ny, nx, headings = table.shape
+    for j in range(ny):
+        for i in range(nx):
+            for h in range(headings):
+                best = following[j, i, h] if valid[j, i, h] else np.float32(NEVER)
+                for d in range(lattice.far_u.shape[3]):
+                    u = lattice.far_u[j, i, h, d]
+                    if u != np.float32(-1.0):
+                        v, w = lattice.far_v[j, i, h, d], lattice.far_h[j, i, h, d]
+                        best = max(best, np.float32(bilinear(valid, following, v, u, w)))
+                for r in range(lattice.shift.shape[0]):
+                    w = (h + lattice.shift[r]) % headings
+                    if lattice.turns[j, i, h, r] and valid[j, i, w]:
+                        best = max(best, following[j, i, w])
+                if best >= start:
+                    table[j, i, h] = start - 1
+
+
+@kernel
+def _settle(
+    rules: Rules,
+    holds: NDArray[np.uint8],
+    added: NDArray[np.int64],
+    ahead: NDArray[np.float32],
+    start: float,
+    table: NDArray[np.float32],
+) -> None:
+    """m(s, p, J) into `table` where it is later. added: J; ahead: L(., p + J) from step `start` on."""
+    for j in range(table.shape[0]):
+        for i in range(table.shape[1]):
+            for h in range(table.shape[2]):
+                left = ahead[j, i, h]
+                latest = left
+                for k in added:
+                    if not holds[k, j, i, h]:
+                        latest = np.float32(NEVER)
+                        break
+                    if rules.kind[k] == EVENTUALLY_ALWAYS:
+                        dwell = rules.b[k] - rules.c2[k] + 1
+                        if left < max(start, rules.a[k] + rules.b[k]):
+                            latest = np.float32(NEVER)
+                            break
+                        latest = min(
+                            latest, np.float32(rules.c1[k] + rules.c2[k]), np.float32(left - dwell + 1)
+                        )
+                    else:
+                        if left < max(start, rules.a[k]) or start > rules.b[k]:
+                            latest = np.float32(NEVER)
+                            break
+                        latest = min(latest, np.float32(rules.b[k]))
+                table[j, i, h] = max(table[j, i, h], latest)
+
+
+@leaf
+def bilinear(valid: NDArray[np.uint8], table: NDArray[np.float32], v: float, u: float, h: int) -> float:
+    """The table at lattice coordinates, over the corners whose pose is valid; NEVER where none is."""
+    ny, nx = table.shape[0], table.shape[1]
+    j, i = int(np.floor(v)), int(np.floor(u))
+    q, p = v - j, u - i
+    total, weights = 0.0, 0.0
+    for dj in range(2):
+        jj = j + dj
+        wj = q if dj else 1.0 - q
+        if jj < 0 or jj >= ny or wj == 0.0:
+            continue
+        for di in range(2):
+            ii = i + di
+            w = wj * (p if di else 1.0 - p)
+            if ii < 0 or ii >= nx or w == 0.0 or not valid[jj, ii, h]:
+                continue
+            total += w * table[jj, ii, h]
+            weights += w
+    return total / weights if weights > 1e-6 else NEVER
+
+
+@kernel
+def sweep(lattice: Lattice, valid: NDArray[np.uint8], start: float, table: NDArray[np.float32]) -> None:
+    """Relaxes max_a L(f(s, a)) - 1 in place to its fixed point, visiting only cells near what changed.
+
+    start: the phase's first step, before which there is no time.
+    """
+    ny, nx, headings = table.shape
+    reach = lattice.reach
+    active = np.zeros((ny, nx), np.uint8)
+    for j in range(ny):
+        for i in range(nx):
+            for h in range(headings):
+                if table[j, i, h] >= 0.0:
+                    active[max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1] = 1
+                    break
+    for sweep in range(100_000):
+        changed = False
+        for jj in range(ny):
+            j = jj if sweep & 1 else ny - 1 - jj
+            for ii in range(nx):
+                i = ii if sweep & 2 else nx - 1 - ii
+                if not active[j, i]:
+                    continue
+                active[j, i] = 0
+                gained = False
+                for h in range(headings):
+                    if not valid[j, i, h]:
+                        continue
+                    best = table[j, i, h]
+                    for d in range(lattice.far_u.shape[3]):
+                        u = lattice.far_u[j, i, h, d]
+                        if u != np.float32(-1.0):
+                            found = (
+                                bilinear(
+                                    valid, table, lattice.far_v[j, i, h, d], u, lattice.far_h[j, i, h, d]
+                                )
+                                - 1.0
+                            )
+                            best = max(best, np.float32(found))
+                    if best > table[j, i, h] + SETTLED_CHANGE and best >= start:
+                        table[j, i, h] = best
+                        gained = True
+                turned = True
+                while turned:
+                    turned = False
+                    for h in range(headings):
+                        if not valid[j, i, h]:
+                            continue
+                        for r in range(lattice.shift.shape[0]):
+                            if lattice.turns[j, i, h, r]:
+                                found = table[j, i, (h + lattice.shift[r]) % headings] - np.float32(1.0)
+                                if found > table[j, i, h] + SETTLED_CHANGE and found >= start:
+                                    table[j, i, h] = found
+                                    turned = gained = True
+                if gained:
+                    changed = True
+                    active[max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1] = 1
+        if not changed:
+            return

@@ -1,0 +1,282 @@
+"""pi_phi by backward dynamic programming over pose and progress: made in a second, without learning."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_tensors
+
+from specshield.errors import PolicyError
+from specshield.policy.dqn.policy import Card, Proposal, as_one, make_card, wait_motion
+from specshield.policy.lattice import heading_count, holds_at, make_lattice
+from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
+from specshield.policy.reachability.search import propose_all
+from specshield.policy.reachability.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
+from specshield.policy.reachability.tables import INVALID, SCALE, Tables
+from specshield.policy.reachability.work import Guide
+from specshield.policy.tensors import read_tensors
+from specshield.robot.unicycle import Body, make_body
+from specshield.rule.progress import (
+    ALWAYS,
+    Rules,
+    make_rules,
+    pasts,
+    signal_rows,
+)
+from specshield.task import Task
+
+MAX_ENTRIES = 100_000_000  # 400 MB while the tables are made
+FINE_ENTRIES = 1_000_000  # a lattice three times finer that needs no more is used instead
+
+
+@dataclass(frozen=True)
+class Settings:
+    """pitch: of the lattice [m], a third of it where the map is small. beam: how many poses the search near a
+    deadline keeps for each motion.
+    """
+
+    pitch: float = 0.1
+    beam: int = 12
+
+
+def read_settings(options: Mapping[str, Any]) -> Settings:
+    """Settings from JSON. Raises PolicyError with the path of the option at fault."""
+    limits = {"pitch": (0.02, 1.0), "beam": (1, 256)}
+    for name, value in options.items():
+        if name not in limits:
+            raise PolicyError(
+                f"unknown option {name!r}",
+                path=f"options.{name}",
+                got=name,
+                expected=f"one of {sorted(limits)}",
+            )
+        low, high = limits[name]
+        whole = name == "beam"
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int if whole else (int, float))
+            or not low <= value <= high
+        ):
+            raise PolicyError(
+                "not in range", path=f"options.{name}", got=value,
+                expected=f"a {'whole ' if whole else ''}number from {low:g} to {high:g}",
+            )  # fmt: skip
+    return Settings(**options)
+
+
+@dataclass(frozen=True, eq=False)
+class ReachabilityPolicy:
+    """Follows the tables of latest feasible times (policy/tables.py, policy/search.py)."""
+
+    task: Task
+    card: Card
+    settings: Settings
+    tables: Tables
+
+    @property
+    def id(self) -> str:
+        return str(self.card["id"])
+
+    @cached_property
+    def _prepared(self) -> tuple[Body, Rules]:
+        return make_body(self.task.robot, self.task.grid), make_rules(self.task)
+
+    def propose(
+        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
+    ) -> Proposal:
+        """A continuation after each first motion: greedy, or by a beam near a deadline."""
+        body, rules = self._prepared
+        rules = rules._replace(signals=rules.signals.copy(), margin=margin)
+        rows = signal_rows(self.task, signals, len(history))
+        guide = Guide(body, rules, self.tables, wait_motion(self.task.robot))
+        proposals = []
+        for past in pasts(rules, history, rows):
+            motions = np.empty((len(body.translate), self.task.horizon + 1 - len(history)), np.int64)
+            poses = np.empty((*motions.shape, 3))
+            preferred = propose_all(guide, self.settings.beam, past, history, rows, motions, poses)
+            proposals.append(Proposal(motions, poses, int(preferred)))
+        return as_one(proposals)
+
+    def weights(self) -> bytes:
+        """The safetensors file."""
+        names = ("cell", "bits") if len(self.tables.bits) else ("cell", "code", "table")
+        return save_tensors({name: getattr(self.tables, name) for name in names})
+
+
+def synthesise(
+    task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
+) -> ReachabilityPolicy:
+    """Makes the tables. Raises FragmentError for a formula that they do not cover, PolicyError for a
+    map too large.
+    """
+    began = time.perf_counter()
+    settings = settings or Settings()
+    body, rules = make_body(task.robot, task.grid), make_rules(task)
+    goals, pitch = _goals(task, rules, settings)
+    lattice = make_lattice(body, pitch)
+    holds = holds_at(body, rules, lattice)
+    if wait_motion(task.robot) < 0:
+        used = np.any(lattice.valid, axis=2)
+        bits, feasible = feasible_steps(lattice, rules, holds, task.horizon, used)
+        tables = _step_tables(rules, task.horizon, _numbered(used), bits, pitch)
+        size = tables.bits.nbytes + tables.cell.nbytes
+    else:
+        masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
+        latest, valid = latest_times(lattice, rules, holds, goals, masks, phases)
+        tables = _pack(latest, valid, masks, phases, goals, rules, pitch)
+        start = latest[0, masks.index(0)][valid[0] == 1]
+        feasible = float((start >= 0.0).mean()) if len(start) else 0.0
+        size = tables.code.nbytes + tables.cell.nbytes
+    metrics = {
+        "feasible_start": round(feasible, 4),
+        "size_bytes": int(size),
+        "wall_time_s": round(time.perf_counter() - began, 3),
+    }
+    card = make_card(task, "reachability", asdict(settings), 0, metrics, spec)
+    return ReachabilityPolicy(task, card, settings, tables)
+
+
+def load_reachability(weights: bytes | Path, card: Card, task: Task) -> ReachabilityPolicy:
+    """A policy from its two files. Raises PolicyError where they do not fit the task."""
+    settings = read_settings(card.get("options", {}))
+    rules = make_rules(task)
+    goals, pitch = _goals(task, rules, settings)
+    tensors, (shape, headings) = read_tensors(weights), _shape(task, pitch)
+    if wait_motion(task.robot) < 0:
+        cell, bits = _read(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
+        size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
+        _check_fit(cell, shape, bits.shape[1], bits.shape == size, f"bits {list(size)}")
+        return ReachabilityPolicy(task, card, settings, _step_tables(rules, task.horizon, cell, bits, pitch))
+    cell, code, table = _read(
+        tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
+    )
+    phases = phases_of(rules, task.horizon)
+    fits = (
+        code.shape[2] == headings and table.shape == (len(phases), 1 << len(goals))
+        and table.min() >= -1 and table.max() < code.shape[0]
+    )  # fmt: skip
+    wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {1 << len(goals)}]"
+    _check_fit(cell, shape, code.shape[1], fits, wanted)
+    return ReachabilityPolicy(
+        task, card, settings, _time_tables(rules, goals, phases, cell, code, table, pitch)
+    )
+
+
+def _read(tensors: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[type, int]]) -> list[NDArray[Any]]:
+    for name, (dtype, rank) in wanted.items():
+        array = tensors.get(name)
+        if array is None or array.dtype != dtype or array.ndim != rank:
+            raise PolicyError(
+                f"the table {name!r} is missing or of another kind", path=f"weights.{name}",
+                got=None if array is None else f"{array.dtype} {list(array.shape)}",
+                expected=f"{dtype.__name__}, rank {rank}",
+            )  # fmt: skip
+    return [np.ascontiguousarray(tensors[name]) for name in wanted]
+
+
+def _check_fit(cell: NDArray[np.int32], shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
+    if not fits or cell.shape != shape or cell.min(initial=-1) < -1 or cell.max(initial=-1) >= rows:
+        raise PolicyError(
+            "the tables do not fit the task", path="weights",
+            got=f"cell {list(cell.shape)} and tables of {rows} cells",
+            expected=f"cell {list(shape)}, {wanted}",
+        )  # fmt: skip
+
+
+def check(task: Task, settings: Settings) -> None:
+    """Raises what `synthesise` would for a task it cannot serve, without making anything."""
+    _goals(task, make_rules(task), settings)
+
+
+def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[NDArray[np.int64], float]:
+    """The obligations that are not `always`, and the lattice's pitch, where the tables cover the task."""
+    goals = np.flatnonzero(rules.kind != ALWAYS)
+    if wait_motion(task.robot) < 0:
+        entries, unit = (task.horizon + 1) * -(-state_count(rules) // 8), "bytes"
+        limits = FINE_ENTRIES, MAX_BYTES
+    else:
+        entries = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
+        limits, unit = (FINE_ENTRIES, MAX_ENTRIES), "entries"
+    for pitch, limit in zip((settings.pitch / 3.0, settings.pitch), limits, strict=True):
+        (ny, nx), headings = _shape(task, pitch)
+        if ny * nx * headings * entries <= limit:
+            return goals, pitch
+    raise PolicyError(
+        "the tables are too large", path="options.pitch",
+        got=f"{entries} {unit} for each of {ny} x {nx} x {headings} poses",
+        expected=f"at most {limit} {unit}: a larger pitch, or fewer windows that overlap",
+    )  # fmt: skip
+
+
+def _shape(task: Task, pitch: float) -> tuple[tuple[int, int], int]:
+    ny, nx = (
+        max(int(np.ceil(n * task.grid.resolution / pitch - 1e-9)), 1)
+        for n in (task.grid.height, task.grid.width)
+    )
+    return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
+
+
+def _numbered(used: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Rows of the cells that are used, -1 elsewhere."""
+    cell = np.full(used.shape, -1, np.int32)
+    cell[used] = np.arange(int(used.sum()))
+    return cell
+
+
+def _pack(
+    latest: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+    masks: list[int],
+    phases: tuple[Phase, ...],
+    goals: NDArray[np.int64],
+    rules: Rules,
+    pitch: float,
+) -> Tables:
+    used = np.any(valid, axis=(0, 3))
+    table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
+    codes: list[NDArray[np.uint16]] = []
+    for i in range(len(phases)):
+        for n, mask in enumerate(masks):
+            values = latest[i, n][used]
+            settled = mask == masks[0] and i == len(phases) - 1  # nothing left to do
+            if settled or not np.any(values >= 0.0):
+                continue
+            code = np.where(values >= 0.0, 1.0 + np.floor(SCALE * values), 0.0).astype(np.uint16)
+            code[valid[i][used] == 0] = INVALID
+            table[i, mask] = len(codes)
+            codes.append(code)
+    code = np.array(codes, np.uint16).reshape(len(codes), int(used.sum()), valid.shape[3])
+    return _time_tables(rules, goals, phases, _numbered(used), code, table, pitch)
+
+
+def _time_tables(
+    rules: Rules,
+    goals: NDArray[np.int64],
+    phases: tuple[Phase, ...],
+    cell: NDArray[np.int32],
+    code: NDArray[np.uint16],
+    table: NDArray[np.int32],
+    pitch: float,
+) -> Tables:
+    bit = np.zeros(len(rules.kind), np.int64)
+    bit[goals] = 1 << np.arange(len(goals))
+    ends = np.array([phase.end for phase in phases], np.int32)
+    phase = np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32)
+    none = np.empty((0, 0, 0, 0), np.uint8)
+    return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch)
+
+
+def _step_tables(
+    rules: Rules, horizon: int, cell: NDArray[np.int32], bits: NDArray[np.uint8], pitch: float
+) -> Tables:
+    code = np.empty((0, *bits.shape[1:3]), np.uint16)
+    phase, end = np.zeros(horizon + 1, np.int32), np.array([horizon], np.int32)
+    bit = np.zeros(len(rules.kind), np.int64)
+    return Tables(cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch)

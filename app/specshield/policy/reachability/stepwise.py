@@ -1,0 +1,224 @@
+"""Feasibility step by step, for a robot that cannot wait.
+
+Then what can be done from time t need not be possible from an earlier one, and no single latest time says it
+all. With p the progress, which counts a dwell's steps too, backward over exact steps:
+
+    B(T, s, p) = every goal is settled in p
+    B(t, s, p) = for some motion a, with s' = f(s, a) valid at t + 1:  B(t + 1, s', p after s')
+
+valid: free, and the `always` of the step hold. B is a bit; between the lattice's crossings it is interpolated
+over the valid ones and rounded. A move that contact does not permit may be how such a robot stands still.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel, leaf
+from specshield.policy.lattice import Lattice
+from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
+
+MAX_BYTES = 100_000_000  # of the tables
+BROKEN_STATE = -1
+
+
+def digits_of(rules: Rules) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The progress as one number, sum_k stride_k digit_k: stride and dwell [K].
+
+    An F's digit is 1 once settled. A dwell of n steps counts 0 to n, n + 1 once settled. An `always` has
+    stride 0.
+    """
+    dwell = np.where(rules.kind == EVENTUALLY_ALWAYS, rules.b - rules.c2 + 1, 0)
+    values = np.where(rules.kind == ALWAYS, 1, dwell + 2)
+    stride = np.concatenate([np.ones(1, np.int64), np.cumprod(values)[:-1]])
+    return np.where(rules.kind == ALWAYS, 0, stride), dwell
+
+
+def state_count(rules: Rules) -> int:
+    """How many values the progress can have."""
+    count = 1
+    for kind, b, c2 in zip(rules.kind.tolist(), rules.b.tolist(), rules.c2.tolist(), strict=True):
+        count *= 1 if kind == ALWAYS else b - c2 + 3 if kind == EVENTUALLY_ALWAYS else 2
+    return count
+
+
+def transitions(rules: Rules, t: int, holds: int) -> NDArray[np.int64]:
+    """The progress after step t for each before it, BROKEN_STATE where that breaks the formula.
+
+    holds: bit k says whether obligation k's predicate does.
+    """
+    stride, dwell = digits_of(rules)
+    before = np.arange(state_count(rules))
+    after = np.zeros_like(before)
+    broken = np.zeros(len(before), bool)
+    for k in np.flatnonzero(rules.kind != ALWAYS):
+        true, full = bool(holds >> int(k) & 1), int(dwell[k])
+        digit = before // stride[k] % (full + 2)
+        settled = digit == full + 1
+        if rules.kind[k] == EVENTUALLY_ALWAYS:
+            counts = true and t >= rules.a[k] + rules.c2[k]
+            run = np.minimum(digit + 1, full) if counts else np.zeros_like(digit)
+            done = (run >= full) & (t >= rules.a[k] + rules.b[k])
+            late = ~done & (t + 1 - run > rules.c1[k] + rules.c2[k])
+            new = np.where(done, full + 1, run)
+        else:
+            done = np.full(len(before), true and bool(rules.a[k] <= t <= rules.b[k]))
+            late = ~done & (t >= rules.b[k])
+            new = done.astype(np.int64)
+        after += stride[k] * np.where(settled, full + 1, new)
+        broken |= ~settled & late
+    return np.where(broken, BROKEN_STATE, after)
+
+
+def feasible_steps(
+    lattice: Lattice, rules: Rules, holds: NDArray[np.uint8], horizon: int, used: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], float]:
+    """B as bits, uint8 [T + 1, cells, H, ceil(P / 8)], and the share of valid poses feasible at t = 0.
+
+    holds [K, ny, nx, H]; used [ny, nx]: the cells that have a row.
+    """
+    states = state_count(rules)
+    row = np.full(used.shape, -1, np.int32)
+    row[used] = np.arange(int(used.sum()))
+    pattern = np.zeros(lattice.valid.shape, np.int64)
+    for k in range(len(rules.kind)):
+        pattern |= holds[k].astype(np.int64) << k
+    patterns, of = np.unique(pattern[used], return_inverse=True)
+    of = of.reshape(-1, lattice.headings)
+    always = sum(1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS))
+    bits = np.zeros((horizon + 1, len(of), lattice.headings, -(-states // 8)), np.uint8)
+    valid = lattice.valid[used]
+    bits[horizon, :, :, (states - 1) >> 3] = np.where(valid, 1 << ((states - 1) & 7), 0)
+    start = 0.0
+    for t in range(horizon, -1, -1):
+        asked = sum(
+            1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS) if rules.a[k] <= t <= rules.b[k]
+        )
+        after = np.array([transitions(rules, t, int(p)) for p in patterns], np.int64).reshape(-1, states)
+        after[(patterns & asked & always) != asked] = BROKEN_STATE
+        before = np.zeros_like(bits[t])
+        _before(bits[t], valid, of, after, before)
+        if t > 0:
+            _step_back(lattice, valid, row, before, bits[t - 1])
+        elif valid.any():
+            start = float((before[..., 0] & 1)[valid == 1].mean())
+    return bits, start
+
+
+@kernel
+def _before(
+    bits: NDArray[np.uint8],
+    valid: NDArray[np.uint8],
+    pattern: NDArray[np.int64],
+    after: NDArray[np.int64],
+    out: NDArray[np.uint8],
+) -> None:
+    """From the progress that includes a step's pose to the one before it: out[p] = bits[after[p]]."""
+    states = after.shape[1]
+    for c in range(bits.shape[0]):
+        for h in range(bits.shape[1]):
+            if not valid[c, h]:
+                continue
+            some = False
+            for b in range(bits.shape[2]):
+                some = some or bits[c, h, b] != 0
+            if not some:
+                continue
+            for p in range(states):
+                to = after[pattern[c, h], p]
+                if to >= 0 and bits[c, h, to >> 3] >> (to & 7) & 1:
+                    out[c, h, p >> 3] |= 1 << (p & 7)
+
+
+@kernel
+def _step_back(
+    lattice: Lattice,
+    valid: NDArray[np.uint8],
+    row: NDArray[np.int32],
+    following: NDArray[np.uint8],
+    out: NDArray[np.uint8],
+) -> None:
+    """out(s) = the union over motions of `following` where they lead."""
+    ny, nx = row.shape
+    headings, size = following.shape[1], following.shape[2]
+    at, weight = np.empty(4, np.int64), np.empty(4)
+    for j in range(ny):
+        for i in range(nx):
+            c = row[j, i]
+            if c < 0:
+                continue
+            for h in range(headings):
+                if not valid[c, h]:
+                    continue
+                for r in range(lattice.shift.shape[0]):
+                    w = (h + lattice.shift[r]) % headings if lattice.turns[j, i, h, r] else h
+                    for b in range(size):
+                        out[c, h, b] |= following[c, w, b]
+                for d in range(lattice.far_u.shape[3]):
+                    u, v = lattice.far_u[j, i, h, d], lattice.far_v[j, i, h, d]
+                    if u == np.float32(-1.0):  # contact: it stays
+                        for b in range(size):
+                            out[c, h, b] |= following[c, h, b]
+                        continue
+                    w = int(lattice.far_h[j, i, h, d])
+                    n = _corners(row, valid, v, u, w, at, weight)
+                    for b in range(size):
+                        out[c, h, b] |= _majority(following, at, weight, n, w, b)
+
+
+@leaf
+def _corners(
+    row: NDArray[np.int32],
+    valid: NDArray[np.uint8],
+    v: float,
+    u: float,
+    h: int,
+    at: NDArray[np.int64],
+    weight: NDArray[np.float64],
+) -> int:
+    """The rows of the valid corners about a place of the lattice, with weights that sum to 1; how many."""
+    j, i = int(np.floor(v)), int(np.floor(u))
+    q, p = v - j, u - i
+    n, total = 0, 0.0
+    for corner in range(4):
+        dj, di = corner >> 1, corner & 1
+        w = (q if dj else 1.0 - q) * (p if di else 1.0 - p)
+        if j + dj < 0 or j + dj >= row.shape[0] or i + di < 0 or i + di >= row.shape[1] or w < 1e-6:
+            continue
+        c = row[j + dj, i + di]
+        if c >= 0 and valid[c, h]:
+            at[n], weight[n] = c, w
+            total += w
+            n += 1
+    for k in range(n):
+        weight[k] /= total
+    return n
+
+
+@leaf
+def _majority(
+    bits: NDArray[np.uint8],
+    at: NDArray[np.int64],
+    weight: NDArray[np.float64],
+    n: int,
+    h: int,
+    b: int,
+) -> int:
+    """The bits that corners of more than half of the weight have."""
+    common, some = 255, 0
+    for k in range(n):
+        common &= bits[at[k], h, b]
+        some |= bits[at[k], h, b]
+    if n == 0 or common == some:
+        return some
+    result = 0
+    for bit in range(8):
+        if some >> bit & 1:
+            share = 0.0
+            for k in range(n):
+                if bits[at[k], h, b] >> bit & 1:
+                    share += weight[k]
+            if share > 0.5:
+                result |= 1 << bit
+    return result

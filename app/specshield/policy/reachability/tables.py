@@ -1,0 +1,249 @@
+"""The tables as decisions read them: the slack of a pose, and where it grows."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import inlined, leaf
+from specshield.policy.lattice import coordinates
+from specshield.robot.unicycle import Body
+from specshield.rule.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
+
+SCALE = 64.0  # table codes a step
+INVALID = 65535  # code of a pose that is in collision or breaks an `always` of the phase
+HOPELESS = -1e9
+SAFE = 1e6
+
+
+class Tables(NamedTuple):
+    """Latest feasible times, or feasibility step by step (policy/stepwise.py), over the cells that have a
+    valid pose.
+
+    cell [ny, nx]: row of `code`, -1 where no pose is valid. code [P, cells, H]: INVALID, 0 for never, else
+    1 + SCALE * L. table [phases, 2^G]: which table a set of settled goals has in a phase, -1 if it has none.
+    phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
+    settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: step by step; bits has
+    no steps where the tables are latest times.
+    """
+
+    cell: NDArray[np.int32]
+    code: NDArray[np.uint16]
+    table: NDArray[np.int32]
+    phase: NDArray[np.int32]
+    end: NDArray[np.int32]
+    bit: NDArray[np.int64]
+    bits: NDArray[np.uint8]
+    stride: NDArray[np.int64]
+    dwell: NDArray[np.int64]
+    pitch: float
+
+
+@inlined
+def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float:
+    """L at lattice coordinates: linear in x, y and heading over the corners that are valid; HOPELESS where
+    none is.
+    """
+    ny, nx = tables.cell.shape
+    headings = tables.code.shape[2]
+    j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
+    q, p, f = v - j, u - i, h - k
+    low, high = k % headings, (k + 1) % headings
+    total, weights = 0.0, 0.0
+    for dj in range(2):
+        wj = q if dj else 1.0 - q
+        if j + dj < 0 or j + dj >= ny or wj == 0.0:
+            continue
+        for di in range(2):
+            wi = wj * (p if di else 1.0 - p)
+            if i + di < 0 or i + di >= nx or wi == 0.0:
+                continue
+            row = tables.cell[j + dj, i + di]
+            if row < 0:
+                continue
+            w = wi * (1.0 - f)
+            code = tables.code[table, row, low]
+            if w >= 1e-9 and code != INVALID:
+                total += w * (code - 1.0)
+                weights += w
+            w = wi * f
+            code = tables.code[table, row, high]
+            if w >= 1e-9 and code != INVALID:
+                total += w * (code - 1.0)
+                weights += w
+    return total / (SCALE * weights) if weights > 1e-6 else HOPELESS
+
+
+@leaf
+def slack(
+    body: Body,
+    rules: Rules,
+    tables: Tables,
+    x: float,
+    y: float,
+    theta: float,
+    t: int,
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+) -> float:
+    """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something
+    is broken.
+    """
+    if tables.bits.shape[0] > 0:
+        return _steps_ahead(body, rules, tables, x, y, theta, t, status, run)
+    mask, every = 0, 0
+    for k in range(status.shape[0]):
+        if status[k] == BROKEN:
+            return HOPELESS
+        every |= tables.bit[k]
+        if status[k] == SETTLED:
+            mask |= tables.bit[k]
+    if mask == every and tables.phase[t] == len(tables.end) - 1:
+        return SAFE
+    v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
+    best = HOPELESS
+    table = tables.table[tables.phase[t], mask]
+    if table >= 0:
+        best = latest_at(tables, table, v, u, h) - t
+    for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
+        if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
+            over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
+            if over < tables.phase.shape[0]:
+                best = max(best, _after_dwell(tables, mask | tables.bit[k], every, over, v, u, h))
+    return best
+
+
+@leaf
+def _steps_ahead(
+    body: Body,
+    rules: Rules,
+    tables: Tables,
+    x: float,
+    y: float,
+    theta: float,
+    t: int,
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+) -> float:
+    """How feasible a pose is, step by step: from 0 to 1 now, and as much for each of some delays [steps]
+    that it would stand. SAFE once nothing is pending, HOPELESS where it is not feasible at all.
+    """
+    progress, pending = 0, False
+    for k in range(status.shape[0]):
+        if status[k] == BROKEN:
+            return HOPELESS
+        pending = pending or status[k] == PENDING
+        if rules.kind[k] != ALWAYS:
+            digit = min(run[k], tables.dwell[k]) if status[k] == PENDING else tables.dwell[k] + 1
+            progress += tables.stride[k] * digit
+    if not pending:
+        return SAFE
+    v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
+    ahead = 0.0
+    for delay in (0, 1, 2, 4, 8):
+        if t + delay >= tables.bits.shape[0]:
+            break
+        ahead += _feasible_at(tables, t + delay, progress, v, u, h)
+        if ahead == 0.0:
+            return HOPELESS
+    return ahead
+
+
+@leaf
+def _feasible_at(tables: Tables, t: int, progress: int, v: float, u: float, h: float) -> float:
+    """The share of the lattice's corners, by weight, from which the formula can be satisfied at step t."""
+    ny, nx = tables.cell.shape
+    headings = tables.bits.shape[2]
+    j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
+    share = 0.0
+    for corner in range(8):
+        dj, di, dk = corner >> 2, corner >> 1 & 1, corner & 1
+        if j + dj < 0 or j + dj >= ny or i + di < 0 or i + di >= nx or tables.cell[j + dj, i + di] < 0:
+            continue
+        bits = tables.bits[t, tables.cell[j + dj, i + di], (k + dk) % headings, progress >> 3]
+        if bits >> (progress & 7) & 1:
+            w = (v - j if dj else 1.0 - v + j) * (u - i if di else 1.0 - u + i)
+            share += w * (h - k if dk else 1.0 - h + k)
+    return share
+
+
+@inlined
+def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: float, h: float) -> float:
+    """The slack once a dwell is over, at step t and where it was begun."""
+    if mask == every and tables.phase[t] == len(tables.end) - 1:
+        return float(tables.end[-1] - t)
+    table = tables.table[tables.phase[t], mask]
+    return latest_at(tables, table, v, u, h) - t if table >= 0 else HOPELESS
+
+
+@inlined
+def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
+    for k in range(status.shape[0]):
+        if status[k] == BROKEN or (rules.kind[k] != ALWAYS and status[k] == PENDING):
+            return False
+    return True
+
+
+@inlined
+def is_broken(status: NDArray[np.int8]) -> bool:
+    broken = False
+    for k in range(status.shape[0]):
+        broken = broken or status[k] == BROKEN
+    return broken
+
+
+@inlined
+def score(
+    body: Body,
+    rules: Rules,
+    tables: Tables,
+    x: float,
+    y: float,
+    theta: float,
+    t: int,
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+    wait: int,
+    last: int,
+    scores: NDArray[np.float64],
+) -> None:
+    """L after each motion (M,) from x_t, contact and the step's own progress left out: a cheap order to try
+    motions in.
+
+    last: the motion before, -1 for none. HOPELESS for what leads straight back: the tables err by a little.
+    """
+    if tables.bits.shape[0] > 0:
+        scores[:] = SAFE
+        return
+    mask, every = 0, 0
+    for k in range(status.shape[0]):
+        every |= tables.bit[k]
+        if status[k] == SETTLED:
+            mask |= tables.bit[k]
+    if mask == every and tables.phase[t + 1] == len(tables.end) - 1:
+        scores[:] = SAFE
+        return
+    table = tables.table[tables.phase[t + 1], mask]
+    headings = tables.code.shape[2]
+    v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
+    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
+    cos, sin = math.cos(grid_theta) / tables.pitch, math.sin(grid_theta) / tables.pitch
+    before, turn = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
+    for m in range(scores.shape[0]):
+        d = body.translate[m]
+        if table < 0 or d * before < 0.0 or body.rotate[m] * turn < 0.0:
+            scores[m] = HOPELESS
+            continue
+        w = h + body.rotate[m] * headings / (2.0 * math.pi)
+        if w < 0.0:
+            w += headings
+        scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w)
+    for k in range(status.shape[0]):
+        if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
+            over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
+            if over < tables.phase.shape[0]:
+                spare = _after_dwell(tables, mask | tables.bit[k], every, over, v, u, h)
+                scores[wait] = max(scores[wait], spare + t + 1.0)

@@ -1,0 +1,81 @@
+"""What is left of a formula after a prefix: what is still open, and what can be kept of it once violated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.rule.view import look, view_of
+from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts, robustness_bounds
+from specshield.task import Task
+
+
+def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int) -> Iterator[Formula]:
+    """What is left to keep after a prefix that violates, the most demanding first.
+
+    prefix {name: [t + 1]}. The broken conjuncts are dropped, a broken G is enforced again from t + 1; and
+    where even that cannot be (the robot is still inside), without those. Nothing is yielded where no conjunct
+    is left.
+    """
+    kept, broken = left_over(formula, prefix, t)
+    if broken:
+        yield joined([*kept, *again(broken, t + 1)])
+    if kept:
+        yield joined(kept)
+
+
+def left_over(
+    formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int
+) -> tuple[list[Formula], list[Always]]:
+    """The conjuncts that can still be kept, and the broken G whose windows are not over."""
+    kept: list[Formula] = []
+    broken: list[Always] = []
+    for conjunct in conjuncts(formula):
+        _, high = robustness_bounds(conjunct, {name: prefix[name] for name in conjunct.names})
+        if high > SATISFIED_ABOVE:
+            kept.append(conjunct)
+        elif isinstance(conjunct, Always) and conjunct.b > t:
+            broken.append(conjunct)
+    return kept, broken
+
+
+def again(broken: Sequence[Always], t: int) -> list[Formula]:
+    """The broken G whose windows are not over by step t, enforced from then on."""
+    return [Always(max(each.a, t), each.b, each.child) for each in broken if each.b >= t]
+
+
+def still_open(
+    task: Task, formula: Formula, poses: NDArray[np.float64], rows: NDArray[np.float64], slack: int
+) -> Formula:
+    """What of the formula x_{0:t} leaves open: a G from where its child is, an F `slack` steps early.
+
+    poses [t + 1, 3], rows [t + 1, S]: the signals. A window keeps at least half its length. With nothing
+    open, the formula itself.
+    """
+    t, kept = len(poses) - 1, list[Formula]()
+    for conjunct in conjuncts(formula):
+        if bounds_after(task, conjunct, poses, rows)[0] > SATISFIED_ABOVE:
+            continue
+        match conjunct:
+            case Always(a, b, child):
+                kept.append(Always(max(a, min(t + 1 - child.horizon, b)), b, child))
+            case Eventually(a, b, child):
+                kept.append(Eventually(a, b - min(slack, (b - a) // 2), child))
+            case _:
+                kept.append(conjunct)
+    return joined(kept) if kept else formula
+
+
+def bounds_after(
+    task: Task, formula: Formula, poses: NDArray[np.float64], rows: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Bounds (lo, hi) on rho of the formula, or of a part of it, after x_{0:t}."""
+    view = view_of(task, formula)
+    low, high = look(view, poses, rows, np.empty(view.tree.size))
+    return float(low), float(high)
+
+
+def joined(parts: Sequence[Formula]) -> Formula:
+    return parts[0] if len(parts) == 1 else And(tuple(parts))

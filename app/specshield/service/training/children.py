@@ -1,0 +1,81 @@
+"""What a server process keeps running beside it: its share of the embedded store, and a training worker."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from specshield.errors import SpecshieldError
+from specshield.service.settings import Settings
+from specshield.service.storage.embedded import EmbeddedStore
+
+CHECK_EVERY = 0.25  # seconds
+log = logging.getLogger("specshield")
+
+
+class TrainingWorker:
+    """At most one a data folder, however many servers there are: it holds a lock while it lives."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def ensure(self) -> None:
+        """Start it, unless it runs here or beside another process."""
+        if self._process is not None:
+            if self._process.poll() is None:
+                return
+            self._process = None
+        lock = os.open(_lock(self._settings.data_dir), os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # It ends when this process does: its standard input is a pipe from here.
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "specshield.cli", "worker", "--until-eof"],
+                env=self._settings.environment(),
+                stdin=subprocess.PIPE,
+                pass_fds=[lock],
+                start_new_session=True,
+            )
+        except BlockingIOError:
+            pass
+        finally:
+            os.close(lock)
+
+    def stop(self) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(5.0)
+
+
+def wants_worker(settings: Settings) -> bool:
+    if settings.worker is not None:
+        return settings.worker
+    return settings.redis_url is None
+
+
+async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None) -> None:
+    """Start again whatever has died, until cancelled."""
+    while True:
+        try:
+            if embedded is not None and not embedded.joined():
+                log.warning("the embedded store is gone; starting it again")
+                await asyncio.to_thread(embedded.join)
+            if worker is not None:
+                worker.ensure()
+        except (SpecshieldError, OSError) as error:
+            log.error("%s", error)
+            await asyncio.sleep(2.0)
+        await asyncio.sleep(CHECK_EVERY)
+
+
+def _lock(data_dir: Path) -> Path:
+    data_dir.mkdir(parents=True, exist_ok=True)
+    return data_dir / "worker.lock"

@@ -1,0 +1,143 @@
+"""Training runs: queued with rq, followed in `specshield:training:{id}`. Blocking.
+
+A run writes there only while its `attempt` is the latest, so cancelling or asking again is one write. A run
+that stops giving signs of life is reported as failed, whatever happened to its worker.
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import redis
+from redis.backoff import ExponentialBackoff
+from redis.retry import Retry
+from rq import Queue
+from rq.serializers import JSONSerializer
+
+from specshield.errors import StoreError
+from specshield.service.settings import Settings
+
+SIGN_OF_LIFE = 5  # seconds without one after which a run, or the last worker, is taken for dead
+WRITE = """
+if redis.call('HGET', KEYS[1], 'attempt') ~= ARGV[1] then return 0 end
+redis.call('HSET', KEYS[1], unpack(ARGV, 2))
+return 1
+"""
+
+
+@dataclass(frozen=True)
+class Training:
+    """status: queued, training or failed. eta_s: estimate of the time left [s]."""
+
+    status: str
+    progress: float = 0.0
+    eta_s: float | None = None
+    error: str | None = None
+
+
+class Jobs:
+    """Every method raises StoreError where the store cannot be reached in time."""
+
+    def __init__(self, url: str, settings: Settings) -> None:
+        self.redis: Any = redis.Redis.from_url(
+            url,
+            socket_timeout=settings.store_timeout,
+            socket_connect_timeout=settings.store_timeout,
+            # A lost connection is tried again; a store that does not answer would hold the caller once a try.
+            retry=Retry(ExponentialBackoff(cap=0.2, base=0.02), 3, (redis.ConnectionError,)),
+            retry_on_error=[redis.ConnectionError],
+        )
+        self._timeout = settings.training_timeout
+        self._write = self.redis.register_script(WRITE)
+
+    def worker_there(self, method: str) -> bool:
+        return bool(self._try(lambda: self.redis.exists(_worker(method))))
+
+    def start(self, id: str, method: str) -> None:
+        """Queue a run for this policy."""
+        attempt = secrets.token_hex(8)
+        state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
+
+        def enqueue() -> None:
+            self.redis.hset(_key(id), mapping=state)
+            queue = Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer)
+            queue.enqueue(
+                "specshield.service.training.worker.train",
+                id,
+                attempt,
+                job_timeout=self._timeout,
+                result_ttl=0,
+                failure_ttl=24 * 3600,
+            )
+
+        self._try(enqueue)
+
+    def get(self, id: str) -> Training:
+        """How the training of a policy stands; one never heard of has failed."""
+        found, alive = self._try(lambda: (self.redis.hgetall(_key(id)), self.redis.exists(_alive(id))))
+        state = {name.decode(): value.decode() for name, value in found.items()}
+        status, error = state.get("status", "failed"), state.get("error") or None
+        if status == "failed" and not state:
+            error = "nothing is known of its training; ask for it again"
+        if status == "training" and not alive:
+            status, error = (
+                "failed",
+                "its worker is gone; ask for it again and it goes on from its checkpoint",
+            )
+        eta = state.get("eta_s")
+        return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
+
+    def cancel(self, id: str) -> None:
+        """The run, if it has begun, stops within a second or so; if not, when its turn comes."""
+        fields = {"attempt": "", "status": "failed", "error": "cancelled", "eta_s": ""}
+        self._try(lambda: self.redis.hset(_key(id), mapping=fields))
+
+    def forget(self, id: str) -> None:
+        self._try(lambda: self.redis.unlink(_key(id)))
+
+    # --- for the run itself
+
+    def report(self, id: str, attempt: str, **fields: Any) -> bool:
+        """Of no effect, and False, where another attempt, or nobody, is to go on."""
+        pairs = [part for pair in fields.items() for part in pair]
+        return bool(self._try(lambda: self._write(keys=[_key(id)], args=[attempt, *pairs])))
+
+    def sign_of_life(self, id: str, attempt: str) -> bool:
+        """Of a run. False where another attempt, or nobody, is to go on."""
+        self._try(lambda: self.redis.set(_alive(id), 1, ex=SIGN_OF_LIFE))
+        return bool(self._try(lambda: self.redis.hget(_key(id), "attempt")) == attempt.encode())
+
+    def worker_lives(self, methods: Sequence[str]) -> None:
+        """The sign of life of a worker for these methods."""
+
+        def live() -> None:
+            for method in methods:
+                self.redis.set(_worker(method), 1, ex=SIGN_OF_LIFE)
+
+        self._try(live)
+
+    def _try(self, action: Any) -> Any:
+        try:
+            return action()
+        except (redis.RedisError, OSError) as error:
+            raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+
+
+def queue_of(method: str) -> str:
+    """Of rq: one a method, since not every worker can do them all."""
+    return f"specshield-{method}"
+
+
+def _worker(method: str) -> str:
+    return f"specshield:worker:{method}"
+
+
+def _key(id: str) -> str:
+    return f"specshield:training:{{{id}}}"
+
+
+def _alive(id: str) -> str:
+    return f"specshield:training:{{{id}}}:alive"

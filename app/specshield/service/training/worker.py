@@ -1,0 +1,176 @@
+"""The worker: `specshield worker`. One process takes jobs, a fork of it runs each."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import redis
+from rq import Worker
+from rq.job import Job
+from rq.serializers import JSONSerializer
+
+from specshield.errors import SpecshieldError, StoreError
+from specshield.service.settings import Settings
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.keeper import follow_parent
+from specshield.service.training import methods
+from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, queue_of
+
+log = logging.getLogger("specshield")
+
+
+def serve(settings: Settings, until_eof: bool, others: Sequence[str] = ()) -> None:
+    """Work until told to stop, or until standard input ends: the server that started this one is gone.
+
+    others: queues of jobs that are no training runs and look after themselves. Raises StoreError where the
+    store has failed the worker for good.
+    """
+    if settings.redis_url is None:
+        embedded = EmbeddedStore(settings.data_dir)
+        embedded.join()
+        os.environ["REDIS_URL"] = embedded.url  # for the runs
+    url = os.environ.get("REDIS_URL") or str(settings.redis_url)
+    jobs = Jobs(url, settings)
+    if until_eof:
+        threading.Thread(target=_stop_at_eof, daemon=True).start()
+    with _regularly(lambda: jobs.worker_lives(methods.available())):
+        _Worker(url, jobs, others).work(logging_level="WARNING")
+    raise StoreError("the worker cannot go on; what rq has logged says why", expected="a store that answers")
+
+
+class _Worker(Worker):
+    """rq's worker, which on SIGTERM ends the run at once: what it has learned is in its checkpoint."""
+
+    def __init__(self, url: str, jobs: Jobs, others: Sequence[str]) -> None:
+        self._training = [queue_of(method) for method in methods.available()]
+        super().__init__(
+            [*self._training, *others],
+            # Not that of `jobs`: rq waits for work longer than any answer of the store may take, and sets the
+            # time limit of these connections, before the first of them is made, to fit.
+            connection=redis.Redis.from_url(url, socket_timeout=None),
+            serializer=JSONSerializer,
+            work_horse_killed_handler=self._killed,
+            worker_ttl=60,
+        )
+        self._jobs = jobs
+        self._running: Any = None
+
+    def execute_job(self, job: Job, queue: Any) -> None:
+        self._running = job
+        super().execute_job(job, queue)
+        self._running = None
+
+    def request_stop(self, signum: int, frame: Any) -> None:
+        if self._running is not None:
+            self._fail(
+                self._running, "the worker was stopped; ask for it again and it goes on from its checkpoint"
+            )
+            self.kill_horse()
+        raise SystemExit(0)
+
+    def _killed(self, job: Job, pid: int, status: int, usage: Any) -> None:
+        how = (
+            f"by signal {os.WTERMSIG(status)}"
+            if status and os.WIFSIGNALED(status)
+            else f"with status {status}"
+        )
+        if status and os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
+            how += " (the kernel does this when memory runs out)"
+        self._fail(
+            job, f"the training process ended {how}; ask for it again and it goes on from its checkpoint"
+        )
+
+    def _fail(self, job: Job, reason: str) -> None:
+        if job.origin not in self._training:
+            return
+        id, attempt = job.args
+        self._jobs.report(id, attempt, status="failed", error=reason, eta_s="")
+
+
+def train(id: str, attempt: str) -> None:
+    """One run, in a process of its own. Whatever ends it is said in the policy's `error`."""
+    follow_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    settings = Settings()
+    jobs = Jobs(str(settings.redis_url), settings)
+    cancelled = threading.Event()
+
+    def live() -> None:
+        if not jobs.sign_of_life(id, attempt):
+            cancelled.set()
+
+    live()  # first: a run that is said to train without a sign of life is taken for dead
+    if not jobs.report(id, attempt, status="training"):
+        return  # cancelled, or asked for again
+    with _regularly(live):
+        try:
+            _train(settings, jobs, id, attempt, cancelled)
+            done: dict[str, Any] = {"status": "ready", "progress": 1, "eta_s": 0}
+        except SpecshieldError as error:
+            done = {"status": "failed", "error": error.message, "eta_s": ""}
+        except Exception as error:
+            if cancelled.is_set():
+                return
+            log.exception("training of %s", id)
+            name = type(error).__name__  # what it says may be of the inside: paths, lines of code
+            done = {"status": "failed", "error": f"{name}; the worker's log says more", "eta_s": ""}
+        jobs.report(id, attempt, **done)  # of no effect once cancelled
+
+
+def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
+    # numba, torch and the rest are for the process of the run alone: the worker stays small.
+    from specshield.service.library.maps import Maps
+    from specshield.service.library.policies import Policies
+
+    policies = Policies(settings, Maps(settings))
+    about = policies.record(id).about
+
+    def on_progress(done: float, eta_s: float) -> None:
+        jobs.report(id, attempt, progress=round(done, 4), eta_s=round(eta_s, 1))
+
+    policy = methods.make(
+        about.method,
+        policies.task(about),
+        about.options,
+        about.seed,
+        about.spec,
+        policies.checkpoints(id),
+        on_progress,
+        cancelled.is_set,
+    )
+    policies.finish(id, policy.weights(), {**policy.card, "map_id": about.map_id, "seed": about.seed})
+
+
+@contextmanager
+def _regularly(action: Callable[[], object]) -> Iterator[None]:
+    """Several times within SIGN_OF_LIFE, in a thread, as long as the block lasts."""
+    over = threading.Event()
+
+    def repeat() -> None:
+        while not over.is_set():
+            try:
+                action()
+            except StoreError as error:
+                log.warning("%s", error)
+            over.wait(SIGN_OF_LIFE / 5)
+
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(1.0)
+
+
+def _stop_at_eof() -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)

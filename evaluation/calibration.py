@@ -1,0 +1,44 @@
+"""Methods whose margin is to come from what was measured: NAME@conformal/K becomes NAME@M/K."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from evaluation.conformal import conformal_margin
+from evaluation.evaluation import evaluate
+from evaluation.experiment import Experiment
+
+RUNS = 60
+ALPHA = 0.05  # one episode in twenty may hold a larger surprise
+OTHER_SEED = 1_000_003  # calibration runs share none with those of the experiment
+
+
+def calibrated(experiment: Experiment, method: str, folder: Path | None, processes: int) -> str:
+    """The method with its margin as a number, rounded up to millimetres; others are left as they are.
+
+    The calibration campaign is the same experiment with another seed, by the method without a margin. With a
+    `folder`, what it found is kept there as calibration.json.
+    """
+    kind, _, asked = method.partition("@conformal")
+    if kind == method:
+        return method
+    path = None if folder is None else folder / "calibration.json"
+    found = json.loads(path.read_text()) if path is not None and path.exists() else {}
+    if method not in found:
+        others = replace(experiment, seed=experiment.seed + OTHER_SEED)
+        scores = [r.residual for r in evaluate(others, RUNS, [f"{kind}@0{asked}"], None, processes)]
+        margin = conformal_margin(scores, ALPHA)
+        found[method] = {
+            "method": f"{kind}@{math.ceil(1e3 * margin) / 1e3:g}{asked}",
+            "margin": margin,
+            "alpha": ALPHA,
+            "runs": RUNS,
+            "seed": others.seed,
+        }
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(found, indent=1) + "\n")
+    return str(found[method]["method"])

@@ -1,0 +1,141 @@
+"""All runs of an experiment, over processes or job workers: kept as they finish, taken up again."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+from evaluation import jobs
+from evaluation.experiment import Experiment
+from evaluation.runs import Record, run
+from specshield.errors import InputError
+
+ABOUT = "experiment.json"
+Missing = Mapping[int, Sequence[str]]  # {run: methods}
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def evaluate(
+    experiment: Experiment,
+    runs: int,
+    methods: Sequence[str],
+    folder: Path | None = None,
+    processes: int = 1,
+    redis_url: str | None = None,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> list[Record]:
+    """The records of `runs` runs by each method, by run and then by method; one named twice counts once.
+
+    folder: finished runs are kept there as they come, those that are there already are not made again.
+    processes: 1 is this one. redis_url: where job workers take the runs from instead. on_progress: how many
+    runs are finished. Raises InputError where `folder` holds another experiment, or records made from
+    another map, policy or model.
+    """
+    methods = list(dict.fromkeys(methods))
+    done = {} if folder is None else _open(folder, experiment)
+    missing = {i: left for i in range(runs) if (left := [name for name in methods if (i, name) not in done])}
+    on_progress(runs - len(missing))
+    if redis_url is not None and missing:
+        made = jobs.over_workers(redis_url, experiment, missing)
+    elif processes > 1:
+        made = _over_processes(experiment, missing, processes)
+    else:
+        made = (run(experiment, i, names) for i, names in missing.items())
+    for finished, records in enumerate(made, runs - len(missing) + 1):
+        done.update({(record.run, record.method): record for record in records})
+        if folder is not None:
+            _keep(folder, records)
+        on_progress(finished)
+    return [done[i, name] for i in range(runs) for name in methods]
+
+
+def _over_processes(experiment: Experiment, missing: Missing, processes: int) -> Iterator[list[Record]]:
+    """Each run in one of `processes` fresh processes, which end with this one, however it goes."""
+    for name in THREADS:  # one thread each: the processes share the cores out
+        os.environ.setdefault(name, "1")
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
+    try:
+        under_way: set[Future[list[Record]]] = {
+            pool.submit(run, experiment, i, list(names)) for i, names in missing.items()
+        }
+        while under_way:
+            finished, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A process that nobody waits for any more ends, whatever it is at."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]:
+    """What `folder` holds of the experiment."""
+    folder.mkdir(parents=True, exist_ok=True)
+    about, written = folder / ABOUT, folder / "runs.jsonl"
+    check(folder, experiment)
+    if not about.exists():
+        described = {**experiment.to_json(), "made_from": experiment.setting.made_from}
+        about.write_text(json.dumps(described) + "\n")
+    if not written.exists():
+        return {}
+    os.truncate(written, written.read_bytes().rfind(b"\n") + 1)  # a line that was cut short
+    return {(record.run, record.method): record for record in read(folder)}
+
+
+def check(folder: Path, experiment: Experiment) -> None:
+    """Raises InputError unless the folder's records, if it has any, and new ones can stand side by side."""
+    if not (folder / ABOUT).exists():
+        return
+    found, made_from = read_about(folder)
+    if found != experiment:
+        raise InputError(
+            "the folder holds another experiment", path="out", got=str(found.to_json()),
+            expected=f"{experiment.to_json()}, or another folder",
+        )  # fmt: skip
+    if made_from is None:
+        raise InputError(
+            f"{folder} does not say which map, policies and model its records were made from", path="out",
+            got=str(folder), expected="another --out; `specshield report` reads this one as it is",
+        )  # fmt: skip
+    now = experiment.setting.made_from
+    changed = [name for name in {**made_from, **now} if made_from.get(name) != now.get(name)]
+    if changed:
+        raise InputError(
+            f"since the records in {folder} were made there is another {', '.join(changed)}", path="out",
+            got=changed, expected="another --out, or what was there then",
+        )  # fmt: skip
+
+
+def read_about(folder: Path) -> tuple[Experiment, dict[str, Any] | None]:
+    """The experiment of a folder, and what its records were made from; None in a folder that does not say."""
+    content = json.loads((folder / ABOUT).read_text())
+    made_from = content.pop("made_from", None)
+    return Experiment.from_json(content), made_from
+
+
+def read(folder: Path) -> list[Record]:
+    """The records kept in a folder, one a run and method: the last. A line that was cut off is none."""
+    with open(folder / "runs.jsonl") as lines:
+        records = [Record.from_json(json.loads(line)) for line in lines if line.endswith("\n")]
+    return list({(record.run, record.method): record for record in records}.values())
+
+
+def _keep(folder: Path, records: Sequence[Record]) -> None:
+    with open(folder / "runs.jsonl", "a") as lines:
+        lines.writelines(json.dumps(record.to_json()) + "\n" for record in records)

@@ -1,0 +1,182 @@
+"""An experiment: a case, a model, a disturbance and a seed; and what every process prepares for it once."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+from evaluation.decoding import HardDecoding, RobustDecoding
+from evaluation.disturbance import believed, check
+from evaluation.houses import load_house_case
+from evaluation.methods import Decoding, Method, Shielded, Simplex
+from specshield import __version__
+from specshield.errors import InputError, NotFound
+from specshield.policy.dqn.policy import Policy
+from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
+from specshield.robot.unicycle import Body, make_body
+from specshield.shield.decision import Config
+from specshield.shield.episode import Shield, make_shield
+from specshield.sim.cases import MODELS, Case, case_name, load_case, shipped
+from specshield.sim.learned.model import FOLDER, WEIGHTS, read
+from specshield.sim.model import FoundationModel, check_model, make_model
+from specshield.task import Task
+
+METHODS = ("unmodified", "hcd", "rcd", "simplex", "paper", "ours", "lookahead")
+CERTIFYING = ("simplex", "paper", "ours", "lookahead")
+CAREFUL = ("simplex", "ours", "lookahead")  # NAME@M/K asks for a margin of M metres and K steps of slack
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """house: where `case` is "house", which one (sim/houses.py). noise: of sim/disturbance.py."""
+
+    case: str
+    house: str | None = None
+    model: str = "learned"
+    noise: str = "none"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check(self.noise)
+        check_model(self.model)
+        if (self.case == "house") != (self.house is not None):
+            raise InputError(
+                "the case 'house' needs a house, and no other has one", path="house", got=self.house,
+                expected="a house's name or path, with case 'house'",
+            )  # fmt: skip
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_json(value: Mapping[str, Any]) -> Experiment:
+        return Experiment(**value)
+
+    @property
+    def setting(self) -> Setting:
+        return _setting(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What an experiment needs, prepared when it is first asked for. task, body: as the shield is told."""
+
+    experiment: Experiment
+    case: Case
+    task: Task
+    body: Body
+
+    @cached_property
+    def model(self) -> FoundationModel:
+        return make_model(self.experiment.model, self.case)
+
+    @cached_property
+    def learned(self) -> Policy | None:
+        """The DQN that came for the case; None where there is none."""
+        try:
+            policy = shipped(self.case, "dqn")
+        except NotFound:
+            return None
+        return replace(policy, task=self.task) if isinstance(policy, Policy) else None
+
+    @cached_property
+    def policies(self) -> tuple[ReachabilityPolicy | Policy, ...]:
+        """Reachability, then the DQN if there is one."""
+        computed = synthesise(self.task)
+        return (computed,) if self.learned is None else (computed, self.learned)
+
+    @cached_property
+    def paper(self) -> Shield:
+        """The paper's shield. Raises NotFound where there is no DQN for the case."""
+        if self.learned is None:
+            raise NotFound(
+                f"there is no learned policy for {self.case.name}", path="methods", got="paper",
+                expected="a case with a folder in models/, or other methods",
+            )  # fmt: skip
+        return make_shield([replace(self.learned, literal=True)])
+
+    @cached_property
+    def ours(self) -> Shield:
+        return make_shield(self.policies)
+
+    @cached_property
+    def made_from(self) -> dict[str, Any]:
+        """What records depend on beside the experiment's own fields, as JSON: what is long as its sha256."""
+        case = self.case
+        made_from = {
+            "specshield": __version__,
+            "task": case.task.content_hash,
+            "instruction": case.instruction,
+            "target": list(case.target),
+        }
+        for policy in self.policies:
+            made_from[f"policy {policy.card['method']}"] = _hash(policy.weights())
+        if self.experiment.model == "learned":
+            temperature = read(MODELS / FOLDER).temperature
+            made_from["learned model"] = _hash((MODELS / FOLDER / WEIGHTS).read_bytes() + b"%r" % temperature)
+        return made_from
+
+    def method(self, name: str) -> Method:
+        """A method by its name, NAME@M/K with a margin of M metres and K steps of slack.
+
+        Raises NotFound, InputError.
+        """
+        kind, margin, slack = split(name)
+        careful = Config(margin=margin, slack=slack)
+        make: dict[str, Callable[[], Method]] = {
+            "unmodified": lambda: Decoding(self.task),
+            "hcd": lambda: Decoding(self.task, HardDecoding(self.task)),
+            "rcd": lambda: Decoding(self.task, RobustDecoding(self.task)),
+            "simplex": lambda: Simplex(make_shield(self.policies, careful)),
+            "paper": lambda: Shielded(self.paper, carries=False),
+            "ours": lambda: Shielded(make_shield(self.policies, careful)),
+            "lookahead": lambda: Shielded(make_shield(self.policies, replace(careful, shaping="lookahead"))),
+        }
+        return make[kind]()
+
+
+def experiments(case: str, house: str | None, model: str, noise: str, seed: int) -> list[Experiment]:
+    """One a noise, of those that `noise` joins by commas. case: a case's name, or its number."""
+    return [Experiment(case_name(case), house, model, each, seed) for each in noise.split(",")]
+
+
+def available(case: str) -> list[str]:
+    """The methods that can be had for a case without options."""
+    return [name for name in METHODS if name != "paper" or case != "house"]
+
+
+def split(method: str) -> tuple[str, float, int]:
+    """The kind of a method, its margin [m] and its slack [steps]. Raises NotFound or InputError."""
+    kind, at, asked = method.partition("@")
+    if kind not in METHODS:
+        raise NotFound(
+            f"there is no method {kind!r}", path="methods", got=method, expected=f"of {', '.join(METHODS)}"
+        )
+    if not at:
+        return kind, 0.0, 0
+    metres, _, steps = asked.partition("/")
+    try:
+        margin, slack = float(metres), int(steps or 0)
+    except ValueError:
+        margin, slack = math.nan, 0
+    if kind not in CAREFUL or not math.isfinite(margin):
+        raise InputError(
+            "not a method with a margin", path="methods", got=method,
+            expected=f"NAME@METRES or NAME@METRES/STEPS, the name one of {', '.join(CAREFUL)}",
+        )  # fmt: skip
+    return kind, margin, slack
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+@lru_cache(maxsize=4)
+def _setting(experiment: Experiment) -> Setting:
+    case = load_case(experiment.case) if experiment.house is None else load_house_case(experiment.house)
+    task = believed(experiment.noise, case.task)
+    return Setting(experiment, case, task, make_body(task.robot, task.grid))

@@ -1,0 +1,1 @@
+"""How the stand-in for a foundation model is trained."""

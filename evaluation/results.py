@@ -1,0 +1,92 @@
+"""An experiment's results in its folder: results.json and a table in Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from evaluation.evaluation import read, read_about
+from evaluation.experiment import METHODS, Experiment, split
+from evaluation.runs import MAX_STEPS, Record
+from evaluation.statistics import costs_beside, summary
+
+
+def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]:
+    """The figures of every method in `records`, as JSON. refused: starts drawn before those that would do.
+
+    left: the steps of a run that the rule leaves after its horizon, and in how many of its runs the model,
+    unmodified, does its task in as many. lookahead_beside_ours: `costs_beside`, None where either is missing.
+    """
+    by_method: dict[str, list[Record]] = {}
+    for record in sorted(records, key=lambda r: r.run):
+        by_method.setdefault(record.method, []).append(record)
+    runs = sorted({record.run for record in records})
+    ranked = sorted(by_method, key=lambda name: METHODS.index(split(name)[0]))
+    plain = by_method.get("unmodified", [])
+    case = experiment.setting.case
+    left = MAX_STEPS - case.task.horizon
+    pair = by_method.get("lookahead", []), by_method.get("ours", [])
+    in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain]
+    return {
+        "experiment": experiment.to_json(),
+        "case": case.name,
+        "formula": str(case.task.formula),
+        "instruction": case.instruction,
+        "runs": len(runs),
+        "refused_starts": sum({record.run: record.refused for record in records}.values()),
+        "left": {"steps": left, "done": sum(in_time), "of": len(plain)},
+        "methods": [summary(name, by_method[name], plain) for name in ranked],
+        "lookahead_beside_ours": costs_beside(*pair, plain) if all(pair) else None,
+    }
+
+
+def write(folder: Path) -> dict[str, Any]:
+    """Writes results.json and table.md beside the records of an experiment."""
+    experiment, _ = read_about(folder)
+    figures = results(experiment, read(folder))
+    (folder / "results.json").write_text(json.dumps(figures, indent=1) + "\n")
+    (folder / "table.md").write_text(table(figures) + "\n")
+    return figures
+
+
+def table(figures: dict[str, Any]) -> str:
+    """One row a method. Shares with their 95 % Clopper-Pearson intervals."""
+    heads = (
+        "method", "rule satisfied", "main task done", "KL a run [nats]", "extra steps, mean (median)",
+        "fallback decisions", "feasible mass", "decision p50 / p99 [ms]",
+    )  # fmt: skip
+    rows = [
+        (
+            one["method"],
+            share(one["satisfied"]),
+            share(one["main_done"]),
+            _number(one["kl"], ".1f"),
+            _extra(one["extra_steps"]),
+            f"{one['modes'].get('fallback', 0)} of {sum(one['modes'].values())}",
+            _number(one["feasible_mass"], ".2f"),
+            f"{one['decision_ms']['p50']:.2f} / {one['decision_ms']['p99']:.2f}",
+        )
+        for one in figures["methods"]
+    ]
+    return markdown(heads, rows)
+
+
+def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table, its columns after the first to the right."""
+    rule = ["---", *["--:"] * (len(heads) - 1)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in [heads, rule, *rows])
+
+
+def share(of: dict[str, Any]) -> str:
+    """A share as a count and its interval in per cent."""
+    return f"{of['count']} of {of['of']} ({100 * of['low']:.1f} to {100 * of['high']:.1f} %)"
+
+
+def _extra(steps: dict[str, Any]) -> str:
+    return "-" if steps["mean"] is None else f"{steps['mean']:+.1f} ({steps['median']:+.0f})"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

@@ -1,0 +1,130 @@
+"""Training: it learns, it can be repeated, stopped and resumed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from specshield.errors import FragmentError, PolicyError
+from specshield.policy.dqn.network import NAMES
+from specshield.policy.dqn.settings import Settings, options_of, read_settings
+from specshield.policy.dqn.train import Progress, Stopped, _Run, measure, train
+from specshield.policy.methods import load_policy
+from tests.policy.rooms import flat
+
+TASK = flat("F[0,30] West and G[0,30] not Hole")
+SMALL = Settings(
+    units=32, updates=1500, robots=128, batch=256, learning_rate=2e-3, discount=0.95, polyak=0.02,
+    replay=80_000, evaluate_every=300, evaluation_starts=200,
+)  # fmt: skip
+TINY = replace(SMALL, updates=40, robots=16, batch=32, replay=2000, evaluate_every=20, evaluation_starts=20)
+
+
+def same(a, b):
+    return all((a[name] == b[name]).all() for name in NAMES)
+
+
+def test_a_short_training_beats_chance_clearly():
+    reports: list[Progress] = []
+    policy = train(TASK, SMALL, seed=0, on_progress=reports.append)
+    untrained = measure(TASK, _Run(TASK, SMALL, 0).q_network.weights(), 200, 0)
+    metrics = policy.card["metrics"]
+    assert metrics["satisfied"] > 0.4 + untrained["satisfied"]
+    assert metrics["feasible_start"] >= metrics["satisfied"]
+    low, high = metrics["satisfied_interval"]
+    assert low < metrics["satisfied"] < high
+    assert metrics["wall_time_s"] > 0
+    assert [report.update for report in reports] == list(range(100, 1501, 100))
+    assert reports[-1].eta_s == 0.0
+    assert reports[1].satisfied is None
+    assert 0.0 <= reports[2].satisfied <= 1.0
+    again = load_policy(policy.weights(), policy.card, TASK)
+    assert same(again.network._asdict(), policy.network._asdict())
+    assert read_settings(policy.card["options"]) == SMALL
+
+
+@pytest.mark.parametrize("reward", ["progress", "paper"])
+def test_one_seed_one_policy(reward):
+    settings = replace(TINY, reward=reward)
+    first, second, other = (train(TASK, settings, seed).network._asdict() for seed in (1, 1, 2))
+    assert same(first, second)
+    assert not same(first, other)
+
+
+def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path):
+    asked = iter(range(1000))
+    with pytest.raises(Stopped):  # the replay buffer fills for 40 steps first, then updates 1 to 30
+        train(TASK, TINY, 3, checkpoint=tmp_path, should_stop=lambda: next(asked) >= 70)
+    resumed = _Run(TASK, TINY, 3)
+    resumed.resume(tmp_path)
+    assert (resumed.update, resumed.best_rate) == (20, resumed.latest)
+    assert not same(resumed.q_network.weights(), _Run(TASK, TINY, 3).q_network.weights())
+    before = resumed.q_network.weights()
+    resumed.save(tmp_path)
+    again = _Run(TASK, TINY, 3)
+    again.resume(tmp_path)
+    assert same(again.q_network.weights(), before)
+    assert same(again.target_network.weights(), resumed.target_network.weights())
+    for one, two in zip(again.q_network.parameters(), resumed.q_network.parameters(), strict=True):
+        moments, expected = again.optimizer.state[one], resumed.optimizer.state[two]
+        assert all((moments[name] == expected[name]).all() for name in ("step", "exp_avg", "exp_avg_sq"))
+    counts = []
+    policy = train(TASK, TINY, 3, lambda report: counts.append(report.update), tmp_path)
+    assert counts == [40]
+    assert policy.card["metrics"]["wall_time_s"] >= 0
+
+
+def test_another_tasks_checkpoint_is_ignored(tmp_path):
+    train(TASK, TINY, 0, checkpoint=tmp_path)
+    for task, settings in ((flat("F[0,31] West"), TINY), (TASK, replace(TINY, discount=0.9))):
+        run = _Run(task, settings, 0)
+        run.resume(tmp_path)
+        assert run.update == 0
+
+
+def test_nothing_is_trained_outside_the_fragment():
+    with pytest.raises(FragmentError):
+        train(flat("West U[0,9] East"), TINY, 0)
+
+
+def test_measured_rates_have_exact_intervals():
+    """Clopper and Pearson, 1934: of 20, none gives [0, 0.1684] and all [0.8316, 1]."""
+    for formula, rate, interval in (
+        ("F[0,1] West and F[0,1] East", 0.0, [0.0, 0.1684]),
+        ("F[0,1] x > -99", 1.0, [0.8316, 1.0]),
+    ):
+        task = flat(formula)
+        measured = measure(task, _Run(task, TINY, 0).q_network.weights(), 20, 0)
+        for name in ("satisfied", "feasible_start"):
+            assert (measured[name], measured[f"{name}_interval"]) == (rate, interval)
+
+
+@pytest.mark.parametrize(
+    ("options", "path"),
+    [
+        ({"unit": 64}, "options.unit"),
+        ({"units": 64.0}, "options.units"),
+        ({"units": True}, "options.units"),
+        ({"units": 129}, "options.units"),
+        ({"updates": 0}, "options.updates"),
+        ({"learning_rate": float("nan")}, "options.learning_rate"),
+        ({"learning_rate": "fast"}, "options.learning_rate"),
+        ({"discount": 1.1}, "options.discount"),
+        ({"reward": "sparse"}, "options.reward"),
+        ({"exploration": [0.5]}, "options.exploration"),
+        ({"exploration": [0.5, 2.0]}, "options.exploration"),
+    ],
+)
+def test_bad_options_name_the_field(options, path):
+    with pytest.raises(PolicyError) as caught:
+        read_settings(options)
+    assert caught.value.path == path
+    assert caught.value.expected
+
+
+def test_options_are_read_back_as_they_were():
+    assert read_settings({}) == Settings()
+    chosen = Settings(units=32, learning_rate=1e-4, exploration=(0.9, 0.1))
+    assert read_settings(options_of(chosen)) == chosen
+    assert str(read_settings({"discount": 1}).discount) == "1.0"  # 1 and 1.0 are one policy

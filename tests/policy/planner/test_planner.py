@@ -1,0 +1,313 @@
+"""The planner against every future of a small world, a rule of each shape; robots, files."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from specshield.errors import InfeasibleStart, PolicyError
+from specshield.policy.methods import load_policy
+from specshield.policy.planner.policy import Settings, read_settings, synthesise
+from specshield.robot import STRETCH, robot_from_json
+from specshield.robot.unicycle import simulate
+from specshield.shield.episode import Carry, decide, make_shield, start
+from specshield.stl import robustness
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+from tests.oracles.brute_stl import brute_robustness
+from tests.oracles.cells import END, MOTIONS, Cells
+from tests.oracles.judge import signed_distance
+from tests.policy.rooms import CUSTOM, OCCUPIED, REGIONS, flat
+from tests.stl.formulas import formulas
+
+RESTLESS = robot_from_json({"footprint": {"radius": 0.1}, "actions": [{"name": "go", "translate": 0.1}]})
+EVENT = np.zeros(8)  # the signal, held from the newest sample on, as the oracles below read it
+
+
+def within(inside, a, b):
+    """F[a,b] at every step from 0 to T - b."""
+    return np.stack([inside[..., k + a : k + b + 1].any(-1) for k in range(inside.shape[-1] - b)], axis=-1)
+
+
+WORLDS = {
+    "patrol": Cells(
+        "G[0,3] F[0,4] A and G[0,3] F[0,4] B and G[0,7] not C",
+        lambda s: within(s["A"], 0, 4).all(-1) & within(s["B"], 0, 4).all(-1) & ~s["C"].any(-1),
+        {"A": (0, 0), "B": (0, 1), "C": (1, 0)},
+    ),
+    "reactive": Cells(
+        "G[0,4] (event > 0.5 -> F[0,3] A)",
+        lambda s: np.all([(EVENT[k] <= 0.5) | within(s["A"], 0, 3)[..., k] for k in range(5)], axis=0),
+        {"A": (1, 2)},
+        {"event": 0.0},
+    ),
+    "reactive, in one predicate": Cells(
+        "G[0,4] F[0,3] (event < 0.5 or A) and F[3,7] B",
+        lambda s: within((EVENT < 0.5) | s["A"], 0, 3).all(-1) & s["B"][..., 3:].any(-1),
+        {"A": (1, 2), "B": (2, 2)},
+        {"event": 0.0},
+    ),
+    "until": Cells(
+        "not B U[0,6] A and F[4,7] B",
+        lambda s: (
+            np.any([s["A"][..., k] & ~s["B"][..., :k].any(-1) for k in range(7)], axis=0)
+            & s["B"][..., 4:].any(-1)
+        ),
+        {"A": (2, 2), "B": (2, 1)},
+    ),
+    "disjunction": Cells(
+        "F[0,5] A and F[3,7] C or G[2,7] B",
+        lambda s: (s["A"][..., :6].any(-1) & s["C"][..., 3:].any(-1)) | s["B"][..., 2:].all(-1),
+        {"A": (2, 1), "B": (0, 1), "C": (2, 2)},
+    ),
+    "nested": Cells(
+        "G[0,4] (A -> F[0,3] B) and F[0,5] (A and F[1,2] not A)",
+        lambda s: (
+            np.all([~s["A"][..., k] | within(s["B"], 0, 3)[..., k] for k in range(5)], axis=0)
+            & np.any([s["A"][..., k] & ~s["A"][..., k + 1 : k + 3].all(-1) for k in range(6)], axis=0)
+        ),
+        {"A": (2, 2), "B": (2, 1)},
+    ),
+    "a dwell, then away": Cells(
+        "F[1,3] G[1,3] A and G[5,7] not A",
+        lambda s: s["A"][..., 2:5].all(-1) & ~s["A"][..., 5:].any(-1),
+        {"A": (2, 2)},
+    ),
+}
+EACH = pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
+STARTS = [(i, j, h) for i, j in ((0, 0), (0, 1), (1, 2), (2, 1), (2, 2)) for h in range(4)]
+
+
+def see(samples):
+    """The signal so far, for a decision; the oracles see it held."""
+    EVENT[: len(samples)], EVENT[len(samples) :] = samples, samples[-1]
+    return {"event": np.array(samples)}
+
+
+@EACH
+def test_what_it_claims_is_so_and_it_claims_nearly_all(cells):
+    """S_t of the planner alone, no witness carried, along random ways and with events at random steps."""
+    shield, random = make_shield([synthesise(cells.task, Settings(pitch=0.2))]), np.random.default_rng(2)
+    found = missed = 0
+    for state in STARTS:
+        history, rise = [cells.pose(*state)], random.integers(8)
+        for t in range(cells.task.horizon):
+            signals = see([float(k >= rise) for k in range(t + 1)])
+            expected = cells.feasible(history)
+            decision = decide(shield, history, np.zeros(5), signals=signals if cells.signals else {})
+            if decision.mode in ("shaped", "fallback"):
+                claimed = np.array(decision.j_values[:MOTIONS]) == 1.0
+                assert not (claimed & ~expected).any()
+                found, missed = found + claimed.sum(), missed + (expected & ~claimed).sum()
+            likely = (
+                np.flatnonzero(expected) if expected.any() and random.random() < 0.8 else np.arange(MOTIONS)
+            )
+            history.append(decision.next_poses[random.choice(likely)])
+    assert found > 50
+    assert missed <= 0.02 * found
+
+
+@EACH
+def test_once_feasible_always_feasible(cells):
+    """Whatever the model wants; a signal stays as it was at the start, as J supposes."""
+    shield, random = make_shield([synthesise(cells.task, Settings(pitch=0.2))]), np.random.default_rng(3)
+    played = 0
+    for state in STARTS:
+        history, carry, done = [cells.pose(*state)], None, False
+        event = float(random.integers(2)) if cells.signals else 0.0
+        see([event])
+        if not cells.feasible(history).any():
+            if event == 0.0:  # as the signal is before its first sample
+                with pytest.raises(InfeasibleStart):
+                    start(shield, history[0])
+            continue
+        for t in range(cells.task.horizon):
+            signals = see([event] * (t + 1)) if cells.signals else {}
+            logits = random.normal(0, 3, 5)
+            decision = decide(shield, history, None if done else logits, done, signals, carry)
+            assert decision.reason != "infeasible"
+            action = int(random.choice(5, p=decision.distribution))
+            if action == END:
+                done = True
+                action = END if decision.completion_action is None else decision.completion_action
+            history.append(decision.next_poses[action])
+            carry = Carry.from_json(decision.carry.to_json())
+        signals = see([event] * 8) if cells.signals else {}
+        assert cells.kept(history)
+        assert robustness(cells.task.formula, cells.task.samples(np.array(history), signals)) > 0.0
+        played += 1
+    assert played >= 3
+
+
+@settings(max_examples=60, deadline=None)
+@given(formula=formulas(), robot=st.sampled_from([STRETCH, CUSTOM, RESTLESS]), data=st.data())
+def test_any_formula_has_a_proposal_for_every_motion(formula, robot, data):
+    """Whatever is asked for, whatever the robot: rows of f's own poses, and what is claimed is so."""
+    assume(formula.horizon >= 1)
+    regions = {"Charger1": REGIONS["West"], "Bedroom_2": REGIONS["East"]}
+    signals = {"_": 1.0, "GF": 0.0, "notable": -1.0}
+    task = make_task(OccupancyGrid(OCCUPIED, 0.1), robot, str(formula), regions, signals=signals)
+    policy = synthesise(task, Settings(pitch=0.2))
+    heading = data.draw(st.floats(-3.0, 3.0))
+    history = np.array([[0.8, 1.5, heading], [0.9, 1.5, heading]])[: task.horizon]
+    proposal = policy.propose(history, {}, 0.0)
+    assert sorted(set(proposal.motions[:, 0])) == list(range(len(robot.motions)))
+    shield = make_shield([policy])
+    for motions, poses in zip(proposal.motions, proposal.poses, strict=True):
+        again = np.empty_like(poses)
+        simulate(shield.body, history[-1], motions, again)
+        np.testing.assert_array_equal(poses, again)
+    decision = decide(shield, history, np.zeros(len(robot.actions)), witnesses=True)
+    for action, witness in enumerate(decision.witnesses):
+        if witness is not None and decision.spec_status == "pending":
+            ways = np.array([robot.motion_of[a] for a in (action, *witness)], np.int64)
+            after = np.empty((len(ways), 3))
+            simulate(shield.body, history[-1], ways, after)
+            samples = {n: v.tolist() for n, v in task.samples(np.concatenate([history, after])).items()}
+            assert brute_robustness(task.formula, samples) > 0.0
+
+
+ROOM = OccupancyGrid(np.zeros((60, 60), bool), 0.1)
+
+
+def rectangle(x0, y0, x1, y1):
+    return {"type": "rectangle", "min": [x0, y0], "max": [x1, y1]}
+
+
+def decide_at(policy, pose, **asked):
+    robot = policy.task.robot
+    decision = decide(make_shield([policy]), [pose], np.zeros(len(robot.actions)), **asked)
+    return decision, np.array(decision.j_values, float)[robot.representative]
+
+
+@pytest.mark.parametrize("half", [0.5, 0.25])
+def test_an_until_goes_round_what_lies_between(half):
+    """Who is never in K keeps the until: where that is to be had, so is this."""
+    regions = {"K": rectangle(2.5 - half, 2.5 - half, 2.5 + half, 2.5 + half), "B": rectangle(4, 4, 5, 5)}
+    until, never = (
+        synthesise(make_task(ROOM, STRETCH, rule, regions))
+        for rule in ("not K U[0,60] B", "F[0,60] B and G[0,60] not K")
+    )
+    for pose in ((1, 1, 0), (1.5, 1.5, 0), (1, 3, 0), (1.6, 2.5, 0), (0.5, 0.5, 2), (2.5, 1, 1.5)):
+        stricter = decide_at(never, pose)[1]
+        assert stricter.any()
+        assert (decide_at(until, pose)[1] >= stricter).all()
+
+
+def test_an_until_stays_in_a_corridor_up_to_where_it_leads():
+    """The left side ends where the right one begins: no pose is in both, and no goal in the left."""
+    regions = {"Up": rectangle(1, 1, 2, 4), "Along": rectangle(1, 3, 4, 4), "B": rectangle(4, 3, 5, 4)}
+    policy = synthesise(make_task(ROOM, STRETCH, "(Up or Along) U[0,60] B", regions))
+    decision, feasible = decide_at(policy, (1.5, 1.5, 0.0), witnesses=True)
+    assert feasible.all()
+    ways = np.array([STRETCH.motion_of[a] for a in (decision.action, *decision.witness)], np.int64)
+    after = np.empty((len(ways), 3))
+    simulate(make_shield([policy]).body, np.array([1.5, 1.5, 0.0]), ways, after)
+    inside = {n: [signed_distance(region, x, y) > 0 for x, y, _ in after] for n, region in regions.items()}
+    there = inside["B"].index(True)
+    assert all(np.logical_or(inside["Up"], inside["Along"])[:there])
+
+
+def test_a_robot_that_cannot_stand_still_is_planned_for():
+    """It turns where it would wait; a row for every motion, and its poses are those of f."""
+    task = flat("G[0,20] F[0,40] West and F[10,60] East", CUSTOM)
+    policy = synthesise(task)
+    history = np.array([[*task.grid.to_map((1.5, 1.5)), 0.3]])
+    shield = make_shield([policy])
+    proposal = policy.propose(history, {}, 0.0)
+    assert proposal.motions[:, 0].tolist() == [0, 1, 2]
+    for motions, poses in zip(proposal.motions, proposal.poses, strict=True):
+        again = np.empty_like(poses)
+        simulate(shield.body, history[0], motions, again)
+        np.testing.assert_array_equal(poses, again)
+    assert any(decide(shield, history, np.zeros(3)).j_values)
+
+
+FORWARD = {"name": "go", "translate": 0.2}
+HASTY = {  # none of them has a turn on the spot and a stop
+    "car": [FORWARD, *({"name": f"arc {a}", "translate": 0.15, "rotate": a} for a in (0.5, -0.5))],
+    "no stop": [FORWARD, *({"name": f"turn {a}", "rotate": a} for a in (1.5, -1.5))],
+    "rail": [FORWARD, {"name": "back", "translate": -0.2}, {"name": "stop"}],
+}
+
+
+@pytest.mark.parametrize("actions", HASTY.values(), ids=list(HASTY))
+def test_a_robot_that_has_to_bide_its_time_in_motion_is_there_in_time(actions):
+    """Windows that open later than it could be there, or leave, against every way of seven motions."""
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": actions})
+    random, found, missed = np.random.default_rng(4), 0, 0
+    choices = np.array(list(itertools.product(range(3), repeat=7)))
+    for rule in ("F[3,7] C", "G[5,7] not C", "F[7,7] C", "F[4,7] C and G[0,2] C"):
+        task = make_task(ROOM, robot, rule, {"C": {"type": "circle", "center": [3, 3], "radius": 0.6}})
+        policy, ways = synthesise(task), np.empty((len(choices), 8, 3))
+        body = make_shield([policy]).body
+        for _ in range(6):
+            ways[:, 0] = *random.uniform(2.5, 3.5, 2), random.uniform(-3.1, 3.1)
+            for motions, poses in zip(choices, ways, strict=True):
+                simulate(body, poses[0], motions, poses[1:])
+            kept = robustness(task.formula, task.samples(ways)) > 0.0
+            some = np.array([kept[choices[:, 0] == m].any() for m in range(3)])
+            claimed = decide_at(policy, ways[0, 0])[1] == 1.0
+            assert not (claimed & ~some).any()
+            found, missed = found + claimed.sum(), missed + (some & ~claimed).sum()
+    assert found > 40
+    assert missed <= 0.02 * found
+
+
+def test_what_is_broken_is_dropped_and_the_rest_is_kept():
+    """Begun on the forbidden cell: the rule is lost, its patrol and the rest of its G are not."""
+    rule = "G[0,7] not C and F[3,7] B"
+    cells = Cells(rule, lambda s: ~s["C"].any(-1) & s["B"][..., 3:].any(-1), {"B": (0, 0), "C": (0, 2)})
+    shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
+    history, carry = [cells.pose(0, 2, 3)], None
+    while len(history) <= cells.task.horizon:
+        decision = decide(shield, history, None, True, carry=carry)
+        assert decision.mode == "violated"
+        history.append(decision.next_poses[decision.completion_action])
+        carry = decision.carry
+    states = [cells.state(pose)[:2] for pose in history]
+    assert (0, 2) not in states[1:]
+    assert (0, 0) in states[3:]
+
+
+@pytest.mark.parametrize("rest", ["F[5,40] A", "F[5,40] A and G[0,40] not K"])
+def test_a_rule_over_a_signal_that_stays_broken_leaves_the_rest_to_be_kept(rest):
+    """What asks for the signal again cannot be had as long as it is held; what is left can."""
+    regions = {"A": rectangle(4, 0.5, 5, 1.5), "K": rectangle(2, 0.5, 3, 1.5)}
+    regions = {name: region for name, region in regions.items() if name in rest}
+    task = make_task(ROOM, STRETCH, f"G[0,40] (bat > 0.2) and {rest}", regions, signals={"bat": 1.0})
+    history, bat = np.array([[1.0, 1.0, 0.0]] * 2), np.array([1.0, 0.1])
+    poses = synthesise(task).propose(history, {"bat": bat}, 0.0).poses
+    ways = np.concatenate([np.broadcast_to(history, (len(poses), 2, 3)), poses], axis=1)
+    whole = make_task(ROOM, STRETCH, rest, regions)
+    assert (robustness(whole.formula, whole.samples(ways)) > 0.0).all()
+
+
+def test_a_policy_comes_back_from_its_files_as_it_was():
+    task = WORLDS["patrol"].task
+    policy = synthesise(task, Settings(pitch=0.2))
+    again = load_policy(policy.weights(), policy.card, task)
+    history = np.array([WORLDS["patrol"].pose(0, 0, 0)])
+    ours, theirs = policy.propose(history, {}, 0.0), again.propose(history, {}, 0.0)
+    np.testing.assert_array_equal(ours.motions, theirs.motions)
+    assert synthesise(task, Settings(pitch=0.2)).weights() == policy.weights()
+    with pytest.raises(PolicyError, match="do not fit"):
+        load_policy(policy.weights(), {**policy.card, "options": {"pitch": 0.1}}, task)
+    with pytest.raises(PolicyError, match="safetensors"):
+        load_policy(policy.weights()[:-9], policy.card, task)
+    with pytest.raises(PolicyError, match="not in range") as caught:
+        read_settings({"effort": 0})
+    assert caught.value.path == "options.effort"
+
+
+def test_where_there_is_nothing_to_find_it_ends_and_says_the_same_again():
+    patrols = " and ".join(f"G[0,80] F[0,20] {name}" for name in ("West", "East", "Hole"))
+    policy = synthesise(flat(f"{patrols} and (F[0,99] West or G[0,50] East or not West U[3,90] Hole)"))
+    history = np.array([[*policy.task.grid.to_map((1.0, 1.0)), 0.0]])
+    first, second = (policy.propose(history, {}, 0.0) for _ in range(2))
+    np.testing.assert_array_equal(first.motions, second.motions)
+    np.testing.assert_array_equal(first.poses, second.poses)

@@ -1,0 +1,208 @@
+"""Reachability: the exact feasible set where every future can be tried, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+from specshield.errors import FragmentError, PolicyError
+from specshield.policy.methods import load_policy
+from specshield.policy.reachability.policy import Settings, read_settings, synthesise
+from specshield.robot import STRETCH, robot_from_json
+from specshield.shield.episode import decide, make_shield
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+from tests.oracles.cells import MOTIONS, ROBOT, WAIT, Cells
+
+WORLDS = {
+    "in turn, with a forbidden cell": Cells(
+        "F[0,4] A and F[4,7] B and G[0,7] not C",
+        lambda s: s["A"][..., :5].any(-1) & s["B"][..., 4:].any(-1) & ~s["C"].any(-1),
+        {"A": (1, 0), "B": (0, 1), "C": (0, 2)},
+    ),
+    "overlapping windows, in either order": Cells(
+        "F[1,5] A and F[2,7] B",
+        lambda s: s["A"][..., 1:6].any(-1) & s["B"][..., 2:].any(-1),
+        {"A": (0, 0), "B": (0, 2)},
+    ),
+    "one visit that serves two": Cells(
+        "F[0,4] (A or B) and F[4,7] A",
+        lambda s: (s["A"] | s["B"])[..., :5].any(-1) & s["A"][..., 4:].any(-1),
+        {"A": (2, 0), "B": (0, 2)},
+    ),
+    "a dwell, then away": Cells(
+        "F[1,3] G[1,3] A and F[6,7] B",
+        lambda s: (
+            np.any([s["A"][..., k + 1 : k + 4].all(-1) for k in range(1, 4)], axis=0)
+            & s["B"][..., 6:].any(-1)
+        ),
+        {"A": (2, 2), "B": (2, 1)},
+    ),
+    "an always that begins late, and one that ends": Cells(
+        "F[0,7] A and G[0,3] not C and G[4,6] not B",
+        lambda s: s["A"].any(-1) & ~s["C"][..., :4].any(-1) & ~s["B"][..., 4:7].any(-1),
+        {"A": (2, 2), "B": (2, 1), "C": (0, 2)},
+    ),
+    "a dwell while another always begins": Cells(
+        "F[1,3] G[1,3] A and G[5,7] not A",
+        lambda s: (
+            np.any([s["A"][..., k + 1 : k + 4].all(-1) for k in range(1, 2)], axis=0)
+            & ~s["A"][..., 5:].any(-1)
+        ),
+        {"A": (2, 2)},
+    ),
+    "a dwell that serves a visit too": Cells(
+        "F[0,3] G[0,3] (A or B) and F[2,5] A",
+        lambda s: (
+            np.any([(s["A"] | s["B"])[..., k : k + 4].all(-1) for k in range(4)], axis=0)
+            & s["A"][..., 2:6].any(-1)
+        ),
+        {"A": (2, 2), "B": (2, 0)},
+    ),
+}
+
+ALONE = {
+    "overlapping windows, in either order": [
+        lambda s: s["A"][..., 1:6].any(-1),
+        lambda s: s["B"][..., 2:].any(-1),
+    ],
+    "one visit that serves two": [
+        lambda s: (s["A"] | s["B"])[..., :5].any(-1),
+        lambda s: s["A"][..., 4:].any(-1),
+    ],
+    "a dwell while another always begins": [
+        lambda s: np.any([s["A"][..., k + 1 : k + 4].all(-1) for k in range(1, 4)], axis=0),
+        lambda s: ~s["A"][..., 5:].any(-1),
+    ],
+}
+"""What each conjunct of a world asks for by itself."""
+
+RESTLESS = replace(ROBOT, name="restless", actions=ROBOT.actions[:WAIT])
+
+
+@pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
+def test_s_t_is_the_exact_feasible_set_where_it_can_be_enumerated(cells):
+    """On a lattice that f never leaves, every pose at every step of random ways: none claimed falsely, none
+    missed.
+    """
+    shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
+    random, seen = np.random.default_rng(2), set()
+    for i, j, heading in [(i, j, h) for i, j in ((0, 0), (0, 1), (2, 1), (2, 2), (4, 2)) for h in range(4)]:
+        history, carry = [cells.pose(i, j, heading)], None
+        for _ in range(cells.task.horizon):
+            expected = cells.feasible(history)
+            decision = decide(shield, history, np.zeros(5), carry=carry)
+            if decision.mode in ("shaped", "fallback"):
+                assert decision.j_values[:MOTIONS] == tuple(expected.astype(float))
+                seen.add(tuple(expected))
+            likely = (
+                np.flatnonzero(expected) if expected.any() and random.random() < 0.8 else np.arange(MOTIONS)
+            )
+            motion = int(random.choice(likely))
+            history, carry = [*history, decision.next_poses[motion]], decision.carry
+    assert len(seen) > 3
+
+
+@pytest.mark.parametrize("world", ALONE)
+def test_what_each_conjunct_has_a_future_for_need_not_have_one_for_all(world):
+    """Reasoning conjunct by conjunct claims pairs that no single future keeps; S_t has none of them."""
+    cells = WORLDS[world]
+    alone = [Cells(cells.formula, keeps, cells.regions) for keeps in ALONE[world]]
+    shield = make_shield([synthesise(cells.task, Settings(pitch=0.2))])
+    random, claimed = np.random.default_rng(4), 0
+    for i, j, heading in [(i, j, h) for i, j in ((0, 0), (0, 1), (2, 1), (2, 2), (4, 2)) for h in range(4)]:
+        history = [cells.pose(i, j, heading)]
+        for _ in range(cells.task.horizon):
+            decision = decide(shield, history, np.zeros(5))
+            if decision.mode not in ("shaped", "fallback"):
+                break
+            one_by_one = np.all([each.feasible(history) for each in alone], axis=0)
+            wrong = one_by_one & ~cells.feasible(history)
+            claimed += int(wrong.sum())
+            assert not np.array(decision.j_values[:MOTIONS])[wrong].any()
+            likely = np.flatnonzero(one_by_one) if one_by_one.any() else np.arange(MOTIONS)
+            history.append(decision.next_poses[int(random.choice(likely))])
+    assert claimed > 0
+
+
+@pytest.mark.parametrize("cells", WORLDS.values(), ids=list(WORLDS))
+def test_a_robot_that_cannot_wait_has_its_exact_feasible_set_too(cells):
+    """The same worlds without the motion that waits: tables step by step, all futures tried without it."""
+    task = replace(cells.task, robot=RESTLESS)
+    shield = make_shield([synthesise(task, Settings(pitch=0.2))])
+    random, seen = np.random.default_rng(3), set()
+    for i, j, heading in [(i, j, h) for i, j in ((0, 0), (2, 1), (2, 2), (4, 2)) for h in range(4)]:
+        history = [cells.pose(i, j, heading)]
+        for _ in range(task.horizon):
+            motions, kept = cells.futures(history)
+            kept &= (motions != WAIT).all(axis=1)
+            expected = np.array([kept[motions[:, 0] == m].any() for m in range(WAIT)])
+            decision = decide(shield, history, np.zeros(WAIT))
+            if decision.mode in ("shaped", "fallback"):
+                assert decision.j_values == tuple(expected.astype(float))
+                seen.add(tuple(expected))
+            motion = int(random.choice(np.flatnonzero(expected) if expected.any() else WAIT))
+            history.append(decision.next_poses[motion])
+    assert len(seen) > 3
+
+
+def test_a_robot_that_fits_nowhere_can_start_nowhere():
+    cannot_wait = {"actions": [{"name": "go", "translate": 0.2}, {"name": "left", "rotate": 0.5}]}
+    for robot in (STRETCH, robot_from_json({"footprint": {"radius": 1.0}, **cannot_wait})):
+        grid = OccupancyGrid(np.ones((12, 12), bool) if robot is STRETCH else np.zeros((12, 12), bool), 0.1)
+        policy = synthesise(make_task(grid, robot, "F[0,9] x > 0.5"))
+        assert policy.card["metrics"]["feasible_start"] == 0.0
+
+
+def test_a_policy_comes_back_from_its_files_as_it_was():
+    task = WORLDS["in turn, with a forbidden cell"].task
+    restless = synthesise(replace(task, robot=RESTLESS), Settings(pitch=0.2))
+    again = load_policy(restless.weights(), restless.card, restless.task)
+    np.testing.assert_array_equal(again.tables.bits, restless.tables.bits)
+    policy = synthesise(task, Settings(pitch=0.2))
+    history = np.array([[0.1, 0.1, 0.0]])
+    again = load_policy(policy.weights(), policy.card, task)
+    ours, theirs = policy.propose(history, {}, 0.0), again.propose(history, {}, 0.0)
+    np.testing.assert_array_equal(ours.motions, theirs.motions)
+    np.testing.assert_array_equal(ours.poses, theirs.poses)
+    assert synthesise(task, Settings(pitch=0.2)).weights() == policy.weights()
+    assert policy.id != synthesise(task, Settings(pitch=0.1)).id
+    for options in ({"pitch": 0.1}, {"pitch": 0.2, "beam": 0}, {"pitch": "fine"}):
+        with pytest.raises(PolicyError):
+            load_policy(policy.weights(), {**policy.card, "options": options}, task)
+    with pytest.raises(PolicyError, match="safetensors"):
+        load_policy(policy.weights()[:-9], policy.card, task)
+    for theirs in (policy.weights(), save({"cell": again.tables.cell, "bits": again.tables.bits[1:]})):
+        with pytest.raises(PolicyError) as caught:
+            load_policy(theirs, restless.card, restless.task)
+        assert caught.value.path.startswith("weights")
+    cell = restless.tables.cell.copy()
+    cell[0, 0] += 1000
+    with pytest.raises(PolicyError, match="fit"):
+        load_policy(save({"cell": cell, "bits": again.tables.bits}), restless.card, restless.task)
+
+
+def test_a_visit_is_no_graze_where_there_is_time():
+    """In an empty room, to a circle of 0.5 m: a deadline far away buys depth, a near one is kept as it is."""
+    regions = {"A": {"type": "circle", "center": [3.0, 1.5], "radius": 0.5}}
+    grid, pose = OccupancyGrid(np.zeros((30, 40), bool), 0.1), np.array([[0.5, 1.5, 0.0]])
+    for deadline, depth in ((40, 0.2), (15, 0.0)):
+        task = make_task(grid, STRETCH, f"F[0,{deadline}] A", regions)
+        found = synthesise(task).propose(pose, {}, 0.0)
+        assert task.samples(found.poses)["A"].max(axis=1).min() > depth
+
+
+def test_what_the_tables_do_not_cover_is_refused():
+    regions = {"A": {"type": "circle", "center": [0.5, 0.5], "radius": 0.2}}
+    grid = OccupancyGrid(np.zeros((20, 20), bool), 0.1)
+    with pytest.raises(FragmentError, match="too many"):
+        synthesise(make_task(grid, STRETCH, " and ".join(f"F[0,{k}] A" for k in range(1, 10)), regions))
+    with pytest.raises(PolicyError, match="not in range") as caught:
+        read_settings({"pitch": 0})
+    assert caught.value.path == "options.pitch"
+    huge = OccupancyGrid(np.zeros((1000, 1000), bool), 0.05)
+    with pytest.raises(PolicyError, match="too large"):
+        synthesise(make_task(huge, STRETCH, "F[0,9] A", regions), Settings(pitch=0.02))
