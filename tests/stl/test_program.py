@@ -34,8 +34,8 @@ def test_packed_programs() -> None:
     stack = np.empty(STACK_SIZE)
     for k, predicate in enumerate(predicates):
         rho = robustness(predicate, {name: [state[i]] for name, i in SLOTS.items()})
-        assert evaluate_packed(k, *packed, state, stack) == rho
-    assert np.isnan(evaluate_packed(3, *packed, np.zeros(len(SLOTS)), stack))
+        assert evaluate_packed(k, packed, state, stack) == rho
+    assert np.isnan(evaluate_packed(3, packed, np.zeros(len(SLOTS)), stack))
     assert pack([]).starts.tolist() == [0]
 
 

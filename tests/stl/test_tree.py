@@ -27,7 +27,7 @@ def run(formula: Formula, samples: dict[str, list[float]], known: int) -> tuple[
             low[i], high[i] = tree.low[n], tree.high[n]
             if t < known:
                 values = np.array([samples[name][t] for name in NAMES])
-                low[i] = high[i] = evaluate_packed(n, *tree.programs, values, stack)
+                low[i] = high[i] = evaluate_packed(n, tree.programs, values, stack)
     whole = tree_value(tree, low.copy()) if known > formula.horizon else None
     return *tree_bounds(tree, low, high), whole
 

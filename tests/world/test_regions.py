@@ -96,7 +96,7 @@ def test_moving_by_d_changes_the_distance_by_at_most_d(region, point, angle, d):
 def test_packed_regions_give_the_very_same_numbers(regions, point):
     packed = pack_regions(regions)
     for i, region in enumerate(regions):
-        assert region_distance(i, *packed, *point) == signed_distance(region, point)
+        assert region_distance(packed, i, *point) == signed_distance(region, point)
 
 
 @settings(deadline=None)  # numba compiles on the first call

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from specshield.compiled import inlined, kernel, leaf
 from specshield.robot.unicycle import TOUCH, Body, free_distance, in_collision, step, wrap
 from specshield.rule.progress import STACK, Rules, read_predicates, value_count
+from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
-from specshield.task import POSE_NAMES
 
 MAX_HEADINGS = 120
-HEADING_SLOT = POSE_NAMES.index("theta")
 
 
 class Lattice(NamedTuple):
@@ -141,7 +140,7 @@ def holds_at(body: Body, rules: Rules, lattice: Lattice) -> NDArray[np.uint8]:
     ny, nx, headings = lattice.valid.shape
     out = np.zeros((rules.kind.shape[0], ny, nx, headings), np.uint8)
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
-    turns_matter = np.any((rules.ops == VALUE) & (rules.args == HEADING_SLOT))
+    turns_matter = np.any((rules.programs.ops == VALUE) & (rules.programs.args == HEADING))
     for j in range(ny):
         for i in range(nx):
             fresh = True

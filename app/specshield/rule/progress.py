@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import inlined, kernel, leaf
+from specshield.compiled import kernel, leaf
 from specshield.errors import FragmentError
+from specshield.rule.values import REGIONS, fill_place, fill_signals, initial_signals, places, regions_of
 from specshield.stl import Obligation, obligations
-from specshield.stl.program import STACK_SIZE, compile_predicate, evaluate_packed, pack
-from specshield.task import POSE_NAMES, Task
-from specshield.world.regions import pack_regions, region_distance
+from specshield.stl.program import STACK_SIZE, Programs, compile_predicate, evaluate_packed, pack
+from specshield.task import Task
+from specshield.world.regions import PackedRegions
 
 EVENTUALLY, ALWAYS, EVENTUALLY_ALWAYS = 0, 1, 2
 KINDS = {"eventually": EVENTUALLY, "always": ALWAYS, "eventually_always": EVENTUALLY_ALWAYS}
@@ -28,7 +29,7 @@ STACK = STACK_SIZE
 
 
 class Rules(NamedTuple):
-    """A formula's K obligations as flat arrays. Predicates read `values`: x, y, theta, regions, signals."""
+    """A formula's K obligations as flat arrays."""
 
     kind: NDArray[np.int64]  # [K]
     a: NDArray[np.int64]  # [K] windows in absolute steps, closed
@@ -36,14 +37,9 @@ class Rules(NamedTuple):
     c1: NDArray[np.int64]
     c2: NDArray[np.int64]
     last: NDArray[np.int64]  # [K] the step by which the obligation is decided
-    ops: NDArray[np.int64]  # packed predicate programs
-    args: NDArray[np.float64]
-    starts: NDArray[np.int64]  # [K + 1]
-    region_starts: NDArray[np.int64]
-    region_kinds: NDArray[np.int64]
-    region_offsets: NDArray[np.int64]
-    region_data: NDArray[np.float64]
-    signals: NDArray[np.float64]  # [n] the value each signal holds
+    programs: Programs  # of the K predicates, over `values` (rule/values.py)
+    regions: PackedRegions
+    signals: NDArray[np.float64]  # [S] the value each signal holds
     margin: float  # an obligation holds where its predicate's robustness is above this
 
 
@@ -53,10 +49,7 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
     if len(parts) > MAX_OBLIGATIONS:
         expected = f"at most {MAX_OBLIGATIONS}; or method 'planner', which takes any formula"
         raise FragmentError("too many obligations", got=len(parts), expected=expected)
-    names = [*POSE_NAMES, *task.regions, *task.signals]
-    slots = {name: i for i, name in enumerate(names)}
-    ops, args, starts = pack([compile_predicate(part.predicate, slots) for part in parts])
-    regions = pack_regions(list(task.regions.values()))
+    known = places(task)
 
     def column(values: list[int]) -> NDArray[np.int64]:
         return np.array(values, dtype=np.int64)
@@ -68,14 +61,9 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
         c1=column([p.c1 for p in parts]),
         c2=column([p.c2 for p in parts]),
         last=column([last_step(p) for p in parts]),
-        ops=ops,
-        args=args,
-        starts=starts,
-        region_starts=regions.starts,
-        region_kinds=regions.kinds,
-        region_offsets=regions.offsets,
-        region_data=regions.data,
-        signals=np.array([task.signals[name] for name in task.signals], dtype=np.float64),
+        programs=pack([compile_predicate(part.predicate, known) for part in parts]),
+        regions=regions_of(task),
+        signals=initial_signals(task),
         margin=margin,
     )
 
@@ -95,20 +83,7 @@ def signal_rows(task: Task, signals: Mapping[str, NDArray[np.float64]], n: int) 
 
 @leaf
 def value_count(rules: Rules) -> int:
-    return int(3 + rules.region_starts.shape[0] - 1 + rules.signals.shape[0])
-
-
-@inlined
-def read_values(rules: Rules, x: float, y: float, theta: float, values: NDArray[np.float64]) -> None:
-    """What the predicates read at a pose, into `values`, shape (value_count,)."""
-    values[0], values[1], values[2] = x, y, theta
-    n = rules.region_starts.shape[0] - 1
-    for i in range(n):
-        values[3 + i] = region_distance(
-            i, rules.region_starts, rules.region_kinds, rules.region_offsets, rules.region_data, x, y
-        )
-    for i in range(rules.signals.shape[0]):
-        values[3 + n + i] = rules.signals[i]
+    return int(REGIONS + rules.regions.starts.shape[0] - 1 + rules.signals.shape[0])
 
 
 @leaf
@@ -122,9 +97,10 @@ def read_predicates(
     out: NDArray[np.float64],
 ) -> None:
     """The robustness of each obligation's predicate at a pose, into `out`, shape (K,)."""
-    read_values(rules, x, y, theta, values)
+    fill_place(rules.regions, x, y, theta, values)
+    fill_signals(rules.regions, rules.signals, values)
     for k in range(rules.kind.shape[0]):
-        out[k] = evaluate_packed(k, rules.ops, rules.args, rules.starts, values, stack)
+        out[k] = evaluate_packed(k, rules.programs, values, stack)
 
 
 @leaf

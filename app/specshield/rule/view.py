@@ -10,18 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel
+from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
 from specshield.stl import Formula
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
 from specshield.stl.tree import Tree, compile_tree, tree_bounds, tree_value
-from specshield.task import POSE_NAMES, Task
-from specshield.world.regions import PackedRegions, pack_regions, region_distance
+from specshield.task import Task
+from specshield.world.regions import PackedRegions
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 class View(NamedTuple):
-    """A formula over a task. Its leaves read, at each step: x, y, theta, R regions, S signals.
+    """A formula over a task with R regions and S signals. Its leaves read `values` (rule/values.py).
 
     first, last [R]: the steps between which some leaf reads a region.
     """
@@ -36,17 +37,16 @@ class View(NamedTuple):
 def view_of(task: Task, formula: Formula) -> View:
     """The formula, or a part of it, prepared once."""
     names = list(task.regions)
-    slots = {name: i for i, name in enumerate([*POSE_NAMES, *names, *task.signals])}
-    tree = compile_tree(formula, slots)
+    tree = compile_tree(formula, places(task))
     first, last = np.full(len(names), np.iinfo(np.int64).max), np.full(len(names), -1)
     programs = tree.programs
     for n in range(len(tree.leaf_at)):
         code = slice(programs.starts[n], programs.starts[n + 1])
-        for slot in programs.args[code][programs.ops[code] == VALUE]:
-            r = int(slot) - len(POSE_NAMES)
+        for place in programs.args[code][programs.ops[code] == VALUE]:
+            r = int(place) - REGIONS
             if 0 <= r < len(names):
                 first[r], last[r] = min(first[r], tree.leaf_start[n]), max(last[r], tree.leaf_stop[n] - 1)
-    return View(tree, pack_regions(list(task.regions.values())), first, last)
+    return View(tree, regions_of(task), first, last)
 
 
 @inlined
@@ -57,7 +57,7 @@ def _read(
 
     signals (m, S): of the same steps, the last held. values (3 + R + S,), stack: scratch.
     """
-    tree, programs, areas = view.tree, view.tree.programs, view.regions
+    tree, first_signal = view.tree, REGIONS + view.first.shape[0]
     regions, leaves, held = view.first.shape[0], tree.leaf_at.shape[0], signals.shape[0] - 1
     sound = True
     for k in range(poses.shape[0]):
@@ -65,21 +65,19 @@ def _read(
         placed = k > 0 and x == poses[k - 1, 0] and y == poses[k - 1, 1]
         same = placed and theta == poses[k - 1, 2] and k > held
         if not same:
-            values[0], values[1], values[2] = x, y, theta
+            fill_pose(x, y, theta, values)
             for s in range(signals.shape[1]):
-                values[3 + regions + s] = signals[min(k, held), s]
+                values[first_signal + s] = signals[min(k, held), s]
         for r in range(regions):
             if view.first[r] <= t <= view.last[r] and not (placed and t > view.first[r]):
-                values[3 + r] = region_distance(r, areas.starts, areas.kinds, areas.offsets, areas.data, x, y)
+                fill_region(view.regions, r, x, y, values)
         for n in range(leaves):
             if tree.leaf_start[n] <= t < tree.leaf_stop[n]:
                 i = tree.leaf_at[n] + t - tree.leaf_start[n]
                 if same and t > tree.leaf_start[n]:
                     buffer[i] = buffer[i - 1]
                 else:
-                    buffer[i] = evaluate_packed(
-                        n, programs.ops, programs.args, programs.starts, values, stack
-                    )
+                    buffer[i] = evaluate_packed(n, tree.programs, values, stack)
                     sound = sound and not math.isnan(buffer[i])
     return sound
 
@@ -91,7 +89,7 @@ def look(view: View, poses: Floats, signals: Floats, known: Floats) -> tuple[flo
     poses (t + 1, 3), signals (t + 1, S). known (tree.size,): the leaves at the steps to t are written there.
     """
     tree, stop = view.tree, poses.shape[0]
-    values = np.empty(3 + view.first.shape[0] + signals.shape[1])
+    values = np.empty(REGIONS + view.first.shape[0] + signals.shape[1])
     if not _read(view, poses, signals, 0, values, np.empty(STACK_SIZE), known):
         return math.nan, math.nan
     low, high = known.copy(), known.copy()
@@ -109,7 +107,7 @@ def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Fl
     held (1, S): the values that the signals keep from step t + 1 on.
     """
     tree = view.tree
-    values = np.empty(3 + view.first.shape[0] + held.shape[1])
+    values = np.empty(REGIONS + view.first.shape[0] + held.shape[1])
     stack, buffer = np.empty(STACK_SIZE), np.empty(tree.size)
     for f in range(poses.shape[0]):
         for n in range(tree.leaf_at.shape[0]):

@@ -163,12 +163,7 @@ def evaluate(ops: NDArray[np.int64], args: NDArray[np.float64], values: NDArray[
 
 @inlined
 def evaluate_packed(
-    k: int,
-    ops: NDArray[np.int64],
-    args: NDArray[np.float64],
-    starts: NDArray[np.int64],
-    values: NDArray[np.float64],
-    stack: NDArray[np.float64],
+    k: int, programs: Programs, values: NDArray[np.float64], stack: NDArray[np.float64]
 ) -> float:
-    """The robustness of program k of `Programs`; stack float64[STACK_SIZE] is scratch."""
-    return _run(ops, args, starts[k], starts[k + 1], values, stack)
+    """The robustness of program k of `programs`; stack float64[STACK_SIZE] is scratch."""
+    return _run(programs.ops, programs.args, programs.starts[k], programs.starts[k + 1], values, stack)

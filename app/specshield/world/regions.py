@@ -93,7 +93,7 @@ def signed_distance(region: Region, points: ArrayLike) -> NDArray[np.float64]:
     """Metres to the region's boundary, positive inside. points [..., 2] in the map frame, result [...]."""
     array = np.asarray(points, dtype=np.float64)
     flat = np.ascontiguousarray(array.reshape(-1, 2))
-    result: NDArray[np.float64] = _distances(*_packed(region), flat).reshape(array.shape[:-1])
+    result: NDArray[np.float64] = _distances(_packed(region), flat).reshape(array.shape[:-1])
     return result
 
 
@@ -141,22 +141,14 @@ def pack_regions(regions: Sequence[Region]) -> PackedRegions:
 
 
 @inlined
-def region_distance(
-    i: int,
-    starts: NDArray[np.int64],
-    kinds: NDArray[np.int64],
-    offsets: NDArray[np.int64],
-    data: NDArray[np.float64],
-    x: float,
-    y: float,
-) -> float:
+def region_distance(regions: PackedRegions, i: int, x: float, y: float) -> float:
     """Signed distance of the point (x, y) to packed region i, metres, positive inside."""
-    best = -np.inf
-    for part in range(starts[i], starts[i + 1]):
-        begin, end = offsets[part], offsets[part + 1]
-        if kinds[part] == CIRCLE:
+    data, best = regions.data, -np.inf
+    for part in range(regions.starts[i], regions.starts[i + 1]):
+        begin, end, kind = regions.offsets[part], regions.offsets[part + 1], regions.kinds[part]
+        if kind == CIRCLE:
             d = data[begin + 2] - math.sqrt((x - data[begin]) ** 2 + (y - data[begin + 1]) ** 2)
-        elif kinds[part] == RECTANGLE:
+        elif kind == RECTANGLE:
             dx = min(x - data[begin], data[begin + 2] - x)
             dy = min(y - data[begin + 1], data[begin + 3] - y)
             d = -math.sqrt(dx * dx + dy * dy) if dx < 0.0 and dy < 0.0 else min(dx, dy)
@@ -186,16 +178,10 @@ def _polygon_distance(data: NDArray[np.float64], begin: int, end: int, x: float,
 
 
 @kernel
-def _distances(
-    starts: NDArray[np.int64],
-    kinds: NDArray[np.int64],
-    offsets: NDArray[np.int64],
-    data: NDArray[np.float64],
-    points: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _distances(regions: PackedRegions, points: NDArray[np.float64]) -> NDArray[np.float64]:
     out = np.empty(points.shape[0])
     for k in range(points.shape[0]):
-        out[k] = region_distance(0, starts, kinds, offsets, data, points[k, 0], points[k, 1])
+        out[k] = region_distance(regions, 0, points[k, 0], points[k, 1])
     return out
 
 

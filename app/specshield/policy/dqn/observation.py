@@ -22,10 +22,10 @@ from specshield.rule.progress import (
     read_predicates,
     value_count,
 )
+from specshield.rule.values import HEADING, REGIONS, fill_pose, fill_region
 from specshield.stl.program import VALUE, evaluate_packed
 from specshield.task import Task
 from specshield.world.geodesic import geodesic_distance
-from specshield.world.regions import region_distance
 
 GLOBAL, PER_GOAL, PER_ALWAYS, PER_MOTION = 5, 10, 2, 3
 FAR = 2.0  # distances are given in units of 5 m, up to this
@@ -67,8 +67,9 @@ def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
         goal = predicates[k] > rules.margin
         reachable = allowed & goal
         fields.append(_fill(geodesic_distance(allowed, reachable, grid.resolution), grid.resolution))
-    owner = np.repeat(rules.kind, np.diff(rules.starts))
-    read = set(rules.args[(rules.ops == VALUE) & (owner == ALWAYS)].astype(int).tolist())
+    programs = rules.programs
+    owner = np.repeat(rules.kind, np.diff(programs.starts))
+    read = set(programs.args[(programs.ops == VALUE) & (owner == ALWAYS)].astype(int).tolist())
     xmin, ymin, xmax, ymax = grid.bounds
     distance = np.stack(fields) if fields else np.zeros((0, grid.height, grid.width))
     return Sight(
@@ -80,8 +81,8 @@ def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
         half_y=0.5 * (ymax - ymin),
         horizon=task.horizon,
         stride=float(max(np.max(np.abs(body.translate)), 0.05)),
-        guards=np.array([i for i in range(len(rules.region_starts) - 1) if 3 + i in read], dtype=np.int64),
-        turns_matter=2 in read,
+        guards=np.array([r for r in range(len(task.regions)) if REGIONS + r in read], dtype=np.int64),
+        turns_matter=HEADING in read,
     )
 
 
@@ -266,12 +267,10 @@ def _safety_at(
     predicates: NDArray[np.float64],
 ) -> np.float32:
     """_safety at a pose; values, stack, predicates (K,): scratch."""
-    values[0], values[1], values[2] = x, y, theta
-    for i in sight.guards:
-        values[3 + i] = region_distance(
-            i, rules.region_starts, rules.region_kinds, rules.region_offsets, rules.region_data, x, y
-        )
+    fill_pose(x, y, theta, values)
+    for r in sight.guards:
+        fill_region(rules.regions, r, x, y, values)
     for k in range(rules.kind.shape[0]):
         if rules.kind[k] == ALWAYS:
-            predicates[k] = evaluate_packed(k, rules.ops, rules.args, rules.starts, values, stack)
+            predicates[k] = evaluate_packed(k, rules.programs, values, stack)
     return _safety(rules, t, predicates)

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf
+from specshield.rule.values import fill_place
 from specshield.rule.view import View, view_of
 from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until
 from specshield.stl.program import evaluate_packed
 from specshield.stl.tree import tree_bounds
 from specshield.task import Task
-from specshield.world.regions import region_distance
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -174,26 +174,19 @@ def read_pose(
     agenda: Agenda, x: float, y: float, theta: float, values: Floats, stack: Floats, rho: Floats
 ) -> None:
     """The predicates' robustness at a pose, rho (P,). values (3 + R + S,): its signals are read."""
-    areas = agenda.rule.regions
-    programs = agenda.rule.tree.programs
-    values[0], values[1], values[2] = x, y, theta
-    for r in range(agenda.rule.first.shape[0]):
-        values[3 + r] = region_distance(r, areas.starts, areas.kinds, areas.offsets, areas.data, x, y)
+    fill_place(agenda.rule.regions, x, y, theta, values)
     for p in range(rho.shape[0]):
         n = agenda.predicate[p, 0]
-        rho[p] = agenda.predicate[p, 1] * evaluate_packed(
-            n, programs.ops, programs.args, programs.starts, values, stack
-        )
+        rho[p] = agenda.predicate[p, 1] * evaluate_packed(n, agenda.rule.tree.programs, values, stack)
 
 
 @leaf
 def read_signals(agenda: Agenda, values: Floats, stack: Floats, held: Floats) -> None:
     """What the leaves that read signals alone keep, held (l,)."""
-    programs = agenda.rule.tree.programs
     for n in range(held.shape[0]):
         held[n] = 0.0
         if agenda.leaf[n, 0] < 0:
-            held[n] = evaluate_packed(n, programs.ops, programs.args, programs.starts, values, stack)
+            held[n] = evaluate_packed(n, agenda.rule.tree.programs, values, stack)
 
 
 @leaf

@@ -15,8 +15,9 @@ from specshield.compiled import kernel, leaf
 from specshield.policy.lattice import Lattice, coordinates, pose_of
 from specshield.policy.reachability.latest import NEVER, sweep
 from specshield.robot.unicycle import Body
+from specshield.rule.values import REGIONS, fill_place, fill_pose, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE, Programs, evaluate_packed
-from specshield.world.regions import PackedRegions, region_distance
+from specshield.world.regions import PackedRegions
 
 FAR = 1000.0  # [steps] what is farther is out of reach
 SCALE = 64.0  # codes a step
@@ -46,10 +47,11 @@ def values_at(
     The programs read x, y, theta, the regions, then `signals` (S,).
     """
     ny, nx, headings = lattice.valid.shape
-    count, regions = programs.starts.shape[0] - 1, areas.starts.shape[0] - 1
+    count = programs.starts.shape[0] - 1
     out = np.full((count, ny, nx, headings), -np.inf, np.float32)
-    values, stack = np.empty(3 + regions + signals.shape[0]), np.empty(STACK_SIZE)
-    values[3 + regions :] = signals
+    values = np.empty(REGIONS + region_count(areas) + signals.shape[0])
+    stack = np.empty(STACK_SIZE)
+    fill_signals(areas, signals, values)
     for j in range(ny):
         for i in range(nx):
             fresh = True
@@ -57,17 +59,12 @@ def values_at(
                 if not lattice.valid[j, i, h]:
                     continue
                 x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
-                values[0], values[1], values[2] = x, y, theta
-                if fresh:
-                    for r in range(regions):
-                        values[3 + r] = region_distance(
-                            r, areas.starts, areas.kinds, areas.offsets, areas.data, x, y
-                        )
+                if fresh:  # regions do not turn with the robot
+                    fill_place(areas, x, y, theta, values)
                     fresh = False
+                fill_pose(x, y, theta, values)
                 for p in range(count):
-                    out[p, j, i, h] = evaluate_packed(
-                        p, programs.ops, programs.args, programs.starts, values, stack
-                    )
+                    out[p, j, i, h] = evaluate_packed(p, programs, values, stack)
     return out
 
 

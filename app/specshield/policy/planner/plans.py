@@ -10,6 +10,7 @@ from specshield.policy.detour import NONE, join, undoing
 from specshield.policy.planner.agenda import Bounds, foresee, is_open, read_signals
 from specshield.policy.planner.approach import LENGTH, WIDTH, Work, World, move, read_at, stay
 from specshield.policy.planner.search import DEEP, Nodes, search, value
+from specshield.rule.values import REGIONS, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE
 
 SHARE = 0.25  # of the effort of one plan: what a first motion may cost that the plan does not begin with
@@ -54,8 +55,8 @@ def propose_all(
     agenda, (count, steps) = world.agenda, motions.shape
     size, literals, leaves = prefix.shape[0], agenda.literal.shape[0], agenda.leaf.shape[0]
     bounds = Bounds(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
-    values = np.zeros(3 + agenda.rule.first.shape[0] + signals.shape[0])
-    values[values.shape[0] - signals.shape[0] :] = signals
+    values = np.zeros(REGIONS + region_count(agenda.rule.regions) + signals.shape[0])
+    fill_signals(agenda.rule.regions, signals, values)
     work = Work(
         values, np.empty(STACK_SIZE), np.empty(agenda.predicate.shape[0]), np.empty(leaves), prefix.copy(),
         np.empty(size), bounds, np.empty(count), np.empty((LENGTH + 1, WIDTH, 4)),

@@ -46,12 +46,12 @@ from specshield.policy.tensors import read_tensors
 from specshield.robot.unicycle import Body, make_body
 from specshield.rule.progress import signal_rows
 from specshield.rule.residual import bounds_after, residuals, still_open
+from specshield.rule.values import REGIONS, initial_signals, places, regions_of
 from specshield.rule.view import look
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.stl.program import STACK_SIZE, compile_predicate, pack
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL
-from specshield.task import POSE_NAMES, Task
-from specshield.world.regions import pack_regions
+from specshield.task import Task
 
 MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
 MAX_FIELDS = 32
@@ -287,12 +287,9 @@ def _shape(task: Task, settings: Settings) -> tuple[int, int, int]:
 
 def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> NDArray[np.bool_]:
     """Where each literal holds, [L, ny, nx, H], with the signals at their initial values."""
-    names = [*POSE_NAMES, *task.regions, *task.signals]
-    slots = {name: i for i, name in enumerate(names)}
-    programs = pack([compile_predicate(each.predicate, slots) for each in literals])
-    signals = np.array([task.signals[name] for name in task.signals], np.float64)
-    areas = pack_regions(list(task.regions.values()))
-    values = values_at(make_body(task.robot, task.grid), lattice, areas, programs, signals)
+    known, body = places(task), make_body(task.robot, task.grid)
+    programs = pack([compile_predicate(each.predicate, known) for each in literals])
+    values = values_at(body, lattice, regions_of(task), programs, initial_signals(task))
     sides = np.array([each.side for each in literals]).reshape(-1, 1, 1, 1)
     holds: NDArray[np.bool_] = (values * sides > SATISFIED_ABOVE) & (lattice.valid == 1)
     return holds
@@ -305,7 +302,7 @@ def _kept(task: Task, agenda: Agenda, literals: tuple[Literal, ...]) -> tuple[li
     """
     size = agenda.rule.tree.size
     bounds = Bounds(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
-    values = np.concatenate([np.zeros(3 + len(task.regions)), list(task.signals.values())])
+    values = np.concatenate([np.zeros(REGIONS + len(task.regions)), initial_signals(task)])
     held = np.empty(len(agenda.leaf))
     read_signals(agenda, values, np.empty(STACK_SIZE), held)
     foresee(agenda, -1, np.empty(size), held, bounds.low, bounds.high)

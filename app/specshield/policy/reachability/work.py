@@ -11,8 +11,8 @@ from specshield.compiled import inlined, kernel
 from specshield.policy.reachability.tables import Tables, goals_settled
 from specshield.robot.unicycle import Body
 from specshield.rule.progress import EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
+from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
 from specshield.stl.program import VALUE, evaluate_packed
-from specshield.world.regions import region_distance
 
 
 class Guide(NamedTuple):
@@ -51,19 +51,16 @@ def make_work(rules: Rules, motions: int) -> Work:
 def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, work: Work) -> float:
     """The robustness of one obligation's predicate at a pose: only the regions that it names are measured."""
     values = work.values
-    values[0], values[1], values[2] = x, y, theta
-    regions = rules.region_starts.shape[0] - 1
-    for i in range(rules.starts[k], rules.starts[k + 1]):
-        if rules.ops[i] == VALUE:
-            slot = int(rules.args[i])
-            if 3 <= slot < 3 + regions:
-                values[slot] = region_distance(
-                    slot - 3, rules.region_starts, rules.region_kinds, rules.region_offsets,
-                    rules.region_data, x, y,
-                )  # fmt: skip
-            elif slot >= 3:
-                values[slot] = rules.signals[slot - 3 - regions]
-    return float(evaluate_packed(k, rules.ops, rules.args, rules.starts, values, work.stack))
+    fill_pose(x, y, theta, values)
+    programs, first_signal = rules.programs, REGIONS + region_count(rules.regions)
+    for i in range(programs.starts[k], programs.starts[k + 1]):
+        if programs.ops[i] == VALUE:
+            place = int(programs.args[i])
+            if REGIONS <= place < first_signal:
+                fill_region(rules.regions, place - REGIONS, x, y, values)
+            elif place >= first_signal:
+                values[place] = rules.signals[place - first_signal]
+    return float(evaluate_packed(k, programs, values, work.stack))
 
 
 @inlined

@@ -1,0 +1,67 @@
+"""What a formula's predicates read at one state, as one array: the pose, the regions, the signals.
+
+`values` holds x, y [m] and theta [rad], then the signed distance to each of the task's R regions [m], then
+each of its S signals. Programs (stl/program.py) name what they read by its place in this array. Everything
+that evaluates predicates fills it here, so that the places mean the same to all.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import inlined
+from specshield.task import POSE_NAMES, Task
+from specshield.world.regions import PackedRegions, pack_regions, region_distance
+
+Floats = NDArray[np.float64]
+
+HEADING = POSE_NAMES.index("theta")
+REGIONS = len(POSE_NAMES)  # the place of the first region
+
+
+def places(task: Task) -> dict[str, int]:
+    """The place of every name that the task's formula may use."""
+    return {name: i for i, name in enumerate([*POSE_NAMES, *task.regions, *task.signals])}
+
+
+def regions_of(task: Task) -> PackedRegions:
+    """The task's regions in the order of their places."""
+    return pack_regions(list(task.regions.values()))
+
+
+def initial_signals(task: Task) -> Floats:
+    """The values that the signals hold before their first samples, shape (S,)."""
+    return np.array(list(task.signals.values()), np.float64)
+
+
+@inlined
+def region_count(regions: PackedRegions) -> int:
+    return int(regions.starts.shape[0] - 1)
+
+
+@inlined
+def fill_pose(x: float, y: float, theta: float, values: Floats) -> None:
+    values[0], values[1], values[2] = x, y, theta
+
+
+@inlined
+def fill_region(regions: PackedRegions, r: int, x: float, y: float, values: Floats) -> None:
+    """The signed distance of (x, y) to region r. Formulas often need only some: regions cost the most."""
+    values[REGIONS + r] = region_distance(regions, r, x, y)
+
+
+@inlined
+def fill_place(regions: PackedRegions, x: float, y: float, theta: float, values: Floats) -> None:
+    """The pose and every region; the signals are left as they are."""
+    fill_pose(x, y, theta, values)
+    for r in range(region_count(regions)):
+        fill_region(regions, r, x, y, values)
+
+
+@inlined
+def fill_signals(regions: PackedRegions, signals: Floats, values: Floats) -> None:
+    """signals (S,)."""
+    first = REGIONS + region_count(regions)
+    for s in range(signals.shape[0]):
+        values[first + s] = signals[s]
