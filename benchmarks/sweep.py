@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from benchmarks.decisions import ask, warm
 from benchmarks.states import State, shipped_dqn
 from benchmarks.timing import summary
+from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.observation import PER_MOTION, observation_size
-from specshield.policy.dqn.policy import Policy, make_card
+from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import STRETCH, Robot
 from specshield.robot.actions import Action

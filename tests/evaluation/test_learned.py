@@ -10,7 +10,7 @@ from safetensors.numpy import save
 from evaluation.model.measure import alone
 from evaluation.model.transformer import Transformer, export
 from specshield.errors import NotFound, PolicyError
-from specshield.policy.dqn.policy import read_tensors
+from specshield.policy.tensors import read_tensors
 from specshield.robot import STRETCH
 from specshield.sim.cases import MODELS
 from specshield.sim.learned.model import CARD, FOLDER, WEIGHTS, load_learned, target_of

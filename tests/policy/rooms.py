@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from specshield.policy.card import make_card
 from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.observation import observation_size
-from specshield.policy.dqn.policy import Policy, make_card
+from specshield.policy.dqn.policy import Policy
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.unicycle import make_body
 from specshield.rule.progress import make_rules

@@ -9,8 +9,8 @@ import httpx
 import numpy as np
 from safetensors.numpy import save
 
+from specshield.policy.card import make_card
 from specshield.policy.dqn.observation import observation_size
-from specshield.policy.dqn.policy import make_card
 from specshield.robot import robot_from_json
 from specshield.robot.unicycle import make_body
 from specshield.rule.progress import make_rules

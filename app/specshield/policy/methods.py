@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from specshield.errors import PolicyError
-from specshield.policy.dqn.policy import Card, Proposer, load_dqn
+from specshield.policy.card import Card
+from specshield.policy.dqn.policy import Proposer, load_dqn
 from specshield.policy.planner.policy import load_planner
 from specshield.policy.reachability.policy import load_reachability
 from specshield.task import Task

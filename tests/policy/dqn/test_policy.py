@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from specshield.errors import PolicyError
+from specshield.policy.card import policy_id
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.network import greedy, make_network
 from specshield.policy.dqn.observation import PER_MOTION, observation_size, observe
-from specshield.policy.dqn.policy import policy_id, undoing_motions, wait_motion
+from specshield.policy.dqn.policy import undoing_motions, wait_motion
 from specshield.policy.dqn.rollout import rollout
 from specshield.policy.dqn.train import _QNetwork
 from specshield.policy.methods import load_policy

@@ -4,30 +4,25 @@ unpickled.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
+from specshield.policy.card import Card
 from specshield.policy.dqn.network import Network, make_network
 from specshield.policy.dqn.observation import Sight, make_sight, observation_size
 from specshield.policy.dqn.rollout import propose_all
 from specshield.policy.tensors import read_tensors
-from specshield.robot import Robot, robot_to_json
+from specshield.robot import Robot
 from specshield.robot.unicycle import Body, make_body
 from specshield.rule.progress import Rules, make_rules, pasts, signal_rows
 from specshield.task import Task
-from specshield.world.regions import region_to_json
-
-Card = dict[str, Any]
-FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -134,50 +129,6 @@ def undoing_motions(robot: Robot) -> NDArray[np.int64]:
 
     both = [(back(rotate, turns), back(translate, moves)) for translate, rotate in robot.motions]
     return np.array([(a, b) if a >= 0 else (b, a) for a, b in both], np.int64).reshape(-1, 2)
-
-
-def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:
-    """The hash of task, method, options and seed, as hex."""
-    content = json.dumps(
-        {"task": task_hash, "method": method, "options": options, "seed": seed}, sort_keys=True
-    )
-    return hashlib.sha256(content.encode()).hexdigest()
-
-
-def make_card(
-    task: Task,
-    method: str,
-    options: Mapping[str, Any],
-    seed: int,
-    metrics: Mapping[str, Any],
-    spec: Mapping[str, Any] | None = None,
-) -> Card:
-    """What is told of a policy beside its weights. `metrics` holds measured figures and the wall time.
-
-    spec: the spec as it was given; by default the canonical formula and every region it uses, rooms included.
-    """
-    return {
-        "format": FORMAT,
-        "id": policy_id(task.content_hash, method, options, seed),
-        "method": method,
-        "map_id": task.grid.content_hash,
-        "robot": robot_to_json(task.robot),
-        "spec": dict(spec) if spec else task_spec(task),
-        "task_hash": task.content_hash,
-        "horizon": task.horizon,
-        "options": dict(options),
-        "seed": seed,
-        "metrics": dict(metrics),
-    }
-
-
-def task_spec(task: Task) -> dict[str, Any]:
-    """The task's rule as a self-contained spec."""
-    spec: dict[str, Any] = {
-        "formula": str(task.formula),
-        "regions": {name: region_to_json(region) for name, region in task.regions.items()},
-    }
-    return spec | ({"signals": dict(task.signals)} if task.signals else {})
 
 
 def load_dqn(weights: bytes | Path, card: Card, task: Task) -> Policy:

@@ -23,9 +23,10 @@ from safetensors.numpy import load_file, save_file
 from scipy.stats import beta
 from torch import nn
 
+from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.network import NAMES, Network, make_network
-from specshield.policy.dqn.policy import Policy, make_card, wait_motion
+from specshield.policy.dqn.policy import Policy, wait_motion
 from specshield.policy.dqn.rollout import satisfies
 from specshield.policy.dqn.settings import Settings, options_of
 from specshield.task import Task

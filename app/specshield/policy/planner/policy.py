@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
 from specshield.errors import PolicyError
-from specshield.policy.dqn.policy import Card, Proposal, as_one, make_card
+from specshield.policy.card import Card, make_card
+from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
 from specshield.policy.planner.agenda import (
     Agenda,

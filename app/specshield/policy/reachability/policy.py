@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
 from specshield.errors import PolicyError
-from specshield.policy.dqn.policy import Card, Proposal, as_one, make_card, wait_motion
+from specshield.policy.card import Card, make_card
+from specshield.policy.dqn.policy import Proposal, as_one, wait_motion
 from specshield.policy.lattice import heading_count, holds_at, make_lattice
 from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
 from specshield.policy.reachability.search import propose_all

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from specshield.errors import FormulaError, NotFound, PolicyError, SpecshieldError
-from specshield.policy.dqn.policy import Proposer, policy_id
+from specshield.policy.card import policy_id
+from specshield.policy.dqn.policy import Proposer
 from specshield.policy.methods import load_policy
 from specshield.robot import robot_from_json
 from specshield.service.library import files

@@ -1,0 +1,56 @@
+"""A policy's card: the JSON beside its weights that says what the policy is for and how it was made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from specshield.robot import robot_to_json
+from specshield.task import Task
+from specshield.world.regions import region_to_json
+
+Card = dict[str, Any]
+FORMAT = 1  # the version of the card's members; no other version exists yet, so nothing reads it
+
+
+def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:
+    """sha256 over task, method, options and seed, as hex: whatever decides what the policy does."""
+    content = {"task": task_hash, "method": method, "options": options, "seed": seed}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def make_card(
+    task: Task,
+    method: str,
+    options: Mapping[str, Any],
+    seed: int,
+    metrics: Mapping[str, Any],
+    spec: Mapping[str, Any] | None = None,
+) -> Card:
+    """The card of a policy.
+
+    metrics: measured figures, among them `wall_time_s`. spec: the spec as the caller gave it; by default the
+    canonical formula and every region that it uses, the map's rooms included.
+    """
+    return {
+        "format": FORMAT,
+        "id": policy_id(task.content_hash, method, options, seed),
+        "method": method,
+        "map_id": task.grid.content_hash,
+        "robot": robot_to_json(task.robot),
+        "spec": dict(spec) if spec else _spec_of(task),
+        "task_hash": task.content_hash,
+        "horizon": task.horizon,
+        "options": dict(options),
+        "seed": seed,
+        "metrics": dict(metrics),
+    }
+
+
+def _spec_of(task: Task) -> dict[str, Any]:
+    """The task's rule as a spec that needs neither the map's rooms nor anything else."""
+    regions = {name: region_to_json(region) for name, region in task.regions.items()}
+    spec: dict[str, Any] = {"formula": str(task.formula), "regions": regions}
+    return spec | ({"signals": dict(task.signals)} if task.signals else {})
