@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf, merged
-from specshield.policy.planner.agenda import Agenda, Bounds, note, read_pose
+from specshield.policy.planner.due_dates import Agenda, Bounds, note, read_pose
 from specshield.policy.planner.fields import FAR, Fields, to_go_after, to_go_at
 from specshield.robot.unicycle import Body, step
 

@@ -31,7 +31,8 @@ from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
 from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
-from specshield.policy.planner.agenda import (
+from specshield.policy.planner.approach import World
+from specshield.policy.planner.due_dates import (
     Agenda,
     Bounds,
     Literal,
@@ -40,9 +41,8 @@ from specshield.policy.planner.agenda import (
     is_open,
     read_signals,
 )
-from specshield.policy.planner.approach import World
 from specshield.policy.planner.fields import FAR, Fields, steps_to, values_at
-from specshield.policy.planner.plans import propose_all
+from specshield.policy.planner.first_motions import propose_all
 from specshield.policy.tensors import read_tensors
 from specshield.robot.unicycle import Body, make_body
 from specshield.rule.progress import signal_rows

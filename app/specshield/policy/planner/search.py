@@ -18,15 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf, merged
-from specshield.policy.planner.agenda import (
-    NEVER,
-    due,
-    foresee,
-    is_open,
-    needed_until,
-    needed_without,
-    stay_for,
-)
 from specshield.policy.planner.approach import (
     BEGIN,
     DUE,
@@ -42,6 +33,15 @@ from specshield.policy.planner.approach import (
     read_at,
     stay,
     walk,
+)
+from specshield.policy.planner.due_dates import (
+    NEVER,
+    due,
+    foresee,
+    is_open,
+    needed_until,
+    needed_without,
+    stay_for,
 )
 from specshield.policy.planner.fields import to_go_at
 from specshield.stl.tree import tree_value

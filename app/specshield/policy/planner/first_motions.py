@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import NONE, join, undoing
-from specshield.policy.planner.agenda import Bounds, foresee, is_open, read_signals
 from specshield.policy.planner.approach import LENGTH, WIDTH, Work, World, move, read_at, stay
+from specshield.policy.planner.due_dates import Bounds, foresee, is_open, read_signals
 from specshield.policy.planner.search import DEEP, Nodes, search, value
 from specshield.rule.values import REGIONS, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE
