@@ -16,16 +16,17 @@ from typing import Any, Literal
 from specshield.errors import FormulaError
 
 KEYWORDS = frozenset({"F", "G", "U", "not", "always", "eventually", "until", "and", "or", "implies", "abs"})
-MAX_BOUND = 100_000  # steps; keeps what an unbounded horizon allocates within reason
+MAX_BOUND = 100_000  # steps; bounds the memory that a formula's samples take where no horizon limit is set
 
-# How tight each kind of expression binds; an operand looser than its place asks for gets parentheses.
+# How tightly each kind of expression binds. An operand that binds less tightly than its place asks is printed
+# in parentheses.
 IMPLIES, OR, AND, UNTIL, PREFIX, COMPARISON, SUM, PRODUCT, NEGATION, PRIMARY = range(1, 11)
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def is_name(text: str) -> bool:
-    """Whether a formula can call something `text`: letters, digits and _, no keyword, no digit in front."""
+    """Whether `text` can be a name in a formula: letters, digits and _, no digit in front, no keyword."""
     return _NAME.fullmatch(text) is not None and text not in KEYWORDS
 
 
@@ -42,14 +43,14 @@ class Node:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names whose samples it needs, sorted."""
+        """The names whose samples the node needs, sorted."""
         if isinstance(self, Name | Atom):
             return (self.name,)
         return tuple(sorted({name for part in self.parts for name in part.names}))
 
     @cached_property
     def depth(self) -> int:
-        """Nodes on the longest way down, itself included."""
+        """The number of nodes on the longest way down, this one included."""
         return 1 + max((part.depth for part in self.parts), default=0)
 
     @property
@@ -64,7 +65,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Term(Node):
-    """Base of what has a value: numbers, names and arithmetic over them."""
+    """Base of the nodes that are numbers at each step: numbers, names and arithmetic over them."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ class Neg(Term):
 
     def __str__(self) -> str:
         text = self.child._at(NEGATION)
-        # `-3` is the number minus three, so the negated number three is `-(3)`.
+        # `-3` parses as the number minus three, so the negated number three prints as `-(3)`.
         return f"-({text})" if isinstance(self.child, Number) and not text.startswith("-") else f"-{text}"
 
 
@@ -123,11 +124,11 @@ class Arithmetic(Term):
 
 @dataclass(frozen=True)
 class Formula(Node):
-    """Base of what has a robustness rho; it is satisfied where rho > 0."""
+    """Base of the nodes that have a robustness rho at each step. A formula is satisfied where rho > 0."""
 
     @cached_property
     def horizon(self) -> int:
-        """hrz: the last step, counted from the one of evaluation, whose samples it may need."""
+        """hrz: the last step whose samples the formula may need, counted from the step of evaluation."""
         below = (part.horizon for part in self.parts if isinstance(part, Formula))
         return self._reach + max(below, default=0)
 
@@ -259,7 +260,7 @@ def _check_window(a: Any, b: Any) -> None:
     whole = all(isinstance(bound, int) and not isinstance(bound, bool) for bound in (a, b))
     if not whole or not 0 <= a <= b <= MAX_BOUND:
         expected = f"whole numbers with 0 <= a <= b <= {MAX_BOUND}"
-        raise FormulaError(f"[{a},{b}] is no window; expected {expected}", got=[a, b], expected=expected)
+        raise FormulaError(f"[{a},{b}] is not a window; expected {expected}", got=[a, b], expected=expected)
 
 
 def _check_name(name: str) -> None:
@@ -272,4 +273,6 @@ def _check_name(name: str) -> None:
 def _check_children(node: And | Or) -> None:
     object.__setattr__(node, "children", tuple(node.children))
     if len(node.children) < 2:
-        raise FormulaError("and/or join at least two formulas", got=len(node.children), expected="at least 2")
+        raise FormulaError(
+            "'and' and 'or' join at least two formulas", got=len(node.children), expected="at least 2"
+        )

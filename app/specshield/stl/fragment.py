@@ -1,10 +1,10 @@
-"""The fragment that tables can be made for: conjunctions of F, G and F[a,c1] G[c2,b] over predicates.
+"""The fragment of STL that tables and networks can be made for.
 
     phi = psi | phi and phi | F[a,b] psi | G[a,b] psi | F[a,c1] G[c2,b] psi       (the paper's grammar of STL)
 
-psi is any boolean combination of predicates, without temporal operators. A formula that means such a
-conjunction without being written as one is brought into the form: `not` moves inwards, F F and G G merge, G
-over `and` splits, a window of one step is only a shift. The robustness stays the same.
+psi is any boolean combination of predicates, without temporal operators. Many other formulas have the same
+robustness as one of this form and are rewritten: `not` moves inwards, F F and G G merge into one, G over
+`and` splits, and an operator with a window of one step only shifts the windows below it.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ class Obligation:
     kind: Literal["eventually", "always", "eventually_always"]
     a: int
     b: int
-    c1: int  # c1 and c2 are 0 but for eventually_always
+    c1: int  # c1 and c2 are 0 except in an eventually_always
     c2: int
     predicate: Formula
 
 
 def conjuncts(formula: Formula) -> tuple[Formula, ...]:
-    """The formulas that `formula` joins by `and` at its top, left to right, in one form.
+    """The formulas that `formula` joins by `and` at its top, left to right.
 
-    `not` goes inwards through `and`, `or`, `->`, F and G, so that `not F[a,b] p` is `G[a,b] not p`.
+    `not` moves inwards through `and`, `or`, `->`, F and G, so `not F[a,b] p` becomes `G[a,b] not p`.
     """
     return _joined(formula, negated=False)
 
@@ -67,14 +67,15 @@ def _signed(formula: Formula, negated: bool) -> Formula:
 
 
 def is_predicate(node: Node) -> bool:
-    """Whether it has no temporal operator."""
+    """Whether `node` has no temporal operator."""
     return not isinstance(node, Windowed) and all(is_predicate(part) for part in node.parts)
 
 
 def obligations(formula: Formula) -> tuple[Obligation, ...]:
-    """The obligations whose conjunction is `formula`, in the order it is written; rho is their minimum.
+    """The obligations whose conjunction is `formula`, in the order of the text; rho is their minimum.
 
-    A predicate alone is due at step 0. FragmentError, naming the sub-formula, where it is outside.
+    A predicate alone is an obligation for step 0. Raises FragmentError with the sub-formula that is outside
+    the fragment.
     """
     return tuple(found for conjunct in conjuncts(formula) for found in _normal(conjunct))
 
@@ -112,7 +113,7 @@ def _under_eventually(a: int, b: int, inner: Obligation) -> Obligation:
 
 
 def _shifted(inner: Obligation, a: int, b: int) -> Obligation:
-    """The outer window [a, b] joined to the inner one of the same operator."""
+    """F[a,b] of an inner F, or G[a,b] of an inner G: one obligation over the sum of the windows."""
     if inner.kind == "eventually_always":
         return replace(inner, a=inner.a + a, c1=inner.c1 + b)
     return replace(inner, a=inner.a + a, b=inner.b + b)

@@ -17,9 +17,10 @@
     window     = "[" bound ("," | ":") bound "]"                   whole steps, 0 <= a <= b
     name       = letter or "_", then letters, digits, "_"; not a keyword
 
-`-3` is a number; so `F[0,3] a and b` is `(F[0,3] a) and b`, and `not a > 0` is `not (a > 0)`.
-Text is at most MAX_LENGTH characters and a formula at most MAX_DEPTH nodes deep, so that hostile text is an
-error here and never a stack overflow in whatever walks the formula.
+So `F[0,3] a and b` is `(F[0,3] a) and b`, and `not a > 0` is `not (a > 0)`. `-3` is one number.
+
+Text is at most MAX_LENGTH characters long and a formula at most MAX_DEPTH nodes deep, so hostile text is an
+error here and never a stack overflow in the code that later walks the formula.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from specshield.stl.formula import (
     AND,
     COMPARISON,
     IMPLIES,
+    KEYWORDS,
     MAX_BOUND,
     NEGATION,
     OR,
@@ -60,7 +62,7 @@ from specshield.stl.formula import (
 )
 from specshield.stl.tokens import Token, tokens
 
-MAX_DEPTH = 64
+MAX_DEPTH = 64  # nodes on the longest way down; a hand-written formula has about 6
 
 _BINDING = {
     "implies": IMPLIES,
@@ -78,11 +80,11 @@ _N = TypeVar("_N", bound=Node)
 
 
 def parse(text: str, names: Collection[str] | None = None, max_horizon: int | None = None) -> Formula:
-    """The formula that `text` says.
+    """The formula that `text` spells.
 
-    names: what the formula may name; None admits every name. max_horizon: in steps; None is no limit.
-    FormulaError with `position`, the offset into the text, where something is wrong; HorizonError (one of
-    them) where the horizon is over the limit.
+    names: what the formula may name; None allows every name. max_horizon: in steps; None sets no limit.
+    Raises FormulaError with `position`, the offset of the mistake in the text, and HorizonError (a kind of
+    FormulaError) if the horizon exceeds the limit.
     """
     return _Parser(text, names, max_horizon).formula()
 
@@ -116,7 +118,7 @@ class _Parser:
     def _expression(self, binding: int) -> Node:
         """The longest expression from here whose operators bind at least as tight as `binding`."""
         self._nesting += 1
-        if self._nesting > 2 * MAX_DEPTH + 1:  # a printed node nests at most twice: parentheses and operand
+        if self._nesting > 2 * MAX_DEPTH + 1:  # a node prints as at most two levels: parentheses and operand
             raise self._too_deep(self._token)
         start = self._token.position
         left = self._operand()
@@ -200,13 +202,14 @@ class _Parser:
         if isinstance(node, Name):
             return Atom(node.name)
         if not isinstance(node, Formula):
-            raise self._error(f"'{_clip(str(node))}' is a value, not true or false", self._token, _COMPARE)
+            problem = f"'{_clip(str(node))}' is a number, not true or false"
+            raise self._error(problem, self._token, _COMPARE)
         return node
 
     def _as_term(self, node: Node, start: int) -> Term:
         if not isinstance(node, Term):
-            text = f"'{_clip(str(node))}' is true or false, not a value"
-            raise self._error(text, Token("", str(node), start), "arithmetic over names and numbers")
+            problem = f"'{_clip(str(node))}' is true or false, not a number"
+            raise self._error(problem, Token("", str(node), start), "arithmetic over names and numbers")
         return node
 
     def _number(self, token: Token, sign: float) -> Number:
@@ -220,6 +223,7 @@ class _Parser:
             known = sorted(self._names)
             more = f" and {len(known) - 20} more" if len(known) > 20 else ""
             expected = f"one of {', '.join(known[:20])}{more}" if known else "no names at all"
+            expected += _lower_case(token.text)
             raise self._error(f"nothing declares '{_clip(token.text)}'", token, expected)
         return Name(token.text)
 
@@ -238,7 +242,7 @@ class _Parser:
     def _bound(self) -> int:
         token = self._take("number", "a window bound, a whole number of steps, not negative")
         if not token.text.isdigit():
-            problem = f"'{_clip(token.text)}' is no window bound"
+            problem = f"'{_clip(token.text)}' is not a window bound"
             raise self._error(problem, token, "a whole number of steps")
         digits = token.text.lstrip("0") or "0"
         if len(digits) > len(str(MAX_BOUND)) or int(digits) > MAX_BOUND:
@@ -265,7 +269,7 @@ class _Parser:
     def _unexpected(self, expected: str) -> FormulaError:
         token = self._token
         problem = "the text ends" if token.kind == "end" else f"unexpected '{_clip(token.text)}'"
-        return self._error(problem, token, expected)
+        return self._error(problem, token, expected + _lower_case(token.text))
 
     def _error(
         self,
@@ -281,6 +285,12 @@ class _Parser:
             expected=expected,
             position=token.position,
         )
+
+
+def _lower_case(word: str) -> str:
+    """What to add for someone who wrote AND or Not."""
+    lower = word.lower()
+    return f"; '{lower}' is written in lower case" if lower != word and lower in KEYWORDS else ""
 
 
 def _clip(text: str) -> str:

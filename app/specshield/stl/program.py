@@ -1,7 +1,7 @@
 """Boolean combinations of predicates as postfix stack programs, for compiled rollouts.
 
-A program's value is `robustness(predicate, ...)` bit for bit, since both do the same float64 operations in
-the same order; where that raises for arithmetic that is not finite, it is NaN.
+A program's value equals `robustness(predicate, ...)` bit for bit, because both do the same float64 operations
+in the same order. Where `robustness` raises because arithmetic is not finite, the program's value is NaN.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from specshield.stl.formula import (
 )
 from specshield.stl.parser import MAX_DEPTH
 
-STACK_SIZE = MAX_DEPTH  # what a formula of the parser's depth can need at most
+STACK_SIZE = MAX_DEPTH  # numbers; a formula as deep as the parser allows needs no more
 
 NUMBER, VALUE, NEGATE, ABSOLUTE, ADD, SUBTRACT, MULTIPLY, DIVIDE, MINIMUM, MAXIMUM = range(10)
 _ARITHMETIC = {"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "/": DIVIDE}
@@ -53,13 +53,15 @@ class Programs(NamedTuple):
 
 
 def compile_predicate(predicate: Node, slots: Mapping[str, int]) -> Program:
-    """The program of `predicate`, name n's value at values[slots[n]].
+    """The program of `predicate`, which finds the value of a name at values[slots[name]].
 
-    FragmentError at a temporal operator; FormulaError at a name without a slot or nesting beyond STACK_SIZE.
+    Raises FragmentError for a temporal operator, FormulaError for a name without a slot and for a predicate
+    deeper than STACK_SIZE.
     """
     if predicate.depth > STACK_SIZE:
         expected = f"at most {STACK_SIZE} levels of nesting"
-        raise FormulaError(f"a predicate is {predicate.depth} deep; expected {expected}", expected=expected)
+        problem = f"a predicate is {predicate.depth} levels deep; expected {expected}"
+        raise FormulaError(problem, got=predicate.depth, expected=expected)
     code = list(_code(predicate, slots))
     return Program(np.array([op for op, _ in code], np.int64), np.array([arg for _, arg in code], np.float64))
 
@@ -106,7 +108,7 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
             yield MAXIMUM, 0
         case _:
             expected = "a boolean combination of predicates"
-            problem = f"'{node}' is temporal; expected {expected}"
+            problem = f"'{node}' has a temporal operator; expected {expected}"
             raise FragmentError(problem, got=str(node), expected=expected)
 
 
@@ -152,12 +154,12 @@ def _run(
                 if not math.isfinite(left):
                     return math.nan
                 stack[top] = left
-    return float(stack[0] + 0.0)  # one zero, as in `robustness`
+    return float(stack[0] + 0.0)  # -0.0 becomes 0.0, as in `robustness`
 
 
 @kernel
 def evaluate(ops: NDArray[np.int64], args: NDArray[np.float64], values: NDArray[np.float64]) -> float:
-    """The robustness of one program, values float64[slots]."""
+    """The robustness that one program computes from values float64[slots]."""
     return _run(ops, args, 0, len(ops), values, np.empty(STACK_SIZE))
 
 

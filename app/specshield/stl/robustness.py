@@ -7,10 +7,10 @@
     rho(f U[a,b] g, t)  = max over t' in [t+a, t+b] of
                           min(rho(g, t'), min of rho(f, t'') over t'' in [t, t'))
 
-One evaluator does both. Its arrays are [ends, *batch, time]: one end where every sample is known, two, the
-lower and the upper, where some are not. Every operator but `not` is monotone in its operands, so it acts on
-each end alone; `not` swaps them. A sample not seen yet is some real number, so an unknown term is an
-interval, found by interval arithmetic, and the same at every step to come.
+One evaluator computes both. Its arrays are [ends, *batch, time]. There is one end if every sample is known,
+and two, the lower and the upper bound, if some are not. Every operator but `not` is monotone in its operands,
+so it acts on each end alone; `not` swaps the ends. A sample that is still to come may be any real number, so
+the bounds on a term come from interval arithmetic and are the same at every step to come.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ Verdict: TypeAlias = Literal["satisfied", "violated", "pending"]
 
 
 def robustness(formula: Formula, samples: Mapping[str, ArrayLike]) -> Array:
-    """rho at step 0. Shape [...], for samples [..., N] of each name with N >= horizon + 1.
+    """rho at step 0, shape [...], from samples [..., N] of each name, N >= horizon + 1.
 
-    The names' batch shapes broadcast. SampleError where a name is missing, samples are too few, NaN or
-    infinite, or arithmetic on them is not finite (a division by zero, an overflow).
+    The names' batch shapes broadcast. Raises SampleError if a name is missing, if samples are too few, NaN or
+    infinite, or if arithmetic on them is not finite (a division by zero, an overflow).
     """
     seen = _read(formula, samples)
     if seen.known <= formula.horizon:
@@ -65,26 +65,30 @@ def robustness(formula: Formula, samples: Mapping[str, ArrayLike]) -> Array:
 def robustness_bounds(formula: Formula, prefix: Mapping[str, ArrayLike]) -> tuple[Array, Array]:
     """(lo, hi), each [...]: rho at step 0 lies in [lo, hi] however the samples [..., n] go on.
 
-    Samples to come are free reals, so a bound may be infinite. With n > horizon both are the robustness, bit
-    for bit; n may be 0.
-    SampleError as in `robustness`, too few samples excepted.
+    Samples to come may be any real numbers, so a bound may be infinite. With n > horizon both bounds are the
+    robustness, bit for bit. n may be 0. Raises SampleError as `robustness` does, but not for too few samples.
     """
     return _bounds(formula, _read(formula, prefix))
 
 
 def verdict(formula: Formula, prefix: Mapping[str, ArrayLike], margin: float = SATISFIED_ABOVE) -> Verdict:
-    """What the prefix of one trajectory, samples [n], decides of rho > margin. Once decided it stays so."""
+    """Whether the prefix of one trajectory, samples [n], decides that rho > margin.
+
+    A verdict other than "pending" is the verdict on every continuation too.
+    """
     lo, hi = robustness_bounds(formula, prefix)
     if lo.ndim:
         raise SampleError(
-            "a verdict is on one trajectory", got=list(lo.shape), expected="samples of shape [n]"
+            "a verdict is about one trajectory, not a batch",
+            got=list(lo.shape),
+            expected="samples of shape [n]",
         )
     return "satisfied" if lo > margin else "violated" if hi <= margin else "pending"
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """The samples at hand: `values` [*batch, known] of each name, steps 0 to known - 1."""
+    """The samples so far: `values` [*batch, known] of each name, at steps 0 to known - 1."""
 
     values: Mapping[str, Array]
     batch: tuple[int, ...]
@@ -95,7 +99,7 @@ def _read(formula: Formula, samples: Mapping[str, ArrayLike]) -> _Seen:
     missing = [name for name in formula.names if name not in samples]
     if missing:
         raise SampleError(
-            f"no samples of {missing[0]}",
+            f"there are no samples of {missing[0]}",
             path=missing[0],
             got=sorted(samples),
             expected=", ".join(formula.names),
@@ -113,7 +117,7 @@ def _read(formula: Formula, samples: Mapping[str, ArrayLike]) -> _Seen:
         raise SampleError(
             "the samples' batch shapes do not fit together", got=shapes, expected="shapes that broadcast"
         ) from None
-    if not formula.names:  # constants are known for good
+    if not formula.names:  # a formula of constants alone is known at every step
         return _Seen({}, batch, formula.horizon + 1)
     known = next(iter(lengths.values()))
     return _Seen({name: np.broadcast_to(x, (*batch, known)) for name, x in arrays.items()}, batch, known)
@@ -141,7 +145,7 @@ def _sampled(name: str, samples: ArrayLike) -> Array:
 
 def _bounds(formula: Formula, seen: _Seen) -> tuple[Array, Array]:
     with np.errstate(all="ignore"):
-        ends = _evaluate(formula, seen, 0, 1)[..., 0] + 0.0  # -0.0 + 0.0 is 0.0: one zero, and a copy
+        ends = _evaluate(formula, seen, 0, 1)[..., 0] + 0.0  # makes a copy, and 0.0 of -0.0
     return np.asarray(ends[0]), np.asarray(ends[-1])
 
 
@@ -175,7 +179,7 @@ def _evaluate(formula: Formula, seen: _Seen, start: int, stop: int) -> Array:
 
 
 def _sliding(extremum: np.ufunc, values: Array, width: int) -> Array:
-    """The extremum of each `width` neighbours, [..., n + width - 1] to [..., n], in log2(width) passes."""
+    """The extremum of every `width` neighbours, [..., n + width - 1] to [..., n], in log2(width) passes."""
     n = values.shape[-1] - width + 1
     if n == 1:
         single: Array = extremum.reduce(values, axis=-1, keepdims=True)
@@ -191,8 +195,9 @@ def _sliding(extremum: np.ufunc, values: Array, width: int) -> Array:
 def _until(left: Array, right: Array, width: int) -> Array:
     """max over k < width of min(right[t + k], min left[t : t + k]), for each t < n.
 
-    left [..., n + width - 2], right [..., n + width - 1]. In log2(width) passes, as `_sliding`: a reach of
-    m + k steps is a reach of m, or m steps of left and then a reach of k.
+    left [..., n + width - 2], right [..., n + width - 1]. In log2(width) passes, as `_sliding`: `right` is
+    reached within m + k steps if it is reached within m, or if `left` holds for m steps and `right` is
+    reached within k from there.
     """
     n = right.shape[-1] - width + 1
     reached, kept, size = right, left, 1
@@ -209,7 +214,7 @@ def _until(left: Array, right: Array, width: int) -> Array:
 
 
 def _predicate(predicate: Atom | Comparison, seen: _Seen, start: int, stop: int) -> Array:
-    """[1, *batch, stop - start] where the samples are known, [2, ...] where some are not."""
+    """[1, *batch, stop - start] if all of these samples are known, [2, ...] if some are not."""
     known = max(0, min(stop, seen.known) - start)
     term = difference(predicate)
     values = value(term, seen.values, start, start + known)

@@ -1,4 +1,4 @@
-"""The values of terms: exact where the samples are known, an interval where they are still to come."""
+"""The value of a term: exact at steps whose samples are known, an interval at steps still to come."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ _ARITHMETIC = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}
 
 
 def value(term: Term, samples: Mapping[str, Array], start: int, stop: int) -> Any:
-    """The term at known steps, [*batch, stop - start] or a number."""
+    """The term at steps start to stop - 1, whose samples are known: [*batch, stop - start], or a number.
+
+    Raises SampleError where the arithmetic is not finite.
+    """
     match term:
         case Number(number):
             return number
@@ -31,7 +34,7 @@ def value(term: Term, samples: Mapping[str, Array], start: int, stop: int) -> An
         case Arithmetic(op, left, right):
             result = _ARITHMETIC[op](value(left, samples, start, stop), value(right, samples, start, stop))
             if stop > start and not np.isfinite(result).all():
-                # A term without names is a number, the same at every step.
+                # A term without names has no time axis: it is the same number at every step.
                 time = start + (int(np.argwhere(~np.isfinite(result))[0][-1]) if np.ndim(result) else 0)
                 raise SampleError(
                     f"'{term}' is not finite at step {time}",
@@ -44,7 +47,7 @@ def value(term: Term, samples: Mapping[str, Array], start: int, stop: int) -> An
 
 
 def interval(term: Term) -> tuple[float, float]:
-    """Bounds on the term's value where every name may be any real number."""
+    """Bounds on the term's value if every name may be any real number (interval arithmetic)."""
     match term:
         case Number(number):
             return number, number
@@ -63,9 +66,9 @@ def interval(term: Term) -> tuple[float, float]:
             if op in "+-":
                 c = b if op == "+" else (-b[1], -b[0])
                 lo, hi = a[0] + c[0], a[1] + c[1]
-                # NaN is inf - inf, which only a term that overflows anyway can bring about.
+                # inf - inf is NaN. It takes a sum that overflows, so nothing is known of that end.
                 return -math.inf if math.isnan(lo) else lo, math.inf if math.isnan(hi) else hi
-            # 0 * inf is 0, for samples are finite; inf / inf stands between 0 and inf, which the others give.
+            # Samples are finite, so 0 * inf is 0. inf / inf lies between 0 and inf, which are ends as well.
             ends = [x * y if op == "*" else x / y for x in a for y in b]
             ends = [0.0 if math.isnan(end) else end for end in ends]
             return min(ends), max(ends)

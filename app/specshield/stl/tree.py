@@ -1,8 +1,8 @@
-"""Whole formulas as flat trees for compiled code: one pass over a buffer, nothing allocated.
+"""Whole formulas as flat trees for compiled code: one pass over a buffer, and nothing is allocated.
 
-A tree's value is `robustness(formula, ...)`, and its bounds `robustness_bounds`, bit for bit: minima and
-maxima of the same float64 numbers. Its leaves are the largest parts without a temporal operator (`Program`s);
-node n's values, rho at steps start to stop - 1, lie in the buffer from at[n], where its first operand's lay.
+A tree's value equals `robustness(formula, ...)` bit for bit, and its bounds equal `robustness_bounds`: both
+are minima and maxima of the same float64 numbers. The leaves are the largest parts without a temporal
+operator, as `Program`s. A node's values, rho at consecutive steps, replace those of its first operand.
 """
 
 from __future__ import annotations
@@ -38,11 +38,13 @@ Ints = NDArray[np.int64]
 
 
 class Tree(NamedTuple):
-    """A formula at step 0; n nodes in postfix order, l leaves. The value ends up at the buffer's start.
+    """A formula at step 0, of n nodes in postfix order and l leaves. rho ends up at buffer[0].
 
-    op, at, length, a, b [n]: what is done, where the values lie and how many come out, the window. right [n]:
-    where the second operand's values lie. leaf_at, leaf_start, leaf_stop [l]: where a leaf's values lie, and
-    of which steps; low, high [l]: its value where the samples are still to come. size: of the buffer.
+    op [n]: the operator. at, right [n]: where in the buffer its first and second operand's values begin.
+    length [n]: how many values it has, written from `at` on. a, b [n]: its window, in steps.
+    leaf_at, leaf_start, leaf_stop [l]: where a leaf's values begin in the buffer, and from which step up to
+    which (excluded) they are. low, high [l]: bounds on a leaf's value at a step whose samples are to come.
+    size: of the buffer.
     """
 
     op: Ints
@@ -61,7 +63,10 @@ class Tree(NamedTuple):
 
 
 def compile_tree(formula: Formula, slots: Mapping[str, int]) -> Tree:
-    """The tree of `formula`, name n's sample at slots[n]. Raises FormulaError at a name without a slot."""
+    """The tree of `formula`, whose leaves find a name's value at values[slots[name]].
+
+    Raises FormulaError for a name without a slot.
+    """
     builder = _Builder(slots)
     builder.add(formula, 0, 1)
     op, at, length, a, b, right = np.array(builder.nodes, np.int64).reshape(-1, 6).T.copy()
@@ -83,7 +88,7 @@ class _Builder:
         self.size = 0
 
     def add(self, formula: Node, start: int, stop: int) -> int:
-        """Adds rho at steps start to stop - 1; returns where in the buffer it will lie."""
+        """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin."""
         count = stop - start
         match formula:
             case _ if not _is_temporal(formula):
@@ -126,7 +131,7 @@ def _is_temporal(formula: Node) -> bool:
 
 
 def _unknown(formula: Node) -> tuple[float, float]:
-    """Bounds on a leaf's robustness where every name may be any real number."""
+    """Bounds on a leaf's robustness if every name may be any real number."""
     match formula:
         case Atom() | Comparison():
             return interval(difference(formula))
@@ -147,19 +152,19 @@ def _unknown(formula: Node) -> tuple[float, float]:
 
 @inlined
 def tree_value(tree: Tree, buffer: Floats) -> float:
-    """rho, from the leaves' values in `buffer` (size,), which is overwritten."""
+    """rho from the leaves' values in `buffer` (size,), which is overwritten."""
     for n in range(tree.op.shape[0]):
         if tree.op[n] == NOT:
             for i in range(tree.at[n], tree.at[n] + tree.length[n]):
                 buffer[i] = -buffer[i]
         else:
             _apply(tree, n, buffer)
-    return float(buffer[0] + 0.0)  # one zero, as in `robustness`
+    return float(buffer[0] + 0.0)  # -0.0 becomes 0.0, as in `robustness`
 
 
 @leaf
 def tree_bounds(tree: Tree, low: Floats, high: Floats) -> tuple[float, float]:
-    """(lo, hi) of rho, from the leaves' lower and upper values; both buffers are overwritten."""
+    """(lo, hi) of rho from the leaves' lower and upper values; both buffers (size,) are overwritten."""
     for n in range(tree.op.shape[0]):
         if tree.op[n] == NOT:
             for i in range(tree.at[n], tree.at[n] + tree.length[n]):
@@ -172,7 +177,7 @@ def tree_bounds(tree: Tree, low: Floats, high: Floats) -> tuple[float, float]:
 
 @inlined
 def _apply(tree: Tree, n: int, buffer: Floats) -> None:
-    """A monotone operator on one end, in place: each value is written after the last that reads it."""
+    """Applies a monotone operator to one end, in place: no value is written before its last use."""
     op, at, count, right = tree.op[n], tree.at[n], tree.length[n], tree.right[n]
     if op == AND:
         for i in range(count):
@@ -189,7 +194,7 @@ def _apply(tree: Tree, n: int, buffer: Floats) -> None:
 
 @inlined
 def _slide(buffer: Floats, at: int, count: int, width: int, least: bool) -> None:
-    """The extremum of each `width` neighbours, in log2(width) passes."""
+    """The extremum of every `width` neighbours, in log2(width) passes, as `robustness._sliding`."""
     if count == 1:
         best = buffer[at]
         for i in range(at + 1, at + width):
@@ -215,7 +220,7 @@ def _until(buffer: Floats, left: int, right: int, a: int, b: int) -> float:
         kept = min(kept, buffer[left + k])
     for k in range(b - a + 1):
         best = max(best, min(buffer[right + k], kept))
-        if kept <= best:  # what is kept only falls
+        if kept <= best:  # `kept` never rises, so no later k can be better
             break
         if a + k < b:
             kept = min(kept, buffer[left + a + k])
