@@ -91,7 +91,7 @@ class _Builder:
         """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin."""
         count = stop - start
         match formula:
-            case _ if not _is_temporal(formula):
+            case _ if not is_temporal(formula):
                 return self._leaf(formula, start, stop)
             case Not(child):
                 return self._node(NOT, self.add(child, start, stop), count)
@@ -126,8 +126,9 @@ class _Builder:
         return at
 
 
-def _is_temporal(formula: Node) -> bool:
-    return isinstance(formula, (Always, Eventually, Until)) or any(map(_is_temporal, formula.parts))
+def is_temporal(formula: Node) -> bool:
+    """Whether an `always`, `eventually` or `until` is anywhere in the formula."""
+    return isinstance(formula, (Always, Eventually, Until)) or any(map(is_temporal, formula.parts))
 
 
 def _unknown(formula: Node) -> tuple[float, float]:

@@ -1,311 +1,204 @@
-"""Going to where a literal holds, in exact simulation: down a field of steps to go, or a beam over it.
+"""Going to where a literal holds: down a field of steps to go, by the best motion or by a beam.
 
-The fields propose: every pose comes from f, and the way has arrived where the predicate itself says so.
+The fields only propose. Poses come from f, and the robot has arrived where the predicate itself says so.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf, merged
-from specshield.policy.planner.due_dates import Agenda, Bounds, note, read_pose
-from specshield.policy.planner.fields import FAR, Fields, to_go_after, to_go_at
-from specshield.robot.unicycle import Body, step
+from specshield.policy.planner.due_dates import read_pose
+from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
+from specshield.policy.planner.literals import PREDICATE
+from specshield.policy.planner.way import Way, World, holds, keeps, move, note_at, read_at, stay
+from specshield.robot.unicycle import step
 
-PATIENCE = 6  # steps without gain after which a walk is stuck
-NUDGE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
-DETOURS, DETOUR = 4, 24  # beams out of where a walk gets stuck: how many, and how long [steps]
-WIDTH, LENGTH = 12, 64  # poses that a beam keeps, and how long it can be [steps]
-TWIN = 0.05  # [m and rad] poses as near as this are one to a beam
-GAIN = 2.0  # [steps] nearer than where the walk got stuck: what a detour has to reach
-
-# Of what is needed of a literal: by when, from when until when throughout, and until when as long as the
-# literal that one goes to does not hold.
-DUE, BEGIN, UNTIL, WITHOUT = range(4)
+# Chosen by hand; nothing measured.
+STUCK_AFTER = 6  # [steps] without a gain after which a descent is stuck
+GAIN = 0.25  # [steps] nearer than ever before: what counts as a gain
+SHORTEST_MOVE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
+DETOURS = 4  # beams out of places where one descent is stuck
+DETOUR_LENGTH = 24  # [steps] of such a beam, at most
+DETOUR_GAIN = 2.0  # [steps] nearer than where the descent was stuck: what such a beam has to reach
+BEAM_WIDTH = 12  # poses that a beam keeps at a step
+BEAM_LENGTH = 64  # [steps] of a beam, at most
+SAME_POSE = 0.05  # [m + rad] poses that differ by less than this count once in a beam
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-class World(NamedTuple):
-    """What a search reads.
-
-    field [L, 2]: the field that leads to each literal freely, and the one that keeps to what has to hold for
-    a while; -1 for none. band: how far these may err [steps]. pad: the motion that stays, or comes nearest to
-    it; stands: whether it stays. cost: of one evaluation of the formula [about us]. margin: rho to aim above.
-    """
-
-    body: Body
-    fields: Fields
-    agenda: Agenda
-    field: Ints
-    band: float
-    pad: int
-    stands: bool
-    cost: float
-    margin: float
-
-
-class Work(NamedTuple):
-    """Scratch.
-
-    rho (P,): the predicates at the newest pose; held (l,): the leaves that read signals alone; known (size,):
-    all leaves along the way; places [LENGTH + 1, WIDTH, 4], trail [LENGTH + 1, WIDTH, 2]: a beam's poses with
-    their steps to go, and each one's parent and motion; spent (1,) [about us].
-    """
-
-    values: Floats
-    stack: Floats
-    rho: Floats
-    held: Floats
-    known: Floats
-    buffer: Floats
-    bounds: Bounds
-    scores: Floats
-    places: Floats
-    trail: Ints
-    spent: Floats
-
-
-@leaf
-def holds(world: World, k: int, rho: Floats) -> bool:
-    return bool(world.agenda.literal[k, 1] * rho[world.agenda.literal[k, 0]] > world.margin)
-
-
-@leaf
-def read_at(world: World, poses: Floats, n: int, work: Work) -> None:
-    read_pose(world.agenda, poses[n, 0], poses[n, 1], poses[n, 2], work.values, work.stack, work.rho)
-
-
-@leaf
-def move(world: World, t: int, n: int, motion: int, motions: Ints, poses: Floats, work: Work) -> None:
-    """The nth motion. poses (T - t + 1, 3) begin with x_t; work.rho: of poses[n], then of poses[n + 1]."""
-    x, y, theta = step(world.body, poses[n, 0], poses[n, 1], poses[n, 2], motion)
-    motions[n] = motion
-    poses[n + 1, 0], poses[n + 1, 1], poses[n + 1, 2] = x, y, theta
-    if x != poses[n, 0] or y != poses[n, 1] or theta != poses[n, 2]:
-        read_at(world, poses, n + 1, work)
-    note(world.agenda, t + n + 1, work.rho, work.held, work.known)
-
-
-@leaf
-def stay(world: World, t: int, n: int, stop: int, motions: Ints, poses: Floats, work: Work) -> None:
-    """Stays from motions[:n] to motions[:stop], or does what comes nearest to it."""
-    read_at(world, poses, n, work)
-    for i in range(n, stop):
-        move(world, t, i, world.pad, motions, poses, work)
-
-
-@leaf
-def _keeps(world: World, goal: int, at: int, need: Ints, rho: Floats) -> bool:
-    """Whether everything that has to hold at step `at`, on the way to a goal, does. need (L, 4)."""
-    kept, there = True, holds(world, goal, rho)
-    for k in range(need.shape[0]):
-        asked = need[k, BEGIN] <= at <= need[k, UNTIL] or (at <= need[k, WITHOUT] and not there)
-        kept = kept and (not asked or holds(world, k, rho))
-    return kept
-
-
-@leaf
-def linger(
-    world: World, k: int, t: int, n: int, stop: int, need: Ints, motions: Ints, poses: Floats, work: Work
-) -> None:
-    """Stays from motions[:n] to motions[:stop]; a robot that cannot stays near where literal k holds, so that
-    it does in the end.
-    """
-    if world.stands:
-        stay(world, t, n, stop, motions, poses, work)
-        return
-    read_at(world, poses, n, work)
-    kept = True
-    for i in range(n, stop):
-        move(world, t, i, world.pad, motions, poses, work)
-        kept = kept and _keeps(world, k, t + i + 1, need, work.rho)
-    if world.field[k, 0] < 0 or (kept and holds(world, k, work.rho)):
-        return
-    while n < stop:
-        i = min(LENGTH, stop - n)
-        after = beam(world, k, world.field[k, 0], t, n, n + i, np.inf, i, i, need, motions, poses, work)
-        if after < 0:
-            stay(world, t, n, stop, motions, poses, work)
-            return
-        n = after
-
-
 @merged
-def walk(
-    world: World,
-    k: int,
-    f: int,
-    waits: bool,
-    t: int,
-    n: int,
-    stop: int,
-    need: Ints,
-    motions: Ints,
-    poses: Floats,
-    work: Work,
-) -> int:
+def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: int, need: Ints) -> int:
     """Goes on from motions[:n] down field f to where literal k holds; how many motions there are then.
 
-    -1 where it does not come there by motions[:stop]. What has to hold does on the way, need (L, 4); waits:
-    stay where the way down would break it, instead of going round.
+    -1 where it does not come there by motions[:stop]. What has to hold does on the way, need (L, 4). waits:
+    whether to stay where the way down would break that, instead of going round.
     """
-    body, scores = world.body, work.scores
+    body, scores, motions, poses = world.body, way.scores, way.motions, way.poses
     begin, best, best_n, detours = n, np.inf, n, 0
     x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
     while n < stop:
-        if n - best_n > PATIENCE:
+        if n - best_n > STUCK_AFTER:
             detours += 1
             best = to_go_at(body, world.fields, f, poses[best_n, 0], poses[best_n, 1], poses[best_n, 2])
-            enough = max(best - GAIN, 0.0)
-            n = beam(world, k, f, t, best_n, stop, enough, 0, DETOUR, need, motions, poses, work)
+            enough = max(best - DETOUR_GAIN, 0.0)
+            n = descend_by_beam(world, way, k, f, best_n, stop, enough, 0, DETOUR_LENGTH, need)
             if n < 0 or detours == DETOURS:
                 return -1
             x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
-            read_at(world, poses, n, work)
-            if holds(world, k, work.rho):
+            read_at(world, way, n)
+            if holds(world, k, way.rho):
                 return n
             best, best_n = np.inf, n
             continue
-        work.spent[0] += 2.0
+        way.spent[0] += 2.0
         last = motions[n - 1] if n > begin else -1
         to_go_after(body, world.fields, f, x, y, theta, last, scores)
-        barred = False
+        barred = False  # whether a motion that leads down would break what has to hold
         while True:
             m = world.pad if barred and waits else 0
             for i in range(scores.shape[0]):
                 if scores[i] < scores[m] and not (barred and waits):
                     m = i
-            padding = not scores[m] < FAR
+            padding = not scores[m] < OUT_OF_REACH
             m = world.pad if padding else m
             if padding and not barred:
                 break
             nx, ny, nth = step(body, x, y, theta, m)
-            led = abs(nx - x) + abs(ny - y) > NUDGE or nth != theta
+            led = abs(nx - x) + abs(ny - y) > SHORTEST_MOVE or nth != theta
             if led or padding:
-                read_pose(world.agenda, nx, ny, nth, work.values, work.stack, work.rho)
-                if _keeps(world, k, t + n + 1, need, work.rho):
+                read_pose(world.literals, nx, ny, nth, way.values, way.stack, way.rho)
+                if keeps(world, k, way.t + n + 1, need, way.rho):
                     break
                 if padding:
                     return -1
                 barred = True
             scores[m] = np.inf
         if padding and not barred:
-            if not best < FAR:
+            if not best < OUT_OF_REACH:
                 best_n = n
-            n = best_n + PATIENCE + 1
+            n = best_n + STUCK_AFTER + 1
             continue
         if padding:
             best_n = n + 1
-        elif scores[m] < best - 0.25:
+        elif scores[m] < best - GAIN:
             best, best_n = scores[m], n
         x, y, theta = nx, ny, nth
         motions[n] = m
         n += 1
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-        note(world.agenda, t + n, work.rho, work.held, work.known)
-        if holds(world, k, work.rho):
+        note_at(world, way, n)
+        if holds(world, k, way.rho):
             return n
     return -1
 
 
 @leaf
-def beam(
-    world: World,
-    k: int,
-    f: int,
-    t: int,
-    n: int,
-    stop: int,
-    enough: float,
-    shortest: int,
-    longest: int,
+def descend_by_beam(
+    world: World, way: Way, k: int, f: int, n: int, stop: int, enough: float, shortest: int, longest: int,
     need: Ints,
-    motions: Ints,
-    poses: Floats,
-    work: Work,
-) -> int:
-    """A beam down field f from motions[:n] to fewer steps to go than `enough`, or to where literal k holds,
-    after `shortest` steps or later.
-
-    Returns how many motions there are then, -1 where it finds no way. Other arguments as in `walk`.
+) -> int:  # fmt: skip
+    """Goes on from motions[:n] by a beam down field f, to fewer steps to go than `enough` or to where literal
+    k holds, after `shortest` to `longest` steps. The other arguments and the result are those of `descend`.
     """
-    body, places, trail = world.body, work.places, work.trail
-    places[0, 0, 0], places[0, 0, 1], places[0, 0, 2] = poses[n, 0], poses[n, 1], poses[n, 2]
+    body, places, trail = world.body, way.places, way.trail
+    for c in range(3):
+        places[0, 0, c] = way.poses[n, c]
     trail[0, 0, 1] = -1
-    count, reached = 1, -1
+    count = 1
     for i in range(1, min(longest, stop - n) + 1):
         kept = 0
-        work.spent[0] += 3.0 * count
+        way.spent[0] += 3.0 * count
         for w in range(count):
             last = trail[i - 1, w, 1]
             moved, turned = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
             if shortest > 0:
                 moved = turned = 0.0  # there is time to go to and fro
+            before = places[i - 1, w]
             for m in range(body.translate.shape[0]):
                 back = body.translate[m] * moved < 0.0 or body.rotate[m] * turned < 0.0
                 if back or (m == world.pad and world.stands):
                     continue
-                x, y, theta = step(body, places[i - 1, w, 0], places[i - 1, w, 1], places[i - 1, w, 2], m)
-                led = abs(x - places[i - 1, w, 0]) + abs(y - places[i - 1, w, 1]) > NUDGE
-                if shortest == 0 and not led and theta == places[i - 1, w, 2]:
+                x, y, theta = step(body, before[0], before[1], before[2], m)
+                led = abs(x - before[0]) + abs(y - before[1]) > SHORTEST_MOVE or theta != before[2]
+                if shortest == 0 and not led:
                     continue
                 ahead = to_go_at(body, world.fields, f, x, y, theta)
-                if kept == WIDTH and not ahead < places[i, kept - 1, 3]:
+                if kept == BEAM_WIDTH and not ahead < places[i, kept - 1, 3]:
                     continue
-                read_pose(world.agenda, x, y, theta, work.values, work.stack, work.rho)
-                if not _keeps(world, k, t + n + i, need, work.rho):
+                read_pose(world.literals, x, y, theta, way.values, way.stack, way.rho)
+                if not keeps(world, k, way.t + n + i, need, way.rho):
                     continue
-                if holds(world, k, work.rho):
-                    ahead = -1.0 - abs(work.rho[world.agenda.literal[k, 0]])
-                kept = _keep(i, kept, x, y, theta, ahead, w, m, places, trail)
+                if holds(world, k, way.rho):
+                    ahead = -1.0 - abs(way.rho[world.literals.literal[k, PREDICATE]])
+                kept = _insert(places[i], trail[i], kept, x, y, theta, ahead, w, m)
         if kept == 0:
             return -1
         if i >= shortest and places[i, 0, 3] < enough:
-            reached = i
-            break
+            _write(world, way, n, i)
+            return n + i
         count = kept
-    if reached < 0:
-        return -1
-    w = 0
-    for i in range(reached, 0, -1):
-        motions[n + i - 1] = trail[i, w, 1]
-        for c in range(3):
-            poses[n + i, c] = places[i, w, c]
-        w = trail[i, w, 0]
-    for i in range(1, reached + 1):
-        read_at(world, poses, n + i, work)
-        note(world.agenda, t + n + i, work.rho, work.held, work.known)
-    return n + reached
+    return -1
 
 
 @leaf
-def _keep(
-    i: int,
-    kept: int,
-    x: float,
-    y: float,
-    theta: float,
-    ahead: float,
-    parent: int,
+def _insert(
+    places: Floats, trail: Ints, kept: int, x: float, y: float, theta: float, ahead: float, parent: int,
     motion: int,
-    places: Floats,
-    trail: Ints,
-) -> int:
-    """Puts a pose in its place among the nearest at step i, unless it is there; how many there are then."""
+) -> int:  # fmt: skip
+    """Puts a pose among the `kept` ones of a beam's step, those with the fewest steps to go first, unless it
+    is among them; returns how many there are then. places [width, 4], trail [width, 2].
+    """
     for w in range(kept):
-        if abs(places[i, w, 0] - x) + abs(places[i, w, 1] - y) + abs(places[i, w, 2] - theta) < TWIN:
+        if abs(places[w, 0] - x) + abs(places[w, 1] - y) + abs(places[w, 2] - theta) < SAME_POSE:
             return kept
-    at = min(kept, WIDTH - 1)
-    while at > 0 and places[i, at - 1, 3] > ahead:
+    at = min(kept, BEAM_WIDTH - 1)
+    while at > 0 and places[at - 1, 3] > ahead:
         for c in range(4):
-            places[i, at, c] = places[i, at - 1, c]
-        trail[i, at, 0], trail[i, at, 1] = trail[i, at - 1, 0], trail[i, at - 1, 1]
+            places[at, c] = places[at - 1, c]
+        trail[at, 0], trail[at, 1] = trail[at - 1, 0], trail[at - 1, 1]
         at -= 1
-    places[i, at, 0], places[i, at, 1], places[i, at, 2], places[i, at, 3] = x, y, theta, ahead
-    trail[i, at, 0], trail[i, at, 1] = parent, motion
-    return min(kept + 1, WIDTH)
+    places[at, 0], places[at, 1], places[at, 2], places[at, 3] = x, y, theta, ahead
+    trail[at, 0], trail[at, 1] = parent, motion
+    return min(kept + 1, BEAM_WIDTH)
+
+
+@leaf
+def _write(world: World, way: Way, n: int, steps: int) -> None:
+    """Writes the best of a beam's ways of so many steps on from motions[:n]."""
+    w = 0
+    for i in range(steps, 0, -1):
+        way.motions[n + i - 1] = way.trail[i, w, 1]
+        for c in range(3):
+            way.poses[n + i, c] = way.places[i, w, c]
+        w = way.trail[i, w, 0]
+    for i in range(n + 1, n + steps + 1):
+        read_at(world, way, i)
+        note_at(world, way, i)
+
+
+@leaf
+def linger(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> None:
+    """Stays from motions[:n] to motions[:stop]. A robot that cannot stay moves about near where literal k
+    holds, so that it holds in the end.
+    """
+    if world.stands:
+        stay(world, way, n, stop)
+        return
+    read_at(world, way, n)
+    kept = True
+    for i in range(n, stop):
+        move(world, way, i, world.pad)
+        kept = kept and keeps(world, k, way.t + i + 1, need, way.rho)
+    if world.field[k, 0] < 0 or (kept and holds(world, k, way.rho)):
+        return
+    while n < stop:
+        i = min(BEAM_LENGTH, stop - n)
+        after = descend_by_beam(world, way, k, world.field[k, 0], n, n + i, np.inf, i, i, need)
+        if after < 0:
+            stay(world, way, n, stop)
+            return
+        n = after

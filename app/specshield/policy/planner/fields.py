@@ -19,7 +19,7 @@ from specshield.rule.values import REGIONS, fill_place, fill_pose, fill_signals,
 from specshield.stl.program import STACK_SIZE, Programs, evaluate_packed
 from specshield.world.regions import PackedRegions
 
-FAR = 1000.0  # [steps] what is farther is out of reach
+OUT_OF_REACH = 1000.0  # [steps] what is farther counts as out of reach
 SCALE = 64.0  # codes a step
 UNREACHED, INVALID = 65534, 65535
 
@@ -71,9 +71,9 @@ def values_at(
 def steps_to(lattice: Lattice, goal: NDArray[np.bool_], keeps: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """The field of one goal as codes [ny, nx, H], over the free poses that `keeps` allows."""
     valid = np.ascontiguousarray(lattice.valid & keeps)
-    latest = np.where(goal & (valid == 1), np.float32(FAR), np.float32(NEVER))
+    latest = np.where(goal & (valid == 1), np.float32(OUT_OF_REACH), np.float32(NEVER))
     sweep(lattice, valid, 0.0, latest)
-    code = np.where(latest >= 0.0, np.ceil(SCALE * (FAR - latest)), UNREACHED).astype(np.uint16)
+    code = np.where(latest >= 0.0, np.ceil(SCALE * (OUT_OF_REACH - latest)), UNREACHED).astype(np.uint16)
     code[valid == 0] = INVALID
     return code
 
@@ -100,11 +100,11 @@ def to_go(fields: Fields, f: int, v: float, u: float, h: float) -> float:
                 continue
             code = fields.code[f, row, low]
             if wi * (1.0 - r) >= 1e-9 and code != INVALID:
-                total += wi * (1.0 - r) * (code if code != UNREACHED else SCALE * FAR)
+                total += wi * (1.0 - r) * (code if code != UNREACHED else SCALE * OUT_OF_REACH)
                 weights += wi * (1.0 - r)
             code = fields.code[f, row, high]
             if wi * r >= 1e-9 and code != INVALID:
-                total += wi * r * (code if code != UNREACHED else SCALE * FAR)
+                total += wi * r * (code if code != UNREACHED else SCALE * OUT_OF_REACH)
                 weights += wi * r
     return total / (SCALE * weights) if weights > 1e-6 else np.inf
 

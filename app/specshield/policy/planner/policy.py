@@ -31,27 +31,20 @@ from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
 from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
-from specshield.policy.planner.approach import World
-from specshield.policy.planner.due_dates import (
-    Agenda,
-    Bounds,
-    Literal,
-    agenda_of,
-    foresee,
-    is_open,
-    read_signals,
-)
-from specshield.policy.planner.fields import FAR, Fields, steps_to, values_at
-from specshield.policy.planner.first_motions import propose_all
+from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
+from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to, values_at
+from specshield.policy.planner.first_motions import plan_all
+from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
+from specshield.policy.planner.way import World
 from specshield.policy.tensors import read_tensors
 from specshield.robot.unicycle import Body, make_body
 from specshield.rule.progress import signal_rows
 from specshield.rule.residual import bounds_after, residuals, still_open
-from specshield.rule.values import REGIONS, initial_signals, places, regions_of
+from specshield.rule.values import initial_signals, places, regions_of
 from specshield.rule.view import look
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.stl.program import STACK_SIZE, compile_predicate, pack
-from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL
+from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree
 from specshield.task import Task
 
 MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
@@ -117,8 +110,8 @@ class PlannerPolicy:
 
     def _world_of(self, formula: Formula) -> World:
         """The world as a search sees it for the task's formula, or for what is left of it."""
-        agenda, literals = agenda_of(self.task, formula)
-        _, all_literals = agenda_of(self.task, self.task.formula)
+        packed, literals = literals_of(self.task, formula)
+        _, all_literals = literals_of(self.task, self.task.formula)
         index = {(found.predicate, found.side): i for i, found in enumerate(all_literals)}
         known = [index.get((each.predicate, each.side), -1) for each in literals]
         field = np.full((len(literals), 2), -1, np.int64)
@@ -128,8 +121,8 @@ class PlannerPolicy:
         pad = _pad_motion(self._body)
         stands = bool(self._body.translate[pad] == 0.0 and self._body.rotate[pad] == 0.0)
         turns = bool(np.any((self._body.translate == 0.0) & (self._body.rotate != 0.0)))
-        band = BAND if turns else 2.0 * FAR
-        return World(self._body, self.fields, agenda, field, band, pad, stands, cost_of(agenda), 0.0)
+        band = BAND if turns else 2.0 * OUT_OF_REACH
+        return World(self._body, self.fields, packed, field, band, pad, stands, cost_of(packed.formula.tree))
 
     def propose(
         self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
@@ -142,7 +135,9 @@ class PlannerPolicy:
     ) -> tuple[Proposal, bool]:
         """The proposal, and whether a plan of it satisfies the formula, or what can still be kept of it."""
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
-        _, high = look(self._world.agenda.rule, history, rows, np.empty(self._world.agenda.rule.tree.size))
+        _, high = look(
+            self._world.literals.formula, history, rows, np.empty(self._world.literals.formula.tree.size)
+        )
         parts: Iterable[Formula] = (self.task.formula,)
         if high <= SATISFIED_ABOVE:
             left = residuals(self.task.formula, self.task.samples(history, signals), t)
@@ -171,13 +166,14 @@ class PlannerPolicy:
         self, world: World, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
     ) -> tuple[Proposal, bool]:
         t = len(history) - 1
-        known = np.empty(world.agenda.rule.tree.size)
-        look(world.agenda.rule, history, rows, known)
+        literals = world.literals._replace(margin=margin)
+        known = np.empty(literals.formula.tree.size)
+        look(literals.formula, history, rows, known)
         motions = np.empty((len(self._body.translate), self.task.horizon - t), np.int64)
         poses = np.empty((len(motions), motions.shape[1] + 1, 3))
         effort = self.settings.effort * max(1.0, self.task.horizon / USUAL) ** 2
-        world = world._replace(margin=margin)
-        first, found = propose_all(world, t, history[-1], rows[-1], known, effort, motions, poses)
+        world = world._replace(literals=literals)
+        first, found = plan_all(world, t, history[-1], rows[-1], known, effort, motions, poses)
         return Proposal(motions, np.ascontiguousarray(poses[:, 1:]), int(first)), bool(found)
 
     def feasible_start(self, lattice: Lattice) -> float:
@@ -203,13 +199,13 @@ def synthesise(
     began = time.perf_counter()
     settings = settings or Settings()
     check(task, settings)
-    agenda, literals = agenda_of(task, task.formula)
+    packed, literals = literals_of(task, task.formula)
     lattice = make_lattice(make_body(task.robot, task.grid), settings.pitch)
     holds, free = _holding(task, lattice, literals), lattice.valid == 1
     used = free.any(axis=2)
     codes: dict[tuple[int, tuple[int, ...]], NDArray[np.uint16]] = {}
     chosen = np.full((len(literals), 2), -1, np.int32)
-    for column, kept in enumerate(_kept(task, agenda, literals)):
+    for column, kept in enumerate(_kept(task, packed, literals)):
         for k in range(len(literals)):
             keeps = tuple(g for g in kept if literals[g].predicate != literals[k].predicate)
             if (k, keeps) not in codes and len(codes) < MAX_FIELDS:
@@ -238,7 +234,7 @@ def synthesise(
 def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_settings(card.get("options", {}))
-    _, literals = agenda_of(task, task.formula)
+    _, literals = literals_of(task, task.formula)
     tensors = read_tensors(weights)
     wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "chosen": (np.int32, 2)}
     for name, (dtype, rank) in wanted.items():
@@ -267,7 +263,7 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
 
 def check(task: Task, settings: Settings) -> None:
     """Raises what `synthesise` would for a task it cannot serve, without making anything."""
-    _, literals = agenda_of(task, task.formula)
+    _, literals = literals_of(task, task.formula)
     ny, nx, headings = _shape(task, settings)
     fields = min(2 * len(literals), MAX_FIELDS)
     if ny * nx * headings * fields > MAX_ENTRIES:
@@ -296,30 +292,27 @@ def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> NDA
     return holds
 
 
-def _kept(task: Task, agenda: Agenda, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
+def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:
     """The literals that every way to a goal has to keep, and those that some have to, for a while.
 
     The first have to hold, whatever else happens, at half of all steps or more.
     """
-    size = agenda.rule.tree.size
-    bounds = Bounds(np.empty(size), np.empty(size), np.empty(size), np.empty(size))
-    values = np.concatenate([np.zeros(REGIONS + len(task.regions)), initial_signals(task)])
-    held = np.empty(len(agenda.leaf))
-    read_signals(agenda, values, np.empty(STACK_SIZE), held)
-    foresee(agenda, -1, np.empty(size), held, bounds.low, bounds.high)
+    size = packed.formula.tree.size
+    bounds = make_bounds(size)
+    values = np.concatenate([np.zeros(3 + len(task.regions)), list(task.signals.values())])
+    held = np.empty(len(packed.leaf))
+    read_signals(packed, values, np.empty(STACK_SIZE), held)
+    foresee(packed, -1, np.empty(size), held, bounds)
     always = []
     for k in range(len(literals)):
-        needed = [
-            not is_open(agenda, k, -1, -1, t, t, SATISFIED_ABOVE, bounds) for t in range(task.horizon + 1)
-        ]
+        needed = [not is_open_if(packed, k, -1, -1, t, t, bounds) for t in range(task.horizon + 1)]
         if 2 * sum(needed) >= len(needed):
             always.append(k)
     return always, [k for k in range(len(literals)) if k in always or literals[k].guards]
 
 
-def cost_of(agenda: Agenda) -> float:
+def cost_of(tree: Tree) -> float:
     """What one evaluation of the bounds costs [about us]."""
-    tree = agenda.rule.tree
     work = 4.0 * tree.size
     for op, length, a, b in zip(tree.op, tree.length, tree.a, tree.b, strict=True):
         if op in (ALWAYS, EVENTUALLY):

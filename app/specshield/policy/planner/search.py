@@ -1,12 +1,14 @@
-"""Plans for any formula: go to where a predicate holds, stay, go on; searched in exact simulation.
+"""The search for a way that satisfies a formula: go to where a literal holds, stay, go on.
 
-A node of the search is a simulated prefix. Its children serve one literal each, the one due first before
-the others: walk to where it holds and stay until it is not due any more; a robot that cannot stay keeps
-near, and the last children of its nodes are its single motions. A child that no continuation can save (the
-upper bound on rho) is cut; a node from which staying to the horizon satisfies the formula ends the search.
-The order is right nearly always, so the search tries first the ways that depart least from it (limited
-discrepancy search, Harvey and Ginsberg 1995). What it may spend is counted, not timed: one question has one
-answer.
+A node of the search is a simulated prefix. Each child serves one literal: it goes to where the literal holds
+and stays until it is not due any more. The literal that is due first comes first. A robot that cannot stay
+moves about near there, and the last children of its nodes are its single motions. A child that no
+continuation can save, because the upper bound on rho is not above the margin, is cut. A node from which
+staying to the horizon satisfies the formula ends the search.
+
+The order of the children is nearly always right, so the search first tries the ways that depart least from it
+(limited discrepancy search, Harvey and Ginsberg 1995). Its effort is counted, not timed: the same question
+always has the same answer.
 """
 
 from __future__ import annotations
@@ -18,41 +20,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf, merged
-from specshield.policy.planner.approach import (
-    BEGIN,
-    DUE,
-    LENGTH,
-    UNTIL,
-    WITHOUT,
-    Work,
-    World,
-    beam,
-    holds,
-    linger,
-    move,
-    read_at,
-    stay,
-    walk,
-)
+from specshield.policy.planner.approach import BEAM_LENGTH, descend, descend_by_beam, linger
 from specshield.policy.planner.due_dates import (
-    NEVER,
-    due,
+    NO_DATE,
+    due_date,
     foresee,
     is_open,
     needed_until,
-    needed_without,
+    needed_until_goal,
     stay_for,
 )
 from specshield.policy.planner.fields import to_go_at
+from specshield.policy.planner.literals import GUARDS
+from specshield.policy.planner.way import (
+    BEGIN,
+    DUE,
+    UNTIL,
+    UNTIL_GOAL,
+    Way,
+    World,
+    holds,
+    move,
+    read_at,
+    stay,
+)
 from specshield.stl.tree import tree_value
 
-DEEP = 128  # nodes on one way, at most
-SPARE = 3  # [steps] left over where one departs as late as can be
+MAX_DEPTH = 128  # nodes on one way
+SPARE = 3  # [steps] that a late departure leaves over; chosen by hand, nothing measured
 
-MADE, COUNT, TRIED, OPENED, USED = range(5)  # of a node
-KEY, LITERAL, BEFORE, STAY, KEEP = range(5)  # of a child
-# Its key: which kind comes first; then what is due.
-FIRST, SECOND, LATER, LAST, ANY = 0, 1 << 20, 1 << 21, 1 << 22, 1 << 23
+MADE, COUNT, TRIED, OPENED, USED = range(5)  # the columns of a node's state
+KEY, LITERAL, BEFORE, STAY, KEEP = range(5)  # the columns of a child
+# The key that orders children: their class, plus the step at which the literal is due.
+AT_ONCE, STAYING, LATER, NOT_DUE, SINGLE = 0, 1 << 20, 1 << 21, 1 << 22, 1 << 23
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -61,12 +61,13 @@ Ints = NDArray[np.int64]
 class Nodes(NamedTuple):
     """The nodes from the root to the newest.
 
-    state [DEEP, 5]: motions MADE, COUNT of children, how many were TRIED, how many of those were OPENED,
-    discrepancies USED. need [DEEP, L, 4]: by when a literal is DUE, from which step (BEGIN) UNTIL which it
-    has to hold throughout, and until which step as long as it is WITHOUT the child's literal. child
-    [DEEP, C, 5], by KEY: go to LITERAL after waiting BEFORE steps, and STAY there (1) or not (0); or, with
-    KEEP, go at once but keep that literal for the next BEFORE steps; or, with LITERAL -1, STAY that long
-    where KEEP holds; or, without both, for a robot that cannot stay, make the motion STAY.
+    state [MAX_DEPTH, 5]: motions MADE, COUNT of children, how many were TRIED, how many of those were OPENED,
+    discrepancies USED. need [MAX_DEPTH, L, 4]: what is needed of each literal, see way.py.
+
+    child [MAX_DEPTH, C, 5], in the order of KEY, is one of four kinds. With LITERAL alone: wait BEFORE
+    steps, go to the literal, and STAY there (1) or not (0). With LITERAL and KEEP: go at once, but keep the
+    literal KEEP for the next BEFORE steps. With KEEP alone: STAY so many steps where KEEP holds. With
+    neither, for a robot that cannot stay: make the motion STAY. What a child does not have is -1.
     """
 
     state: Ints
@@ -75,17 +76,23 @@ class Nodes(NamedTuple):
 
 
 @leaf
-def value(world: World, work: Work) -> float:
+def value(world: World, way: Way) -> float:
     """rho of a way that is complete."""
-    for i in range(work.buffer.shape[0]):
-        work.buffer[i] = work.known[i]
-    work.spent[0] += world.cost
-    return tree_value(world.agenda.rule.tree, work.buffer)
+    for i in range(way.buffer.shape[0]):
+        way.buffer[i] = way.known[i]
+    way.spent[0] += world.cost
+    return tree_value(world.literals.formula.tree, way.buffer)
+
+
+@leaf
+def _foresee(world: World, way: Way, n: int) -> None:
+    """The leaves' bounds after motions[:n], into way.bounds."""
+    foresee(world.literals, way.t + n, way.known, way.held, way.bounds)
 
 
 @leaf
 def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, keep: int) -> None:
-    """Adds a child to the node on depth d, in its place among those not tried yet."""
+    """Adds a child to the node at depth d, in its place among those not tried yet."""
     i, child = nodes.state[d, COUNT], nodes.child
     if i == child.shape[1]:
         return
@@ -99,157 +106,154 @@ def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, 
 
 
 @leaf
-def _guard(world: World, k: int, s: int, stop: int, need: Ints, work: Work) -> bool:
-    """Notes what has to hold until literal k does. Whether anything has to hold for a while."""
-    agenda, guarding = world.agenda, False
-    foresee(agenda, s, work.known, work.held, work.bounds.low, work.bounds.high)
+def _guard(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> bool:
+    """Notes what has to hold from motions[:n] on, at most to step `stop`, until literal k does. Whether
+    anything has to hold for a while.
+    """
+    literals, guarding, s = world.literals, False, way.t + n
+    _foresee(world, way, n)
     for g in range(need.shape[0]):
-        need[g, WITHOUT] = -1
-        if agenda.literal[g, 3] == 1 and g != k and not (need[g, BEGIN] <= s + 1 and need[g, UNTIL] >= stop):
-            work.spent[0] += 2.0 * world.cost
-            until = needed_without(agenda, g, k, s, stop, world.margin, work.bounds)
+        need[g, UNTIL_GOAL] = -1
+        throughout = need[g, BEGIN] <= s + 1 and need[g, UNTIL] >= stop
+        if literals.literal[g, GUARDS] == 1 and g != k and not throughout:
+            way.spent[0] += 2.0 * world.cost
+            until = needed_until_goal(literals, g, k, s, stop, way.bounds)
             if until > s:
-                need[g, WITHOUT] = until
-        guarding = guarding or need[g, UNTIL] >= 0 or need[g, WITHOUT] >= 0
+                need[g, UNTIL_GOAL] = until
+        guarding = guarding or need[g, UNTIL] >= 0 or need[g, UNTIL_GOAL] >= 0
     return guarding
 
 
 @merged
-def _expand(
-    world: World, t: int, d: int, n: int, used: int, motions: Ints, poses: Floats, work: Work, nodes: Nodes
-) -> bool:
-    """Makes the node on depth d, of motions[:n]. Whether staying here satisfies the formula."""
-    agenda, margin, steps, s, need = world.agenda, world.margin, motions.shape[0], t + n, nodes.need[d]
+def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> bool:
+    """Makes the node at depth d, of motions[:n]. Whether staying here satisfies the formula."""
+    literals, steps, s, need = world.literals, way.motions.shape[0], way.t + n, nodes.need[d]
     state = nodes.state[d]
     state[MADE], state[USED], state[COUNT], state[TRIED], state[OPENED] = n, used, 0, 0, 0
-    stay(world, t, n, steps, motions, poses, work)
-    work.spent[0] += 0.1 * (steps - n)
-    if value(world, work) > margin:
+    stay(world, way, n, steps)
+    way.spent[0] += 0.1 * (steps - n)
+    if value(world, way) > literals.margin:
         return True
-    read_at(world, poses, n, work)
-    foresee(agenda, s, work.known, work.held, work.bounds.low, work.bounds.high)
-    x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
+    read_at(world, way, n)
+    _foresee(world, way, n)
     bits = 2.0 + math.log2(float(steps))
     for k in range(need.shape[0]):
-        guess = nodes.need[d - 1, k, DUE] if d > 0 else NEVER  # most stay what they were
-        by = due(agenda, k, s, guess, margin, work.bounds)
-        work.spent[0] += (3.0 if by in (guess, NEVER) else bits) * world.cost
-        need[k, DUE], need[k, BEGIN], need[k, UNTIL], need[k, WITHOUT] = by, NEVER, -1, -1
-        if by != NEVER and agenda.literal[k, 3] == 1:
-            work.spent[0] += bits * world.cost
-            until = needed_until(agenda, k, s, by, margin, work.bounds)
+        guess = nodes.need[d - 1, k, DUE] if d > 0 else NO_DATE  # most due dates stay what they were
+        by = due_date(literals, k, s, guess, way.bounds)
+        way.spent[0] += (3.0 if by in (guess, NO_DATE) else bits) * world.cost
+        need[k, DUE], need[k, BEGIN], need[k, UNTIL], need[k, UNTIL_GOAL] = by, NO_DATE, -1, -1
+        if by != NO_DATE and literals.literal[k, GUARDS] == 1:
+            way.spent[0] += bits * world.cost
+            until = needed_until(literals, k, s, by, way.bounds)
             if until >= by:
                 need[k, BEGIN], need[k, UNTIL] = by, until
     dwelling, dwell = -1, 0
     for k in range(need.shape[0]):
         by = need[k, DUE]
-        if by == NEVER or not holds(world, k, work.rho):
+        if by == NO_DATE or not holds(world, k, way.rho):
             continue
-        stays = stay_for(agenda, k, s, by, steps - n, margin, work.bounds)
-        work.spent[0] += bits * world.cost
+        stays = stay_for(literals, k, s, by, steps - n, way.bounds)
+        way.spent[0] += bits * world.cost
         if stays <= steps - n and (stays > 1 or (stays == 1 and need[k, BEGIN] == s + 1)):
-            _add(nodes, d, SECOND + by, -1, 0, stays, k)
+            _add(nodes, d, STAYING + by, -1, 0, stays, k)
             if stays < steps - n:
                 dwelling, dwell = k, stays
     for k in range(need.shape[0]):
         by, f = need[k, DUE], world.field[k, 0]
-        if f < 0 or holds(world, k, work.rho):
+        if f < 0 or holds(world, k, way.rho):
             continue
-        ahead = to_go_at(world.body, world.fields, f, x, y, theta)
+        ahead = to_go_at(world.body, world.fields, f, way.poses[n, 0], way.poses[n, 1], way.poses[n, 2])
         if not ahead - world.band < min(steps - n, by - s):
             continue
         if dwelling >= 0:
-            _add(nodes, d, SECOND + min(by, LAST), k, dwell, 1, dwelling)
-        if by == NEVER:
-            _add(nodes, d, LAST + int(ahead), k, 0, 1, -1)
+            _add(nodes, d, STAYING + min(by, NOT_DUE), k, dwell, 1, dwelling)
+        if by == NO_DATE:
+            _add(nodes, d, NOT_DUE + int(ahead), k, 0, 1, -1)
             continue
-        _add(nodes, d, FIRST + by, k, 0, 1, -1)
+        _add(nodes, d, AT_ONCE + by, k, 0, 1, -1)
         late = by - s - math.ceil(ahead) - SPARE
         if late > 1:
             _add(nodes, d, LATER + by, k, late, 1, -1)
     if not world.stands and n < steps:
         for m in range(world.body.translate.shape[0]):
-            _add(nodes, d, ANY, -1, 0, m, -1)
+            _add(nodes, d, SINGLE, -1, 0, m, -1)
     return False
 
 
 @merged
-def _serve(
-    world: World, t: int, d: int, c: int, motions: Ints, poses: Floats, work: Work, nodes: Nodes
-) -> int:
-    """Makes child c of the node on depth d: how many motions there are then, -1 where it leads nowhere."""
-    agenda, margin, steps, need = world.agenda, world.margin, motions.shape[0], nodes.need[d]
+def _serve(world: World, way: Way, nodes: Nodes, d: int, c: int) -> int:
+    """Makes child c of the node at depth d: how many motions there are then, -1 where it leads nowhere."""
+    literals, steps, need = world.literals, way.motions.shape[0], nodes.need[d]
     made, child = nodes.state[d, MADE], nodes.child[d, c]
     k, before, stays, keep = child[LITERAL], child[BEFORE], child[STAY], child[KEEP]
     n = made
     if k < 0 and keep < 0:
-        read_at(world, poses, n, work)
-        move(world, t, n, stays, motions, poses, work)
+        read_at(world, way, n)
+        move(world, way, n, stays)
         n += 1
     elif k < 0:
-        _guard(world, keep, t + n, t + steps, need, work)
-        linger(world, keep, t, n, n + stays, need, motions, poses, work)
+        _guard(world, way, keep, n, way.t + steps, need)
+        linger(world, way, keep, n, n + stays, need)
         n += stays
     else:
         by = need[k, DUE]
-        stop = min(steps, by - t)
-        guarding = _guard(world, k, t + n, t + stop, need, work) or keep >= 0
+        stop = min(steps, by - way.t)
+        guarding = _guard(world, way, k, n, way.t + stop, need) or keep >= 0
         arrived, begin, until = -1, 0, 0
         if keep >= 0:
             begin, until = need[keep, BEGIN], need[keep, UNTIL]
-            need[keep, BEGIN], need[keep, UNTIL] = t + n + 1, t + n + before
+            need[keep, BEGIN], need[keep, UNTIL] = way.t + n + 1, way.t + n + before
         elif before > 0:
-            linger(world, k, t, n, n + before, need, motions, poses, work)
+            linger(world, way, k, n, n + before, need)
             n += before
-            arrived = n if holds(world, k, work.rho) else -1
+            arrived = n if holds(world, k, way.rho) else -1
         guarding = guarding and world.field[k, 0] != world.field[k, 1]
         for column in range(1, -1, -1):
             f = world.field[k, column]
             if arrived < 0 and f >= 0 and (column == 0 or guarding):
                 waits = (column == 0 or keep >= 0) and world.stands
-                arrived = walk(world, k, f, waits, t, n, stop, need, motions, poses, work)
-                if arrived < 0:  # it came too late, or got stuck: look at more than one way
-                    arrived = beam(world, k, f, t, n, stop, 0.0, 0, LENGTH, need, motions, poses, work)
+                arrived = descend(world, way, k, f, waits, n, stop, need)
+                if arrived < 0:  # it came too late or got stuck: a beam looks at more than one way
+                    arrived = descend_by_beam(world, way, k, f, n, stop, 0.0, 0, BEAM_LENGTH, need)
         if keep >= 0:
             need[keep, BEGIN], need[keep, UNTIL] = begin, until
         if arrived < 0:
             return -1
         n = arrived
-        if by != NEVER and stays == 1:
-            foresee(agenda, t + n, work.known, work.held, work.bounds.low, work.bounds.high)
-            stays = stay_for(agenda, k, t + n, by, steps - n, margin, work.bounds)
-            work.spent[0] += 8.0 * world.cost
+        if by != NO_DATE and stays == 1:
+            _foresee(world, way, n)
+            stays = stay_for(literals, k, way.t + n, by, steps - n, way.bounds)
+            way.spent[0] += 8.0 * world.cost
             if 0 < stays <= steps - n:
                 if before == 0:  # or wait first and go there when it counts, or go on before it is served
-                    _add(nodes, d, SECOND + by, k, stays if world.stands else n - made + stays, 1, -1)
+                    _add(nodes, d, STAYING + by, k, stays if world.stands else n - made + stays, 1, -1)
                     _add(nodes, d, LATER + by, k, 0, 0, -1)
-                linger(world, k, t, n, n + stays, need, motions, poses, work)
+                linger(world, way, k, n, n + stays, need)
                 n += stays
-    foresee(agenda, t + n, work.known, work.held, work.bounds.low, work.bounds.high)
-    work.spent[0] += world.cost
-    return n if is_open(agenda, -1, t + n, 0, 0, 0, margin, work.bounds) else -1
+    _foresee(world, way, n)
+    way.spent[0] += world.cost
+    return n if is_open(literals, way.bounds) else -1
 
 
 @leaf
-def search(
-    world: World, t: int, n: int, effort: float, motions: Ints, poses: Floats, work: Work, nodes: Nodes
-) -> bool:
-    """A way to the horizon that satisfies the formula, on from motions[:n], into motions (T - t,) and
-    poses (T - t + 1, 3), which begins with x_t. work.known: the leaves to step t + n. effort [about us].
+def search(world: World, way: Way, nodes: Nodes, n: int, effort: float) -> bool:
+    """Writes a way to the horizon that satisfies the formula, on from motions[:n]; whether there is one.
+
+    way.known has to hold the leaves to step t + n. effort [about us].
     """
-    state, most = nodes.state, work.spent[0] + effort
-    limit, cut = 0, True  # discrepancies allowed, and whether ways with more were left out
+    state, most = nodes.state, way.spent[0] + effort
+    limit, cut = 0, True  # how many discrepancies are allowed, and whether ways with more were left out
     d, made, used = -1, n, 0
     while True:
         if made >= 0:
             d += 1
-            if _expand(world, t, d, made, used, motions, poses, work, nodes):
+            if _expand(world, way, nodes, d, made, used):
                 return True
             made = -1
         more = state[d, TRIED] < state[d, COUNT]
-        if more and work.spent[0] > most:
+        if more and way.spent[0] > most:
             return False
-        if not more or state[d, USED] + state[d, OPENED] > limit or d + 1 == DEEP:
+        if not more or state[d, USED] + state[d, OPENED] > limit or d + 1 == MAX_DEPTH:
             cut = cut or more
             d -= 1
             if d < 0:
@@ -258,7 +262,7 @@ def search(
                 limit, cut, made, used = limit + 1, False, n, 0
             continue
         state[d, TRIED] += 1
-        after = _serve(world, t, d, state[d, TRIED] - 1, motions, poses, work, nodes)
+        after = _serve(world, way, nodes, d, state[d, TRIED] - 1)
         if after > state[d, MADE]:
             made, used = after, state[d, USED] + state[d, OPENED]
             state[d, OPENED] += 1
