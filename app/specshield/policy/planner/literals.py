@@ -43,8 +43,8 @@ class Literal(NamedTuple):
 class PackedLiterals(NamedTuple):
     """A formula of P predicates and L literals over a task; its tree has l leaves.
 
-    formula: the view of the formula as `separate` leaves it. leaf [l, 2]: the predicate that a leaf is, and -1
-    where the leaf is its negation, else 1; predicate -1 for a leaf that reads signals alone. predicate [P,
+    formula: the view of the formula as `separate` leaves it. leaf [l, 2]: the predicate that a leaf is, and
+    -1 where the leaf is its negation, else 1; predicate -1 for a leaf that reads signals alone. predicate [P,
     2]: one leaf that is the predicate or its negation, and -1 for the negation. literal [L, 4]: the columns
     PREDICATE; SIDE, -1 for the negation; LAST, the last step at which some leaf reads it; GUARDS, 1 or 0.
     margin: a literal holds, and the formula is satisfied, where its robustness is above this.
