@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A clone shares no compiled kernels with another, and keeps its own between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
 
-.PHONY: install demo run test lint bench results openapi clean
+.PHONY: install demo run test lint lines bench results openapi clean
 
 install: .venv/.dev
 
@@ -30,10 +30,15 @@ test: .venv/.dev
 	$(BIN)/python -m pytest
 
 lint: .venv/.dev
-	$(BIN)/ruff check app evaluation tests benchmarks
-	$(BIN)/ruff format --check app evaluation tests benchmarks
+	$(BIN)/ruff check app evaluation tests benchmarks examples
+	$(BIN)/ruff format --check app evaluation tests benchmarks examples
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -m benchmarks.lines
+
+# How long the code is: the part that the guarantee rests on, and the rest.
+lines: .venv/bin/python
+	$(BIN)/python -m benchmarks.lines
 
 # What only the benchmarks need stays out of .venv; the rest they take from it.
 .venv-bench/.done: .venv/.dev benchmarks/requirements.txt

@@ -32,10 +32,13 @@ class RunningServer:
 
 
 @contextmanager
-def serving(data_dir: Path, *options: str, ready: bool = True, **environment: str) -> Iterator[RunningServer]:
-    """`specshield serve` on a free port. environment: settings, as in SPECSHIELD_SESSION_TTL="1"."""
+def serving(
+    data_dir: Path, *options: str, ready: bool = True, port: int = 0, **environment: str
+) -> Iterator[RunningServer]:
+    """`specshield serve`. port: 0 is a free one. environment: settings, as in SPECSHIELD_SESSION_TTL="1"."""
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(("127.0.0.1", port))
         port = probe.getsockname()[1]
     kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
     data_dir.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The README's blocks, run as they stand against a real server."""
+"""The blocks of README.md and docs/http.md, run as they stand against a real server."""
 
 import re
 import subprocess
@@ -9,13 +9,14 @@ from specshield.sim import report
 from tests.serving import serving
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
+PAGES = (ROOT / "README.md", ROOT / "docs" / "http.md")
 TIMES = {"p50": 0.0, "p99": 0.0}
 ADDRESS = "http://127.0.0.1:8000"
 
 
 def blocks(language):
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+    pages = "\n".join(page.read_text() for page in PAGES)
+    return re.findall(rf"^```{language}\n(.*?)^```$", pages, re.MULTILINE | re.DOTALL)
 
 
 def run(server, *command):

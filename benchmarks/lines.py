@@ -1,0 +1,77 @@
+"""How long the code is, and whether it is still as small as the project wants it.
+
+    python -m benchmarks.lines        # the table, and what breaks a bound; exit status 1 if something does
+
+Lines are those that `wc -l` counts. The bounds keep the part that has to be right for the guarantee small
+enough to read in an afternoon, and every other part small enough to find one's way in.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+APP = REPOSITORY / "app"
+PACKAGE = APP / "specshield"
+TRUSTED = ("stl", "world", "robot", "task.py", "rule", "shield")  # what the guarantee rests on
+MOST_TRUSTED = 5_500  # lines of the trusted core
+MOST = 17_000  # lines of app/
+LONGEST = 350  # lines of one module
+FULLEST = 14  # files in one folder, at one level
+
+
+def main() -> int:
+    lines = {file: file.read_bytes().count(b"\n") for file in modules(APP)}
+    rooms = sorted({file.relative_to(PACKAGE).parts[0] for file in lines} - set(TRUSTED))
+    print("The trusted core, module by module:")
+    for room in TRUSTED:
+        show(room, below(lines, PACKAGE / room))
+        for file in lines:
+            if file.parent == PACKAGE / room and file.name != "__init__.py":
+                show(f"  {file.name}", lines[file])
+    print("The rest:")
+    for room in rooms:
+        show(room, below(lines, PACKAGE / room))
+    trusted = sum(below(lines, PACKAGE / room) for room in TRUSTED)
+    print()
+    show("The trusted core", trusted, f" of at most {MOST_TRUSTED:,}")
+    show("app/", sum(lines.values()), f" of at most {MOST:,}")
+    broken = list(breaches(lines, trusted))
+    for breach in broken:
+        print(breach, file=sys.stderr)
+    return 1 if broken else 0
+
+
+def show(name: str, lines: int, more: str = "") -> None:
+    print(f"{name:24}{lines:>7,}{more}")
+
+
+def modules(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*.py") if "__pycache__" not in file.parts)
+
+
+def below(lines: dict[Path, int], place: Path) -> int:
+    """The lines of a module, or of all modules in a folder."""
+    return sum(count for file, count in lines.items() if file.is_relative_to(place))
+
+
+def breaches(lines: dict[Path, int], trusted: int) -> Iterator[str]:
+    """What breaks a bound, one sentence each."""
+    if trusted > MOST_TRUSTED:
+        yield f"the trusted core has {trusted:,} lines; expected at most {MOST_TRUSTED:,}"
+    if sum(lines.values()) > MOST:
+        yield f"app/ has {sum(lines.values()):,} lines; expected at most {MOST:,}"
+    for file, count in lines.items():
+        if count > LONGEST:
+            yield f"{file.relative_to(REPOSITORY)} has {count} lines; expected at most {LONGEST}"
+    for folder in sorted({file.parent for file in lines}):
+        files = [each for each in folder.iterdir() if each.is_file() and not each.name.startswith(".")]
+        if len(files) > FULLEST:
+            shown = folder.relative_to(REPOSITORY)
+            yield f"{shown} holds {len(files)} files; expected at most {FULLEST} at one level"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""The examples, each against a real server."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from examples import robot_loop
+from specshield.client import ShieldClient
+from specshield.sim.cases import load_case
+from specshield.sim.model import GoalSeeker
+from specshield.sim.robot import Pose, SimulatedRobot
+from tests.serving import serving
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def test_a_house_of_ones_own(tmp_path: Path) -> None:
+    with serving(tmp_path, SPECSHIELD_WORKER="true") as server:
+        done = subprocess.run(
+            [sys.executable, str(EXAMPLES / "own_house.py"), server.url],
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+    assert done.returncode == 0, done.stderr
+    decided, from_where, kept = done.stdout.splitlines()
+    assert decided.endswith("decided after 120 steps")
+    assert re.search(r"(9\d|100)%", from_where)
+    assert kept == "the rule is satisfied after 120 steps"
+
+
+class Restart(Exception):
+    """The robot's process ends here."""
+
+
+class EventfulRobot(SimulatedRobot):
+    """A robot to which things happen: `events[n]` before its n-th motion."""
+
+    def __init__(self, pose: Pose, events: dict[int, Callable[[], None]]) -> None:
+        super().__init__(load_case(robot_loop.POLICY), pose)
+        self.events, self.motions = events, 0
+
+    def execute(self, action: int) -> None:
+        self.motions += 1
+        self.events.pop(self.motions, lambda: None)()
+        super().execute(action)
+
+
+def test_a_loop_that_goes_on_through_outage_bump_and_restart(tmp_path: Path) -> None:
+    """The service is killed and comes back, the robot is pushed, and its process is started again twice, once
+    while the service is away."""
+    notes = tmp_path / "notes.json"
+    model = GoalSeeker(load_case(robot_loop.POLICY).task.robot)
+    model.reset(np.random.default_rng(0))
+    with ExitStack() as stack:
+        server = stack.enter_context(serving(tmp_path / "data"))
+        port = int(server.url.rpartition(":")[2])
+
+        def push() -> None:
+            robot.pose = (robot.pose[0] + 0.1, robot.pose[1] - 0.1, robot.pose[2] + 0.1)
+
+        def end_process() -> None:
+            raise Restart
+
+        events = {8: server.kill, 12: end_process, 25: push, 35: end_process}
+        robot = EventfulRobot(robot_loop.START, events)
+        with ShieldClient(server.url, timeout=1.0) as client, pytest.raises(Restart):
+            robot_loop.drive(client, robot, model, notes)
+        stack.enter_context(serving(tmp_path / "data", port=port, ready=False))  # the next loop waits for it
+        with ShieldClient(server.url, timeout=1.0) as client, pytest.raises(Restart):
+            robot_loop.drive(client, robot, model, notes)
+        session = robot_loop.Notes.read(notes).session
+        with ShieldClient(server.url, timeout=1.0) as client:
+            verdict = robot_loop.drive(client, robot, model, notes)
+        with ShieldClient(server.url, timeout=10.0) as client:
+            states = client.sessions.get(session).trajectory()
+    assert verdict.spec_status == "satisfied"
+    assert not notes.exists()
+    assert not events
+    undecided = [state.t for state in states if state.decision is None]
+    assert undecided[:4] == [8, 9, 10, 11]  # where the robot followed its plan
+    pushed = states[25].decision
+    assert pushed is not None
+    assert pushed["residual"]["translation"] > 0.05
