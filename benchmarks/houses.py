@@ -25,7 +25,7 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.methods import load_policy
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH, robot_from_json
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body
 from specshield.sim.cases import REPOSITORY
 from specshield.task import make_task
 from specshield.world.map_server import load_map

@@ -25,10 +25,10 @@ from benchmarks.judge import Judge
 from benchmarks.worlds import KINDS, NEAR, SHAPES, explore, make_world, sample
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
-from specshield.policy.dqn.policy import Proposer, wait_motion
+from specshield.policy.dqn.policy import Proposer
 from specshield.policy.reachability.policy import ReachabilityPolicy, Settings, synthesise
 from specshield.policy.reachability.tables import slack
-from specshield.robot.unicycle import Body, in_collision, simulate, step
+from specshield.robot.dynamics import Body, in_collision, motion_count, simulate, step
 from specshield.rule.progress import STACK, advance, make_rules, read_predicates, replay, value_count
 from specshield.shield.episode import Config, Decision, Shield, decide, make_shield, start
 from specshield.sim.cases import Case, case_names, load_case, shipped
@@ -79,7 +79,7 @@ def small_worlds(worlds: int, states: int, seed: int) -> Iterator[str]:
                 kept += 1
                 policy = synthesise(world.task, Settings(pitch=kind.pitch))
                 body, judge = make_shield([policy]).body, Judge(str(world.task.formula), world.regions)
-                wait, random = wait_motion(world.task.robot), np.random.default_rng([seed, number])
+                wait, random = world.task.robot.wait_motion, np.random.default_rng([seed, number])
                 for t, key, spare in sample(exact, wait, states, random):
                     claimed = certified(policy, body, judge, exact.history(t, key))
                     true, near = exact.feasible(t, key), int(spare <= NEAR)
@@ -122,7 +122,7 @@ class Slack:
     def after(self, history: Floats) -> Floats:
         """[M]: after each motion from x_t."""
         replay(self.rules, history, np.empty((len(history), 0)), self.status, self.run)
-        out, t = np.empty(len(self.body.translate)), len(history)
+        out, t = np.empty(motion_count(self.body)), len(history)
         for m in range(len(out)):
             pose = step(self.body, *history[-1].tolist(), m)
             status, run = self.status.copy(), self.run.copy()
@@ -155,7 +155,7 @@ class Model:
             low = 30.0 * np.clip(self.spare.after(history), -5.0, 40.0)
             return np.where(end, -1e4, noise - low[self.robot.motion_of])
         if self.kind == "idle":
-            noise = noise + 8.0 * (self.robot.motion_of == wait_motion(self.robot))
+            noise = noise + 8.0 * (self.robot.motion_of == self.robot.wait_motion)
         return np.where(end, -9.0, noise + self.wants)
 
 

@@ -17,8 +17,8 @@ from torch import nn
 from benchmarks.plain_world import Floats, World, predicate
 from specshield.policy.dqn.network import NAMES
 from specshield.policy.dqn.observation import FAR, NEAR_ALWAYS, make_sight
-from specshield.policy.dqn.policy import Policy, wait_motion
-from specshield.robot.unicycle import make_body
+from specshield.policy.dqn.policy import Policy
+from specshield.robot.dynamics import make_body
 from specshield.rule.progress import make_rules
 from specshield.stl import SATISFIED_ABOVE, Atom, obligations, robustness
 
@@ -36,7 +36,7 @@ class Plain:
         rules = make_rules(task)
         self.sight = make_sight(task, rules, make_body(task.robot, task.grid))
         self.goals = [k for k, part in enumerate(self.parts) if part.kind == "eventually"]
-        self.wait = wait_motion(task.robot)
+        self.wait = task.robot.wait_motion
         self.network = _network(dqn)
         self.offline: Callable[[Floats], float] | None = None
 

@@ -1,4 +1,4 @@
-"""The known dynamics and the regions again, in NumPy: the formulas of robot/unicycle.py, batched over poses.
+"""The known dynamics and the regions again, in NumPy: the formulas of robot/, batched over poses.
 
 Written apart from the compiled kernels, so that agreement in J says something. Two things are left out, and
 asserted instead: a robot that begins inside an obstacle, and regions other than circles and rectangles.
@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.robot.unicycle import CHORD, ROUNDING, SKIN
+from specshield.robot.contact import CHORD, ROUNDING, SKIN
 from specshield.stl import And, Atom, Formula, Not, Or
 from specshield.task import Task
 from specshield.world.regions import Circle, Rectangle, Region

@@ -20,7 +20,7 @@ from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import STRETCH, Robot
 from specshield.robot.actions import Action
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
@@ -87,7 +87,7 @@ def widened(dqn: Policy, task: Task) -> Policy:
 def random_dqn(task: Task, seed: int) -> Policy:
     body = make_body(task.robot, task.grid)
     random = np.random.default_rng(seed)
-    widths = [observation_size(make_rules(task), body), UNITS, UNITS, len(body.translate)]
+    widths = [observation_size(make_rules(task), body), UNITS, UNITS, motion_count(body)]
     arrays = {}
     for i, (fan_in, fan_out) in enumerate(pairwise(widths)):
         scale = 1.0 / math.sqrt(fan_in)

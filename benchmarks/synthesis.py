@@ -14,11 +14,11 @@ from benchmarks.states import shipped_dqn
 from benchmarks.timing import quietest
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.network import NAMES, make_network
-from specshield.policy.dqn.policy import wait_motion
 from specshield.policy.dqn.rollout import satisfies
 from specshield.policy.dqn.settings import Settings
 from specshield.policy.reachability import policy as reachability
 from specshield.policy.reachability.policy import load_reachability
+from specshield.robot.dynamics import motion_count
 from specshield.sim.cases import Case, load_case
 
 STARTS = 1000
@@ -84,7 +84,7 @@ def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]
     from stable_baselines3.common.callbacks import BaseCallback
 
     practice = Environment(case.task, 1, seed)
-    inputs, outputs = practice.observations.shape[1], len(practice.body.translate)
+    inputs, outputs = practice.observations.shape[1], motion_count(practice.body)
 
     class Practice(gymnasium.Env[np.ndarray, np.int64]):
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
@@ -123,7 +123,7 @@ def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]
             net,
             poses,
             False,
-            wait_motion(case.task.robot),
+            case.task.robot.wait_motion,
         )
         return float(satisfies(*args).mean())
 

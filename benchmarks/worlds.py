@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.judge import distance
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import robot_from_json
-from specshield.robot.unicycle import make_body, successors
+from specshield.robot.dynamics import make_body, motion_count, successors
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -230,7 +230,7 @@ class Exact:
 def explore(world: World) -> Exact | None:
     """None where there are more than MAX_NODES states, or none that can keep the formula."""
     body, horizon = make_body(world.task.robot, world.task.grid), world.task.horizon
-    motions = len(body.translate)
+    motions = motion_count(body)
 
     def onward(t: int, pose: Floats, progress: Progress) -> Key | None:
         inside = {name: float(distance(region, pose)) > 0.0 for name, region in world.regions.items()}

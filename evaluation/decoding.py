@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.robot.unicycle import make_body, successors
+from specshield.robot.dynamics import make_body, motion_count, successors
 from specshield.rule.residual import residuals
 from specshield.stl import SATISFIED_ABOVE, Obligation, conjuncts, obligations, robustness, robustness_bounds
 from specshield.task import Task
@@ -36,7 +36,7 @@ class _NextStates:
 
     def after(self, history: Floats) -> Floats:
         """[A, 3]."""
-        poses = np.empty((len(self._body.translate), 3))
+        poses = np.empty((motion_count(self._body), 3))
         successors(self._body, history[-1], poses)
         robot = self.task.robot
         return np.where(robot.terminal[:, None], history[-1], poses[robot.motion_of])

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from specshield.errors import NotFound
-from specshield.robot.unicycle import Body, in_collision, wrap
+from specshield.robot.dynamics import Body, in_collision, wrap
 from specshield.sim.cases import Case
 from specshield.sim.robot import Pose
 from specshield.task import Task

@@ -17,7 +17,7 @@ from specshield import __version__
 from specshield.errors import InputError, NotFound
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
-from specshield.robot.unicycle import Body, make_body
+from specshield.robot.dynamics import Body, make_body
 from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
 from specshield.sim.cases import MODELS, Case, case_name, load_case, shipped

@@ -22,7 +22,7 @@ from evaluation.experiment import Experiment, Setting
 from evaluation.methods import Answer, Method
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.policy.dqn.environment import free_poses
-from specshield.robot.unicycle import in_collision, simulate, step
+from specshield.robot.dynamics import in_collision, simulate, step
 from specshield.shield.episode import Shield, decide, start
 from specshield.sim.cases import Case
 from specshield.sim.robot import Pose, SimulatedRobot

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, label
 
 from specshield.compiled import leaf
-from specshield.robot.unicycle import Body, step
+from specshield.robot.dynamics import Body, displacement, step
 from specshield.sim.robot import COMFORT, LOOK_AHEAD
 from specshield.world.geodesic import geodesic_distance
 from specshield.world.occupancy import OccupancyGrid
@@ -152,17 +152,17 @@ def advise(
     for m in range(representative.shape[0]):
         if representative[m] == IDLE:
             continue
-        rotate = body.rotate[m]
+        move, rotate = displacement(body, m)
         nx, ny, ntheta = step(body, x, y, theta, m)
         after = bearing - rotate
         after -= 2.0 * math.pi * round(after / (2.0 * math.pi))
-        saved = body.translate[m] / stride * math.cos(bearing) + (abs(bearing) - abs(after)) / turn
+        saved = move / stride * math.cos(bearing) + (abs(bearing) - abs(after)) / turn
         if first >= 0:
             saved = 1.0 if representative[m] == first else 0.0
-        elif body.translate[m] < 0.0:
+        elif move < 0.0:
             saved -= BACKWARDS
         moved = math.hypot(nx - x, ny - y)
-        if moved < 0.25 * abs(body.translate[m]) or (rotate != 0.0 and ntheta == theta):
+        if moved < 0.25 * abs(move) or (rotate != 0.0 and ntheta == theta):
             saved = -1.0 - BACKWARDS
         out[representative[m]] = math.exp(SHARPNESS * saved)
         total += out[representative[m]]

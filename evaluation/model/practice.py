@@ -22,7 +22,7 @@ from evaluation.model.expert import END, END_WITHIN, IDLE, OFF, advise, bearing_
 from evaluation.model.floor_plans import House
 from specshield.compiled import kernel, leaf
 from specshield.robot import STRETCH
-from specshield.robot.unicycle import Body, in_collision, make_body, step
+from specshield.robot.dynamics import Body, in_collision, make_body, step
 from specshield.sim.learned.network import ACTIONS, INPUTS, KINDS, NOTHING
 from specshield.sim.senses import FIELD_OF_VIEW, RAYS, SIGHT, cast, scan, see
 from specshield.world.occupancy import OccupancyGrid

@@ -8,7 +8,7 @@ from scipy.ndimage import label
 from evaluation import disturbance
 from specshield.errors import NotFound
 from specshield.robot import STRETCH
-from specshield.robot.unicycle import in_collision, step
+from specshield.robot.dynamics import in_collision, step
 from specshield.sim.cases import load_case
 
 AHEAD = 0  # the Stretch's first motion

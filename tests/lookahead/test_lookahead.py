@@ -25,7 +25,7 @@ from specshield.lookahead.surrogate import (
     step_price,
 )
 from specshield.robot import STRETCH
-from specshield.robot.unicycle import make_body, step, successors
+from specshield.robot.dynamics import make_body, step, successors
 from specshield.rule.progress import make_rules
 from specshield.shield.shaping import log_softmax, restrict
 from specshield.world.occupancy import OccupancyGrid

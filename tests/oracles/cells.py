@@ -15,7 +15,7 @@ import numpy as np
 
 from specshield.policy.dqn.policy import Proposal
 from specshield.robot import robot_from_json
-from specshield.robot.unicycle import make_body, simulate
+from specshield.robot.dynamics import make_body, simulate
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

@@ -9,7 +9,7 @@ from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
 from specshield.robot import STRETCH, robot_from_json
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -54,7 +54,7 @@ def moved(grid, region):
 
 def sizes(task):
     body = make_body(task.robot, task.grid)
-    return observation_size(make_rules(task), body), len(body.translate)
+    return observation_size(make_rules(task), body), motion_count(body)
 
 
 def random_weights(task, seed=0, units=(16, 12)):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from specshield.robot import STRETCH, Action, Robot
-from specshield.robot.unicycle import in_collision, make_body, overlap, simulate, step, successors, wrap
+from specshield.robot.dynamics import in_collision, make_body, overlap, simulate, step, successors, wrap
 from specshield.sim.cases import case_names, load_case
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.disc import DiscWorld

@@ -12,7 +12,7 @@ from safetensors.numpy import save
 from specshield.policy.card import make_card
 from specshield.policy.dqn.observation import observation_size
 from specshield.robot import robot_from_json
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -65,7 +65,7 @@ def policy_files(spec: dict[str, Any] = SPEC, seed: int = 0) -> dict[str, Any]:
         spec.get("signals"),
     )
     body = make_body(task.robot, task.grid)
-    sizes = [observation_size(make_rules(task), body), 4, 4, len(body.translate)]
+    sizes = [observation_size(make_rules(task), body), 4, 4, motion_count(body)]
     weights = {f"w{i + 1}": np.zeros((sizes[i], sizes[i + 1]), np.float32) for i in range(3)}
     weights |= {f"b{i + 1}": np.zeros(sizes[i + 1], np.float32) for i in range(3)}
     card = make_card(task, "dqn", {}, seed, {"satisfied": 1.0}, spec)

@@ -9,7 +9,7 @@ from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.dqn.settings import Settings
 from specshield.policy.dqn.train import train
-from specshield.robot.unicycle import in_collision, make_body, successors
+from specshield.robot.dynamics import in_collision, make_body, successors
 from specshield.shield.episode import Config, decide, make_shield, start
 from specshield.world.regions import signed_distance
 from tests.oracles.brute_stl import brute_robustness

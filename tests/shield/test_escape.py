@@ -11,7 +11,7 @@ import pytest
 from specshield.policy.planner import policy as planner
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import robot_from_json
-from specshield.robot.unicycle import simulate
+from specshield.robot.dynamics import motion_count, simulate
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case, shipped
 from specshield.task import make_task
@@ -32,7 +32,7 @@ def visits(poses, centre, first, last):
 def fewest_steps_out(body, pose):
     for k in range(1, 5):
         reached = np.empty((k, 3))
-        for motions in product(range(len(body.translate)), repeat=k):
+        for motions in product(range(motion_count(body)), repeat=k):
             simulate(body, np.array(pose), np.array(motions), reached)
             if not inside(reached[-1]):
                 return k

@@ -5,7 +5,7 @@ import pytest
 
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
-from specshield.robot.unicycle import in_collision
+from specshield.robot.dynamics import in_collision
 from specshield.sim.robot import SimulatedRobot, waypoints
 
 A = {name: i for i, name in enumerate(STRETCH.action_names)}

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from specshield.robot import STRETCH
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body
 from specshield.sim.robot import SimulatedRobot
 from specshield.sim.senses import RAYS, REACH, SIGHT, scan, see
 from specshield.world.occupancy import OccupancyGrid

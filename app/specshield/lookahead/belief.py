@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from specshield.compiled import kernel
 from specshield.lookahead.surrogate import FEATURES, WANDER, Goals, cell_of, describe, follow
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body, displacements
 
 Floats = NDArray[np.float64]
 
@@ -128,8 +128,9 @@ def observe(
 
 def _sided(body: Body, said: Floats) -> float:
     """The KL of the motions said from the same with no side preferred to the other [nats]."""
-    alike = body.translate[:, None] == body.translate
-    mirrored = alike & (np.abs(body.rotate[:, None] + body.rotate) < 1e-9)
+    moves, turns = displacements(body)
+    alike = moves[:, None] == moves
+    mirrored = alike & (np.abs(turns[:, None] + turns) < 1e-9)
     even = np.where(mirrored.any(axis=0), 0.5 * (said + mirrored @ said), said)
     return float(said @ np.log(said / even))
 

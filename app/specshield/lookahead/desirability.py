@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel, leaf
 from specshield.lookahead.lattice import Planes
 from specshield.policy.lattice import coordinates
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body, displacement
 
 Singles = NDArray[np.float32]
 
@@ -109,7 +109,8 @@ def _back(
     least[:] = NEVER
     total[:] = 0.0
     for m in range(motions.shape[0]):
-        move, turn = body.translate[m] / planes.pitch, body.rotate[m] * headings / (2.0 * math.pi)
+        move, turn = displacement(body, m)
+        move, turn = move / planes.pitch, turn * headings / (2.0 * math.pi)
         low = int(np.floor(turn + 1e-6))
         part = np.float32(max(turn - low, 0.0)) if turn - low > 1e-6 else np.float32(0.0)
         g0, g1 = ahead[(h + low) % headings], ahead[(h + low + 1) % headings]

@@ -11,7 +11,7 @@ from specshield.compiled import kernel, leaf
 from specshield.lookahead.desirability import NEVER, desirability
 from specshield.lookahead.lattice import Planes
 from specshield.lookahead.surrogate import FEATURES, Goals, follow, is_blocked, price_left, step_price
-from specshield.robot.unicycle import Body, step
+from specshield.robot.dynamics import Body, step
 from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
 
 Floats = NDArray[np.float64]

@@ -13,7 +13,7 @@ from specshield.errors import Unsupported
 from specshield.lookahead.surrogate import is_blocked
 from specshield.policy.lattice import heading_count, pose_of
 from specshield.policy.reachability.tables import Tables, slack
-from specshield.robot.unicycle import Body, in_collision, step
+from specshield.robot.dynamics import Body, in_collision, longest_motions, motion_count, step
 from specshield.rule.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -66,10 +66,10 @@ def make_planes(
     body: Body, rules: Rules, horizon: int, tables: Tables | None = None, pitch: float = PITCH
 ) -> Planes:
     """Raises Unsupported where the tables would be too large."""
-    largest = float(np.max(np.abs(body.rotate), initial=0.0))
+    longest, largest = longest_motions(body)
     headings = min(heading_count([largest] if largest else []), MAX_HEADINGS)
     rows, columns = (math.ceil(n * body.resolution / pitch - 1e-9) for n in body.occupied.shape)
-    pad = math.ceil(float(np.max(np.abs(body.translate), initial=0.0)) / pitch - 1e-9) + 1
+    pad = math.ceil(longest / pitch - 1e-9) + 1
     width, cells = columns + 2 * pad, (rows + 2 * pad) * (columns + 2 * pad)
     goal = np.flatnonzero(rules.kind != ALWAYS)
     dwell = rules.kind[goal] == EVENTUALLY_ALWAYS
@@ -90,7 +90,7 @@ def make_planes(
     )
     shape = (headings, cells)
     planes = Planes(
-        pitch, pad, width, np.zeros(shape, np.uint8), np.zeros((len(body.translate), *shape), np.float32),
+        pitch, pad, width, np.zeros(shape, np.uint8), np.zeros((motion_count(body), *shape), np.float32),
         np.zeros(shape, np.int32), np.zeros(shape, np.int32), goal, first, last,
         due.astype(np.int32), opened.astype(np.int32), slot, slot, np.full(cells, -1),
         np.zeros((0, *shape), np.uint8),

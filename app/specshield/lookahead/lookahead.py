@@ -36,7 +36,7 @@ from specshield.lookahead.surrogate import (
 )
 from specshield.policy.lattice import pose_of
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
-from specshield.robot.unicycle import Body, make_body, successors
+from specshield.robot.dynamics import Body, make_body, successors
 from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
 from specshield.task import Task
 

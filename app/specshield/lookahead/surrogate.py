@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from specshield.compiled import kernel, leaf
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body, displacement, longest_motions
 from specshield.world.geodesic import geodesic_distance
 from specshield.world.occupancy import OccupancyGrid
 
@@ -174,10 +174,8 @@ def follow(
 @leaf
 def _largest(body: Body) -> tuple[float, float]:
     """The longest move [m] and the largest turn [rad] of the robot's motions, LEAST where it has none."""
-    stride, turn = LEAST, LEAST
-    for m in range(body.translate.shape[0]):
-        stride, turn = max(stride, abs(body.translate[m])), max(turn, abs(body.rotate[m]))
-    return stride, turn
+    stride, turn = longest_motions(body)
+    return max(stride, LEAST), max(turn, LEAST)
 
 
 @leaf
@@ -202,7 +200,7 @@ def price_left(body: Body, goals: Goals, goal: int, x: float, y: float) -> float
 def _wander(body: Body, blocked: NDArray[np.bool_], out: Floats) -> None:
     stride, turn = _largest(body)
     for m in range(out.shape[0]):
-        move, rotation = body.translate[m], body.rotate[m]
+        move, rotation = displacement(body, m)
         if move > 0.0:
             out[m] = 0.0 if blocked[m] else AHEAD * move / stride
         else:
@@ -229,7 +227,7 @@ def describe(body: Body, wu: float, wv: float, theta: float, blocked: NDArray[np
     for m in range(out.shape[0]):
         for k in range(FEATURES):
             out[m, k] = 0.0
-        move, rotation = body.translate[m], body.rotate[m]
+        move, rotation = displacement(body, m)
         if move == 0.0 and rotation == 0.0:
             out[m, IDLE] = 1.0
         elif blocked[m]:
@@ -244,5 +242,5 @@ def describe(body: Body, wu: float, wv: float, theta: float, blocked: NDArray[np
 def is_blocked(body: Body, motion: int, x: float, y: float, theta: float, after: Floats) -> bool:
     """Whether f stopped the motion from (x, y, theta) short; after (3,): where it led."""
     moved = math.hypot(after[0] - x, after[1] - y)
-    turned = body.rotate[motion] == 0.0 or after[2] != theta
-    return moved < 0.5 * abs(body.translate[motion]) or not turned
+    move, rotation = displacement(body, motion)
+    return moved < 0.5 * abs(move) or not (rotation == 0.0 or after[2] != theta)

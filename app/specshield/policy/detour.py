@@ -5,16 +5,11 @@ Near a wall many motions end in the same pose; arcs of one length end in the sam
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf
-from specshield.robot.unicycle import Body, step, wrap
-
-ALIKE = 1e-9  # [rad] as good as the same angle
-NONE = -2  # no motion does it
+from specshield.robot.dynamics import IMPOSSIBLE, Body, turn_by, wrap
 
 
 @leaf
@@ -68,19 +63,8 @@ def find_sibling(
                 break
             turn = turn_by(body, wrap(poses[other, j, 2] - poses[motion, 0, 2]))
             j += 1
-            if turn != NONE and (out[0] < 0 or j > out[2]) and (waits or j <= 1 + (turn >= 0)):
+            if turn != IMPOSSIBLE and (out[0] < 0 or j > out[2]) and (waits or j <= 1 + (turn >= 0)):
                 out[0], out[1], out[2] = other, turn, j
-
-
-@leaf
-def turn_by(body: Body, angle: float) -> int:
-    """The motion that turns by an angle and does nothing else; -1 for no angle, NONE where there is none."""
-    if abs(angle) < ALIKE:
-        return -1
-    for m in range(body.translate.shape[0]):
-        if body.translate[m] == 0.0 and abs(wrap(body.rotate[m] - angle)) < ALIKE:
-            return m
-    return NONE
 
 
 @leaf
@@ -110,21 +94,3 @@ def join(
             motions[n] = base[at] if at < steps else wait
             at += 1
         n += 1
-
-
-@leaf
-def undoing(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]) -> int:
-    """The motion that leads from `reached` back to `pose`, -1 where it is the same, NONE where none does."""
-    if _is_near(pose[0], pose[1], pose[2], reached):
-        return -1
-    for m in range(body.translate.shape[0]):
-        x, y, theta = step(body, reached[0], reached[1], reached[2], m)
-        if _is_near(x, y, theta, pose):
-            return m
-    return NONE
-
-
-@leaf
-def _is_near(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
-    turn = abs(theta - pose[2])
-    return bool(abs(x - pose[0]) + abs(y - pose[1]) < 1e-6 and min(turn, 2.0 * math.pi - turn) < 1e-6)

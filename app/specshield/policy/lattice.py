@@ -15,7 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel, leaf
-from specshield.robot.unicycle import TOUCH, Body, free_distance, in_collision, step, wrap
+from specshield.robot.dynamics import (
+    TOUCH,
+    Body,
+    displacements,
+    free_distance,
+    in_collision,
+    longest_motions,
+    step,
+    swing_radius,
+    unhindered,
+)
 from specshield.rule.progress import STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
@@ -55,9 +65,10 @@ def make_lattice(body: Body, pitch: float) -> Lattice:
     """Simulates every motion from every pose of the lattice once."""
     height, width = body.occupied.shape
     ny, nx = (max(math.ceil(n * body.resolution / pitch - 1e-9), 1) for n in (height, width))
-    headings = heading_count([float(r) for r in body.rotate if r != 0.0])
-    moving = np.flatnonzero(body.translate != 0.0)
-    turning = np.flatnonzero((body.translate == 0.0) & (body.rotate != 0.0))
+    moves, rotations = displacements(body)
+    headings = heading_count([float(r) for r in rotations if r != 0.0])
+    moving = np.flatnonzero(moves != 0.0)
+    turning = np.flatnonzero((moves == 0.0) & (rotations != 0.0))
     shape = (ny, nx, headings)
     lattice = Lattice(
         pitch=pitch,
@@ -67,8 +78,8 @@ def make_lattice(body: Body, pitch: float) -> Lattice:
         far_v=np.full((*shape, len(moving)), -1.0, np.float32),
         far_h=np.zeros((*shape, len(moving)), np.int16),
         turns=np.zeros((*shape, len(turning)), np.uint8),
-        shift=np.array([round(body.rotate[m] * headings / (2.0 * math.pi)) for m in turning], np.int64),
-        reach=math.ceil(float(np.max(np.abs(body.translate))) / pitch) + 1,
+        shift=np.array([round(rotations[m] * headings / (2.0 * math.pi)) for m in turning], np.int64),
+        reach=math.ceil(longest_motions(body)[0] / pitch) + 1,
     )
     _simulate_all(body, lattice, moving, turning)
     return lattice
@@ -103,8 +114,8 @@ def _simulate_all(
     body: Body, lattice: Lattice, moving: NDArray[np.int64], turning: NDArray[np.int64]
 ) -> None:
     ny, nx, headings = lattice.valid.shape
-    turns_within = body.radius + math.hypot(body.offset_x, body.offset_y) + TOUCH
-    moves_within = turns_within + np.max(np.abs(body.translate))
+    turns_within = swing_radius(body) + TOUCH
+    moves_within = turns_within + longest_motions(body)[0]
     for j in range(ny):
         for i in range(nx):
             u, v = (i + 0.5) * lattice.pitch, (j + 0.5) * lattice.pitch
@@ -114,12 +125,10 @@ def _simulate_all(
                 if room < turns_within and in_collision(body, x, y, theta):
                     continue
                 lattice.valid[j, i, h] = 1
+                cos, sin = math.cos(theta), math.sin(theta)
                 for d in range(moving.shape[0]):
-                    if room >= moves_within:  # nothing in reach: f without its search for contact
-                        distance = body.translate[moving[d]]
-                        x1, y1 = x + distance * math.cos(theta), y + distance * math.sin(theta)
-                        angle = body.rotate[moving[d]]
-                        theta1 = wrap(theta + angle) if angle != 0.0 else theta
+                    if room >= moves_within:
+                        x1, y1, theta1 = unhindered(body, x, y, theta, cos, sin, moving[d])
                     else:
                         x1, y1, theta1 = step(body, x, y, theta, moving[d])
                     if x1 != x or y1 != y or theta1 != theta:
@@ -128,7 +137,7 @@ def _simulate_all(
                         lattice.far_h[j, i, h, d] = round(w) % headings
                 for r in range(turning.shape[0]):
                     if room >= turns_within:
-                        theta1 = wrap(theta + body.rotate[turning[r]])
+                        _, _, theta1 = unhindered(body, x, y, theta, cos, sin, turning[r])
                     else:
                         _, _, theta1 = step(body, x, y, theta, turning[r])
                     lattice.turns[j, i, h, r] = theta1 != theta

@@ -64,6 +64,11 @@ class Robot:
         return np.array([-1 if a.terminal else index[a.translate, a.rotate] for a in self.actions])
 
     @cached_property
+    def wait_motion(self) -> int:
+        """The motion that leaves the pose as it is, -1 where the robot cannot stand still."""
+        return self.motions.index((0.0, 0.0)) if (0.0, 0.0) in self.motions else -1
+
+    @cached_property
     def representative(self) -> NDArray[np.int64]:
         """The lowest action index of each motion. Shape (M,)."""
         return np.array([int(np.argmax(self.motion_of == i)) for i in range(len(self.motions))])

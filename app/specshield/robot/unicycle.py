@@ -1,311 +1,28 @@
-"""The known dynamics x_{t+1} = f(x_t, a_t): a unicycle with a circular footprint on an occupancy grid.
+"""The known dynamics x_{t+1} = f(x_t, a_t) of a unicycle with a circular footprint on an occupancy grid.
 
 One compiled function, `step`, is f for everything: the rollout that certifies an action, training,
 simulation. It handles one pose at a time, so its result never depends on a batch's shape.
-
-Contact is exact for moves: the disc is swept along its straight path against each occupied cell's square, so
-no move jumps a thin wall. A turn sweeps an off-centre footprint along an arc, tested as chords of at most 6
-degrees, and is all or nothing. From inside an obstacle, f permits what does not go deeper.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, leaf
-from specshield.robot.actions import Robot
-from specshield.world.occupancy import OccupancyGrid
-
-TOUCH = 1e-6  # [m] a footprint that overlaps by less than this is not in collision (poses travel as text)
-SKIN = 1e-7  # [m] how far before the first contact a stopped move ends
-ROUNDING = 1e-9  # [m] slack against rounding: sliding along a wall is not a contact
-CHORD = math.radians(6.0)
-DEEP = 32  # [cells] deeper inside obstacles than this is all one: what lies beyond is not searched
-
-
-class Body(NamedTuple):
-    """Grid, footprint and motions as the compiled functions take them. Metres, radians."""
-
-    occupied: NDArray[np.uint8]  # [height, width], row 0 lowest
-    clearance: NDArray[np.float64]  # [height, width] from a cell's centre to the nearest obstacle
-    resolution: float
-    origin_x: float
-    origin_y: float
-    cos_yaw: float
-    sin_yaw: float
-    radius: float
-    offset_x: float
-    offset_y: float
-    stop: bool
-    translate: NDArray[np.float64]  # [M]
-    rotate: NDArray[np.float64]  # [M]
-
-
-def make_body(robot: Robot, grid: OccupancyGrid) -> Body:
-    """Prepares f once for a robot on a grid."""
-    x, y, yaw = grid.origin
-    motions = np.array(robot.motions, dtype=np.float64).reshape(-1, 2)
-    return Body(
-        occupied=np.ascontiguousarray(grid.occupied, dtype=np.uint8),
-        clearance=np.ascontiguousarray(grid.clearance, dtype=np.float64),
-        resolution=float(grid.resolution),
-        origin_x=float(x),
-        origin_y=float(y),
-        cos_yaw=math.cos(yaw),
-        sin_yaw=math.sin(yaw),
-        radius=float(robot.radius),
-        offset_x=float(robot.offset[0]),
-        offset_y=float(robot.offset[1]),
-        stop=robot.on_contact == "stop",
-        translate=np.ascontiguousarray(motions[:, 0]),
-        rotate=np.ascontiguousarray(motions[:, 1]),
-    )
-
-
-@inlined
-def wrap(theta: float) -> float:
-    """The angle in (-pi, pi]."""
-    if -math.pi < theta <= math.pi:
-        return theta
-    turns = math.ceil((theta - math.pi) / (2.0 * math.pi))
-    theta -= turns * 2.0 * math.pi
-    return theta if -math.pi < theta <= math.pi else math.pi
-
-
-@inlined
-def centre(body: Body, x: float, y: float, theta: float) -> tuple[float, float]:
-    """The footprint's centre in grid metres: along the grid's columns and rows from its lower-left corner."""
-    c, s = math.cos(theta), math.sin(theta)
-    dx = x + body.offset_x * c - body.offset_y * s - body.origin_x
-    dy = y + body.offset_x * s + body.offset_y * c - body.origin_y
-    return body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
-
-
-@inlined
-def _is_occupied(body: Body, row: int, col: int) -> bool:
-    if row < 0 or col < 0 or row >= body.occupied.shape[0] or col >= body.occupied.shape[1]:
-        return True
-    return bool(body.occupied[row, col] != 0)
-
-
-@inlined
-def _cell(body: Body, u: float, v: float) -> tuple[int, int]:
-    """Row and column of a point (grid metres), held to the ring: one far off fits no integer."""
-    h, (height, width) = body.resolution, body.occupied.shape
-    return math.floor(min(max(v / h, -1.0), height)), math.floor(min(max(u / h, -1.0), width))
-
-
-@inlined
-def _rows(body: Body, low: float, high: float) -> tuple[int, int]:
-    """The range of rows between two heights (grid metres), with the ring that stands for the outside."""
-    h = body.resolution
-    return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[0]) + 1
-
-
-@inlined
-def _columns(body: Body, low: float, high: float) -> tuple[int, int]:
-    h = body.resolution
-    return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[1]) + 1
-
-
-@inlined
-def _room(body: Body, u: float, v: float) -> float:
-    """How far around a point (grid metres) the clearance field alone shows it free [m]; -inf inside one."""
-    h = body.resolution
-    row, col = _cell(body, u, v)
-    if _is_occupied(body, row, col):
-        return -np.inf
-    return float(body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h))
-
-
-@inlined
-def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
-    """Whether the clearance field alone shows no obstacle within `distance` [m] of a point (grid metres)."""
-    return _room(body, u, v) >= distance
-
-
-@leaf
-def free_distance(body: Body, u: float, v: float, limit: float) -> float:
-    """Exact distance [m] from a point (grid metres) to the nearest occupied square, at most `limit`."""
-    h = body.resolution
-    row, col = _cell(body, u, v)
-    if _is_occupied(body, row, col):
-        return 0.0
-    if _is_clear(body, u, v, limit):
-        return limit
-    best = limit * limit
-    first, last = _columns(body, u - limit, u + limit)
-    for j in range(*_rows(body, v - limit, v + limit)):
-        dy = max(j * h - v, 0.0, v - (j + 1) * h)
-        if dy * dy >= best:
-            continue
-        for i in range(first, last):
-            dx = max(i * h - u, 0.0, u - (i + 1) * h)
-            if dx * dx + dy * dy < best and _is_occupied(body, j, i):
-                best = dx * dx + dy * dy
-    return math.sqrt(best)
-
-
-@leaf
-def _depth(body: Body, u: float, v: float) -> float:
-    """How far inside occupied space a point lies [m]: to the nearest free square, DEEP cells at most."""
-    h = body.resolution
-    height, width = body.occupied.shape
-    row, col = _cell(body, u, v)
-    half = 4
-    while True:  # a window that grows until nothing outside it can be nearer
-        best = half * h
-        for j in range(max(row - half, 0), min(row + half + 1, height)):
-            dy = max(j * h - v, 0.0, v - (j + 1) * h)
-            for i in range(max(col - half, 0), min(col + half + 1, width)):
-                if body.occupied[j, i] == 0:
-                    best = min(best, math.hypot(max(i * h - u, 0.0, u - (i + 1) * h), dy))
-        if best < half * h or half >= DEEP:
-            return best
-        half *= 2
-
-
-@leaf
-def _enters_slab(p: float, d: float, low: float, high: float) -> tuple[float, float]:
-    """The parameters at which p + s d enters and leaves (low, high)."""
-    if d == 0.0:
-        if low < p < high:
-            return -np.inf, np.inf
-        return np.inf, -np.inf
-    first, last = (low - p) / d, (high - p) / d
-    return min(first, last), max(first, last)
-
-
-@leaf
-def _enters_box(
-    pu: float, pv: float, du: float, dv: float, u0: float, u1: float, v0: float, v1: float
-) -> float:
-    a0, a1 = _enters_slab(pu, du, u0, u1)
-    b0, b1 = _enters_slab(pv, dv, v0, v1)
-    enter, leave = max(a0, b0), min(a1, b1)
-    if enter < leave and leave > 0.0:
-        return max(enter, 0.0)
-    return np.inf
-
-
-@leaf
-def _enters_disc(pu: float, pv: float, du: float, dv: float, cu: float, cv: float, r: float) -> float:
-    """(du, dv) is a unit vector."""
-    qu, qv = pu - cu, pv - cv
-    along = qu * du + qv * dv
-    gap = qu * qu + qv * qv - r * r
-    root = along * along - gap
-    if root <= 0.0:
-        return np.inf
-    leave = -along + math.sqrt(root)
-    if leave <= 0.0:
-        return np.inf
-    return max(-along - math.sqrt(root), 0.0)
-
-
-@leaf
-def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length: float, r: float) -> float:
-    """How far [m] a disc of radius r moves from (u, v) along a unit vector until it overlaps; inf: never."""
-    h = body.resolution
-    mu, mv = u + 0.5 * length * du, v + 0.5 * length * dv
-    col, row = math.floor(mu / h), math.floor(mv / h)
-    if 0 <= row < body.occupied.shape[0] and 0 <= col < body.occupied.shape[1]:
-        bound = body.clearance[row, col] - math.hypot(mu - (col + 0.5) * h, mv - (row + 0.5) * h)
-        if bound >= r + 0.5 * length:
-            return np.inf
-    eu, ev = u + length * du, v + length * dv
-    left, right = _columns(body, min(u, eu) - r, max(u, eu) + r)
-    first, reach = np.inf, r + 0.7072 * h  # to the centre of a square that the disc may touch
-    for j in range(*_rows(body, min(v, ev) - r, max(v, ev) + r)):
-        for i in range(left, right):
-            if not _is_occupied(body, j, i):
-                continue
-            su, sv = (i + 0.5) * h - u, (j + 0.5) * h - v  # most are out of reach: the exact test is dear
-            nearest = min(max(su * du + sv * dv, 0.0), length)
-            if (su - nearest * du) ** 2 + (sv - nearest * dv) ** 2 > reach * reach:
-                continue
-            u0, u1, v0, v1 = i * h, (i + 1) * h, j * h, (j + 1) * h
-            # A disc meets a square where its centre meets the square grown by r: two boxes and four discs.
-            first = min(first, _enters_box(u, v, du, dv, u0 - r, u1 + r, v0, v1))
-            first = min(first, _enters_box(u, v, du, dv, u0, u1, v0 - r, v1 + r))
-            first = min(first, _enters_disc(u, v, du, dv, u0, v0, r), _enters_disc(u, v, du, dv, u1, v0, r))
-            first = min(first, _enters_disc(u, v, du, dv, u0, v1, r), _enters_disc(u, v, du, dv, u1, v1, r))
-    return first if first < length else np.inf
-
-
-@leaf
-def _move(body: Body, x: float, y: float, theta: float, distance: float) -> float:
-    """How far of `distance` [m, signed] the robot can go straight on: all of it, or up to the contact."""
-    u, v = centre(body, x, y, theta)
-    sign = 1.0 if distance > 0.0 else -1.0
-    length = abs(distance)
-    cx, cy = sign * math.cos(theta), sign * math.sin(theta)
-    du, dv = body.cos_yaw * cx + body.sin_yaw * cy, body.cos_yaw * cy - body.sin_yaw * cx
-    if _is_clear(body, u, v, body.radius + length):
-        return distance
-    gap = free_distance(body, u, v, body.radius)
-    if gap == 0.0:
-        return sign * _escape(body, u, v, du, dv, length)
-    # The radius tested is never more than the gap there is: what overlaps already may slide or leave, not go
-    # deeper.
-    r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
-    contact = _first_contact(body, u, v, du, dv, length, r)
-    if contact == np.inf:
-        return distance
-    return sign * max(contact - SKIN, 0.0)
-
-
-@leaf
-def _escape(body: Body, u: float, v: float, du: float, dv: float, length: float) -> float:
-    """From a centre inside an obstacle: as far as the way never leads deeper, in steps of a quarter cell."""
-    n = math.ceil(length / (0.25 * body.resolution))
-    depth = _depth(body, u, v)
-    for k in range(1, n + 1):
-        s = length * k / n
-        deeper = _depth(body, u + s * du, v + s * dv)
-        if deeper > depth + ROUNDING:
-            return length * (k - 1) / n
-        depth = min(depth, deeper)
-    return length
-
-
-@leaf
-def _can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> bool:
-    if body.offset_x == 0.0 and body.offset_y == 0.0:
-        return True
-    u, v = centre(body, x, y, theta)
-    if _is_clear(body, u, v, body.radius + 2.0 * math.hypot(body.offset_x, body.offset_y)):
-        return True
-    gap = free_distance(body, u, v, body.radius)
-    inside = _depth(body, u, v) if gap == 0.0 else 0.0
-    r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
-    n = math.ceil(abs(angle) / CHORD - 1e-9)
-    for k in range(1, n + 1):
-        eu, ev = centre(body, x, y, theta + angle * k / n)
-        length = math.hypot(eu - u, ev - v)
-        if gap == 0.0:
-            if _depth(body, eu, ev) > inside + ROUNDING:
-                return False
-        elif (
-            length > 0.0
-            and _first_contact(body, u, v, (eu - u) / length, (ev - v) / length, length, r) < np.inf
-        ):
-            return False
-        u, v = eu, ev
-    return True
+from specshield.robot.body import Body, centre, wrap
+from specshield.robot.contact import TOUCH, can_turn, room_around, way_ahead
 
 
 @leaf
 def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[float, float, float]:
     """f: the pose after one motion (an index into `Robot.motions`). theta in and out in (-pi, pi]."""
-    if _reach(body, motion) <= _room(body, *centre(body, x, y, theta)):
-        return _unhindered(body, x, y, theta, math.cos(theta), math.sin(theta), motion)
+    if _reach(body, motion) <= room_around(body, *centre(body, x, y, theta)):
+        return unhindered(body, x, y, theta, math.cos(theta), math.sin(theta), motion)
     distance = body.translate[motion]
-    moved = _move(body, x, y, theta, distance) if distance != 0.0 else 0.0
+    moved = way_ahead(body, x, y, theta, distance) if distance != 0.0 else 0.0
     return _end(body, x, y, theta, motion, moved)
 
 
@@ -318,7 +35,7 @@ def _reach(body: Body, motion: int) -> float:
 
 
 @inlined
-def _unhindered(
+def unhindered(
     body: Body, x: float, y: float, theta: float, cos: float, sin: float, motion: int
 ) -> tuple[float, float, float]:
     """The pose after a motion that meets nothing."""
@@ -341,7 +58,7 @@ def _end(
         if moved != distance:
             return nx, ny, theta
     if angle != 0.0:
-        if not _can_turn(body, nx, ny, theta, angle):
+        if not can_turn(body, nx, ny, theta, angle):
             return (nx, ny, theta) if body.stop else (x, y, theta)
         theta = wrap(theta + angle)
     return nx, ny, theta
@@ -363,26 +80,14 @@ def successors(body: Body, pose: NDArray[np.float64], out: NDArray[np.float64]) 
     """The pose after each motion: `step`, with what the motions share done once. pose (3,), out (M, 3)."""
     x, y, theta = pose[0], pose[1], pose[2]
     cos, sin = math.cos(theta), math.sin(theta)
-    room = _room(body, *centre(body, x, y, theta))
+    room = room_around(body, *centre(body, x, y, theta))
     last, moved = 0.0, 0.0
     for motion in range(body.translate.shape[0]):
         if _reach(body, motion) <= room:
-            nx, ny, nth = _unhindered(body, x, y, theta, cos, sin, motion)
+            nx, ny, nth = unhindered(body, x, y, theta, cos, sin, motion)
         else:
             distance = body.translate[motion]
             if distance != 0.0 and distance != last:
-                last, moved = distance, _move(body, x, y, theta, distance)
+                last, moved = distance, way_ahead(body, x, y, theta, distance)
             nx, ny, nth = _end(body, x, y, theta, motion, moved)
         out[motion, 0], out[motion, 1], out[motion, 2] = nx, ny, nth
-
-
-@leaf
-def overlap(body: Body, x: float, y: float, theta: float) -> float:
-    """How deep [m] the footprint overlaps an obstacle: 0 where free, radius where its centre is inside."""
-    u, v = centre(body, x, y, theta)
-    return body.radius - free_distance(body, u, v, body.radius)
-
-
-@leaf
-def in_collision(body: Body, x: float, y: float, theta: float) -> bool:
-    return overlap(body, x, y, theta) > TOUCH

@@ -9,7 +9,7 @@ from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.shield import episode
 from specshield.shield.decision import make_shield
@@ -48,7 +48,7 @@ def _task() -> Task:
 
 def _sizes(task: Task) -> tuple[int, int]:
     body = make_body(task.robot, task.grid)
-    return observation_size(make_rules(task), body), len(body.translate)
+    return observation_size(make_rules(task), body), motion_count(body)
 
 
 def _weights(task: Task) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from specshield.errors import InputError, PolicyError
 from specshield.lookahead.belief import Belief
 from specshield.policy.dqn.policy import Proposer
-from specshield.robot.unicycle import Body, make_body
+from specshield.robot.dynamics import Body, make_body
 from specshield.rule.view import View, view_of
 from specshield.stl import Verdict
 from specshield.task import Task

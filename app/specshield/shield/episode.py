@@ -18,7 +18,7 @@ from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.lookahead.lookahead import LookAhead, prepare
 from specshield.policy.reachability.policy import ReachabilityPolicy
-from specshield.robot.unicycle import in_collision, successors, wrap
+from specshield.robot.dynamics import in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
 from specshield.shield.feasibility import futures, prefix_of, rho

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel
-from specshield.robot.unicycle import Body, successors
+from specshield.robot.dynamics import Body, motion_count, successors
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Futures, Prefix
 from specshield.stl import SATISFIED_ABOVE, Always, robustness
@@ -73,7 +73,7 @@ def _search(
     """
     root, motion = np.zeros(1, np.int64), np.full(1, -1)
     layers = [Layer(prefix.poses[-1:], root, motion, root)]
-    width = max(WORK // len(body.translate), len(body.translate))
+    width = max(WORK // motion_count(body), motion_count(body))
     for k in range(1, min(LONGEST, prefix.task.horizon - prefix.t) + 1):
         layer = _expand(body, layers[-1])
         layer = _rows(layer, _holding(prefix, guards, layer.pose, prefix.t + k) > SATISFIED_ABOVE)
@@ -95,7 +95,7 @@ def _rows(layer: Layer, which: NDArray[Any]) -> Layer:
 
 def _expand(body: Body, layer: Layer) -> Layer:
     """Every motion from every pose, those alike once for each first motion."""
-    count = len(body.translate)
+    count = motion_count(body)
     pose = np.empty((len(layer.pose) * count, 3))
     _successors(body, layer.pose, pose)
     motion, parent = np.tile(np.arange(count), len(layer.pose)), np.repeat(np.arange(len(layer.pose)), count)
@@ -107,7 +107,7 @@ def _expand(body: Body, layer: Layer) -> Layer:
 
 @kernel
 def _successors(body: Body, poses: Floats, out: Floats) -> None:
-    count = body.translate.shape[0]
+    count = motion_count(body)
     for i in range(poses.shape[0]):
         successors(body, poses[i], out[i * count : (i + 1) * count])
 

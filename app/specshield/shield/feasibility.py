@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.policy.dqn.policy import Proposer
-from specshield.robot.unicycle import Body, simulate
+from specshield.robot.dynamics import Body, simulate
 from specshield.rule.progress import signal_rows
 from specshield.rule.view import View, best_rows, look, rate
 from specshield.stl import Formula, robustness, robustness_bounds

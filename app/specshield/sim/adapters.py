@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from specshield.client import Session
 from specshield.errors import LogitsError, PoseError, RobotError
 from specshield.robot import STRETCH
-from specshield.robot.unicycle import wrap
+from specshield.robot.dynamics import wrap
 
 Floats = NDArray[np.float64]
 END = "end"

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.robot.unicycle import step, successors
+from specshield.robot.dynamics import displacements, step, successors
 from specshield.sim.cases import Case
 from specshield.sim.senses import RAYS, Senses, scan, see
 from specshield.world.geodesic import geodesic_distance
@@ -77,8 +77,9 @@ class SimulatedRobot:
         robot, body = self._case.task.robot, self._case.body
         after = np.empty((len(robot.motions), 3))
         successors(body, np.array(self.pose), after)
-        short = np.hypot(*(after[:, :2] - self.pose[:2]).T) < 0.5 * np.abs(body.translate)
-        unturned = (body.rotate != 0.0) & (after[:, 2] == self.pose[2])
+        moves, turns = displacements(body)
+        short = np.hypot(*(after[:, :2] - self.pose[:2]).T) < 0.5 * np.abs(moves)
+        unturned = (turns != 0.0) & (after[:, 2] == self.pose[2])
         return np.where(robot.terminal, False, (short | unturned)[robot.motion_of])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body
 
 RAYS = 36
 REACH = 6.0  # [m] of a ray

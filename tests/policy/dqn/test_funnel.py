@@ -10,7 +10,7 @@ import pytest
 
 from specshield.policy.dqn.funnel import decay_rate, gamma, make_funnels, reward
 from specshield.policy.dqn.observation import make_sight
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body
 from specshield.rule.progress import BROKEN, PENDING, SETTLED, make_rules
 from tests.policy.rooms import REGIONS, flat
 

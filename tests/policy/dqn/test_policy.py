@@ -14,12 +14,19 @@ from specshield.policy.card import policy_id
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.network import greedy, make_network
 from specshield.policy.dqn.observation import PER_MOTION, observation_size, observe
-from specshield.policy.dqn.policy import undoing_motions, wait_motion
 from specshield.policy.dqn.rollout import rollout
 from specshield.policy.dqn.train import _QNetwork
 from specshield.policy.methods import load_policy
 from specshield.robot import STRETCH, Action, Robot
-from specshield.robot.unicycle import in_collision, make_body, simulate, step, successors
+from specshield.robot.dynamics import (
+    in_collision,
+    make_body,
+    motion_count,
+    simulate,
+    step,
+    successors,
+    undoing_motions,
+)
 from specshield.rule.progress import (
     BROKEN,
     SETTLED,
@@ -192,7 +199,7 @@ def test_proposals_are_exact_simulations_and_never_differ(robot):
                 status,
                 run,
                 -1,
-                wait_motion(robot),
+                robot.wait_motion,
                 motions,
                 poses,
             )
@@ -257,7 +264,7 @@ def test_what_is_seen_of_one_motion_does_not_depend_on_the_others(robot):
     )
 
     def seen(part, t, pose):
-        nexts = np.empty((len(part.translate), 3))
+        nexts = np.empty((motion_count(part), 3))
         out = np.full(observation_size(rules, part), np.nan, np.float32)
         successors(part, pose, nexts)
         read_predicates(rules, *pose, values, stack, predicates)
@@ -267,8 +274,8 @@ def test_what_is_seen_of_one_motion_does_not_depend_on_the_others(robot):
     for t, pose in enumerate(free_poses(task, body, 40, np.random.default_rng(3))):
         together = seen(body, t, pose)
         assert together.min() < 0.0
-        common = len(together) - PER_MOTION * len(body.translate)
-        for m in range(len(body.translate)):
+        common = len(together) - PER_MOTION * motion_count(body)
+        for m in range(motion_count(body)):
             part = body._replace(translate=body.translate[m : m + 1], rotate=body.rotate[m : m + 1])
             alone = seen(part, t, pose)
             at = common + PER_MOTION * m
@@ -285,7 +292,7 @@ def test_a_rollout_reports_what_the_robustness_says():
         policy = random_policy(task, i)
         _, rules, sight = policy._prepared
         replay(rules, pose[None], np.empty((1, 0)), status, run)
-        wait = wait_motion(STRETCH)
+        wait = STRETCH.wait_motion
         outcome = rollout(
             body, rules, sight, policy.network, pose, 0, status, run, i % 7, wait, motions, poses
         )
@@ -301,7 +308,7 @@ def test_a_broken_obligation_does_not_end_what_is_pending():
     policy = random_policy(task, 1)
     history = np.tile(free_poses(task, make_body(STRETCH, task.grid), 1, np.random.default_rng(4)), (4, 1))
     assert task.samples(history)["East"].max() < 0
-    wait = wait_motion(STRETCH)
+    wait = STRETCH.wait_motion
     assert (policy.propose(history, {}, 0.0).motions[:, 1:] != wait).any()
     broken = flat("F[0,2] East and G[0,40] not Hole")
     settled = flat("F[0,2] not Hole and F[0,40] not Hole")

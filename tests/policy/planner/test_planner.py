@@ -13,7 +13,7 @@ from specshield.errors import InfeasibleStart, PolicyError
 from specshield.policy.methods import load_policy
 from specshield.policy.planner.policy import Settings, read_settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
-from specshield.robot.unicycle import simulate
+from specshield.robot.dynamics import simulate
 from specshield.shield.episode import Carry, decide, make_shield, start
 from specshield.stl import robustness
 from specshield.task import make_task

@@ -15,7 +15,7 @@ from specshield.compiled import kernel
 from specshield.errors import MapError
 from specshield.policy.dqn.funnel import Funnels, make_funnels, reward
 from specshield.policy.dqn.observation import Sight, make_sight, observation_size, observe, outcome
-from specshield.robot.unicycle import Body, in_collision, make_body, successors
+from specshield.robot.dynamics import Body, in_collision, make_body, motion_count, successors
 from specshield.rule.progress import (
     ALWAYS,
     BROKEN,
@@ -42,7 +42,7 @@ class Environment:
         probe = free_poses(task, self.body, 4096, np.random.default_rng(0))
         values = _predicates_at(self.rules, probe)
         self.funnels = make_funnels(self.rules, self.sight, values.min(axis=0), values.max(axis=0), literal)
-        k, m = len(self.rules.kind), len(self.body.translate)
+        k, m = len(self.rules.kind), motion_count(self.body)
         self.pose = np.zeros((robots, 3))
         self.t = np.full(robots, task.horizon, dtype=np.int64)  # past the end: the first step resets all
         self.status = np.zeros((robots, k), dtype=np.int8)

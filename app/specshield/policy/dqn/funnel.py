@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from specshield.compiled import leaf
 from specshield.policy.dqn.observation import Sight, current_goal, field_at
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 
 CAP = 0.15  # [m] robustness of an `always` beyond which more is no better

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from specshield.compiled import inlined, kernel, leaf
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body, displacement, longest_motions, motion_count
 from specshield.rule.progress import (
     ALWAYS,
     BROKEN,
@@ -80,7 +80,7 @@ def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
         half_x=0.5 * (xmax - xmin),
         half_y=0.5 * (ymax - ymin),
         horizon=task.horizon,
-        stride=float(max(np.max(np.abs(body.translate)), 0.05)),
+        stride=max(longest_motions(body)[0], 0.05),
         guards=np.array([r for r in range(len(task.regions)) if REGIONS + r in read], dtype=np.int64),
         turns_matter=HEADING in read,
     )
@@ -89,7 +89,7 @@ def make_sight(task: Task, rules: Rules, body: Body) -> Sight:
 def observation_size(rules: Rules, body: Body) -> int:
     always = int(np.sum(rules.kind == ALWAYS))
     goals = len(rules.kind) - always
-    return GLOBAL + PER_GOAL * goals + PER_ALWAYS * always + PER_MOTION * len(body.translate)
+    return GLOBAL + PER_GOAL * goals + PER_ALWAYS * always + PER_MOTION * motion_count(body)
 
 
 def _fill(distance: NDArray[np.float64], resolution: float) -> NDArray[np.float64]:
@@ -226,7 +226,7 @@ def observe(
         at += PER_GOAL
     still = _safety(rules, t + 1, predicates)
     moved, gain, safe, last_x, last_y = 0.0, 0.0, still, x, y
-    for m in range(body.translate.shape[0]):
+    for m in range(motion_count(body)):
         nx, ny, nth = nexts[m, 0], nexts[m, 1], nexts[m, 2]
         elsewhere = nx != last_x or ny != last_y  # motions that end at one place share what is known of it
         if elsewhere:
@@ -237,7 +237,8 @@ def observe(
                 gain = min(max(ahead / sight.stride, -1.5), 1.5)
         if guarded and (elsewhere or sight.turns_matter):
             safe = _safety_at(rules, sight, t + 1, nx, ny, nth, values, stack, after)
-        full = moved >= abs(body.translate[m]) - 1e-6 and (body.rotate[m] == 0.0 or nth != theta)
+        move, turn = displacement(body, m)
+        full = moved >= abs(move) - 1e-6 and (turn == 0.0 or nth != theta)
         out[at] = 1.0 if full else 0.0
         out[at + 1] = gain
         out[at + 2] = safe

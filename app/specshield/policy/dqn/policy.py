@@ -19,8 +19,7 @@ from specshield.policy.dqn.network import Network, make_network
 from specshield.policy.dqn.observation import Sight, make_sight, observation_size
 from specshield.policy.dqn.rollout import propose_all
 from specshield.policy.tensors import read_tensors
-from specshield.robot import Robot
-from specshield.robot.unicycle import Body, make_body
+from specshield.robot.dynamics import Body, make_body, motion_count, undoing_motions
 from specshield.rule.progress import Rules, make_rules, pasts, signal_rows
 from specshield.task import Task
 
@@ -100,10 +99,10 @@ class Policy:
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
         proposals = []
         for past in pasts(rules, history, rows):
-            motions = np.empty((len(body.translate), self.task.horizon - t), np.int64)
+            motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
             poses = np.empty((*motions.shape, 3))
             preferred = propose_all(
-                body, rules, sight, self.network, past, history, rows, wait_motion(self.task.robot),
+                body, rules, sight, self.network, past, history, rows, self.task.robot.wait_motion,
                 self._undoing, self.literal, motions, poses,
             )  # fmt: skip
             proposals.append(Proposal(motions, poses, preferred))
@@ -114,25 +113,8 @@ class Policy:
         return save_tensors(self.network._asdict())
 
 
-def wait_motion(robot: Robot) -> int:
-    """The motion that leaves the pose as it is, -1 where the robot cannot stand still."""
-    return robot.motions.index((0.0, 0.0)) if (0.0, 0.0) in robot.motions else -1
-
-
-def undoing_motions(robot: Robot) -> NDArray[np.int64]:
-    """The motions that undo each of the robot's, as nearly as two can: (M, 2), in order, -1: no more."""
-    turns = [(0.0, -1), *((a, m) for m, (d, a) in enumerate(robot.motions) if d == 0.0)]
-    moves = [(0.0, -1), *((d, m) for m, (d, a) in enumerate(robot.motions) if a == 0.0)]
-
-    def back(amount: float, choices: list[tuple[float, int]]) -> int:
-        return min(choices, key=lambda choice: abs(amount + choice[0]))[1]
-
-    both = [(back(rotate, turns), back(translate, moves)) for translate, rotate in robot.motions]
-    return np.array([(a, b) if a >= 0 else (b, a) for a, b in both], np.int64).reshape(-1, 2)
-
-
 def load_dqn(weights: bytes | Path, card: Card, task: Task) -> Policy:
     """A policy from its two files. Raises PolicyError where the weights do not fit the task."""
     body, rules = make_body(task.robot, task.grid), make_rules(task)
-    inputs, outputs = observation_size(rules, body), len(body.translate)
+    inputs, outputs = observation_size(rules, body), motion_count(body)
     return Policy(task, card, make_network(read_tensors(weights), inputs, outputs))

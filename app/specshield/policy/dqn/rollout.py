@@ -11,7 +11,7 @@ from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.detour import copy_way, find_sibling, find_twins, join
 from specshield.policy.dqn.network import Network, greedy
 from specshield.policy.dqn.observation import Sight, observe, outcome
-from specshield.robot.unicycle import Body, step, successors
+from specshield.robot.dynamics import Body, motion_count, step, successors
 from specshield.rule.progress import (
     BROKEN,
     PENDING,
@@ -50,7 +50,7 @@ def _make_state(body: Body, rules: Rules, net: Network) -> State:
         np.empty(count, np.int8),
         np.empty(count, np.int64),
         np.empty(count),
-        np.empty((body.translate.shape[0], 3)),
+        np.empty((motion_count(body), 3)),
         np.empty(value_count(rules)),
         np.empty(STACK),
         np.empty(count),
@@ -283,7 +283,7 @@ def satisfies(
         run[:] = 0
         _begin(rules, starts[i], status, run, state)
         advance(rules, 0, state.predicates, status, run)
-        for m in range(-1, body.translate.shape[0] if first else 0):
+        for m in range(-1, motion_count(body) if first else 0):
             _begin(rules, starts[i], status, run, state)
             if _follow(body, rules, sight, net, 0, m, wait, state, motions, poses) == SETTLED:
                 out[i] = True

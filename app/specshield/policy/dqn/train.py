@@ -26,9 +26,10 @@ from torch import nn
 from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.network import NAMES, Network, make_network
-from specshield.policy.dqn.policy import Policy, wait_motion
+from specshield.policy.dqn.policy import Policy
 from specshield.policy.dqn.rollout import satisfies
 from specshield.policy.dqn.settings import Settings, options_of
+from specshield.robot.dynamics import motion_count
 from specshield.task import Task
 
 
@@ -94,10 +95,10 @@ def measure(task: Task, weights: dict[str, NDArray[np.float32]], starts: int, se
     """
     env = Environment(task, 1, 0)
     poses = free_poses(task, env.body, starts, np.random.default_rng([seed, 1]))
-    net = make_network(weights, env.observations.shape[1], len(env.body.translate))
+    net = make_network(weights, env.observations.shape[1], motion_count(env.body))
     result: dict[str, Any] = {"starts": starts}
     for name, first in (("satisfied", False), ("feasible_start", True)):
-        kept = satisfies(env.body, env.rules, env.sight, net, poses, first, wait_motion(task.robot))
+        kept = satisfies(env.body, env.rules, env.sight, net, poses, first, task.robot.wait_motion)
         count = int(kept.sum())
         low = float(beta.ppf(0.025, count, starts - count + 1)) if count else 0.0
         high = float(beta.ppf(0.975, count + 1, starts - count)) if count < starts else 1.0
@@ -174,7 +175,7 @@ class _Run:
         self.env = Environment(task, settings.robots, seed, literal=settings.reward == "paper")
         self.random = np.random.default_rng([seed, 2])
         torch.manual_seed(seed)
-        self.inputs, self.outputs = self.env.observations.shape[1], len(self.env.body.translate)
+        self.inputs, self.outputs = self.env.observations.shape[1], motion_count(self.env.body)
         self.q_network = _QNetwork(self.inputs, settings.units, self.outputs).to(self.device)
         self.target_network = _QNetwork(self.inputs, settings.units, self.outputs).to(self.device)
         self.target_network.load_state_dict(self.q_network.state_dict())
@@ -233,7 +234,7 @@ class _Run:
         """Keeps the weights that satisfy most often, measured on starts of their own."""
         weights = self.q_network.weights()
         net: Network = make_network(weights, self.inputs, self.outputs)
-        env, wait = self.env, wait_motion(self.task.robot)
+        env, wait = self.env, self.task.robot.wait_motion
         poses = free_poses(self.task, env.body, self.settings.evaluation_starts, np.random.default_rng(0))
         rate = float(satisfies(env.body, env.rules, env.sight, net, poses, False, wait).mean())
         self.latest = rate

@@ -13,7 +13,7 @@ from specshield.policy.planner.due_dates import read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
 from specshield.policy.planner.literals import PREDICATE
 from specshield.policy.planner.way import Way, World, holds, keeps, move, note_at, read_at, stay
-from specshield.robot.unicycle import step
+from specshield.robot.dynamics import displacement, motion_count, step
 
 # Chosen by hand; nothing measured.
 STUCK_AFTER = 6  # [steps] without a gain after which a descent is stuck
@@ -114,12 +114,13 @@ def descend_by_beam(
         way.spent[0] += 3.0 * count
         for w in range(count):
             last = trail[i - 1, w, 1]
-            moved, turned = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
+            moved, turned = displacement(body, last) if last >= 0 else (0.0, 0.0)
             if shortest > 0:
                 moved = turned = 0.0  # there is time to go to and fro
             before = places[i - 1, w]
-            for m in range(body.translate.shape[0]):
-                back = body.translate[m] * moved < 0.0 or body.rotate[m] * turned < 0.0
+            for m in range(motion_count(body)):
+                d, angle = displacement(body, m)
+                back = d * moved < 0.0 or angle * turned < 0.0
                 if back or (m == world.pad and world.stands):
                     continue
                 x, y, theta = step(body, before[0], before[1], before[2], m)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel, leaf
 from specshield.policy.lattice import Lattice, coordinates, pose_of
 from specshield.policy.reachability.latest import NEVER, sweep
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body, displacement
 from specshield.rule.values import REGIONS, fill_place, fill_pose, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE, Programs, evaluate_packed
 from specshield.world.regions import PackedRegions
@@ -125,9 +125,9 @@ def to_go_after(
     v, u, h = coordinates(body, fields.pitch, headings, x, y, theta)
     grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
     cos, sin = math.cos(grid_theta) / fields.pitch, math.sin(grid_theta) / fields.pitch
-    moved, turned = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
+    moved, turned = displacement(body, last) if last >= 0 else (0.0, 0.0)
     for m in range(out.shape[0]):
-        d, angle = body.translate[m], body.rotate[m]
+        d, angle = displacement(body, m)
         if d * moved < 0.0 or angle * turned < 0.0 or (d == 0.0 and angle == 0.0):
             out[m] = np.inf
             continue

@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf
-from specshield.policy.detour import NONE, join, undoing
+from specshield.policy.detour import join
 from specshield.policy.planner.approach import BEAM_LENGTH, BEAM_WIDTH
 from specshield.policy.planner.due_dates import foresee, is_open, make_bounds, read_signals
 from specshield.policy.planner.search import MAX_DEPTH, Nodes, search, value
 from specshield.policy.planner.way import Way, World, move, read_at, stay
+from specshield.robot.dynamics import IMPOSSIBLE, motion_count, undo_motion
 from specshield.rule.values import REGIONS, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE
 
@@ -32,7 +33,7 @@ def _make_way(world: World, t: int, steps: int, signals: Floats) -> Way:
     return Way(
         t, np.empty(steps, np.int64), np.empty((steps + 1, 3)), np.empty(size),
         np.empty(literals.predicate.shape[0]), held, make_bounds(size), np.empty(size), values, stack,
-        np.empty(world.body.translate.shape[0]), np.empty((BEAM_LENGTH + 1, BEAM_WIDTH, 4)),
+        np.empty(motion_count(world.body)), np.empty((BEAM_LENGTH + 1, BEAM_WIDTH, 4)),
         np.empty((BEAM_LENGTH + 1, BEAM_WIDTH, 2), np.int64), np.zeros(1),
     )  # fmt: skip
 
@@ -50,8 +51,8 @@ def _rejoin(world: World, way: Way, base: Ints) -> bool:
     """Undoes the first motion and goes by `base` (T - t,), a way from x_t; the steps lost are made up where
     that stays. Whether the formula is satisfied.
     """
-    back = undoing(world.body, way.poses[0], way.poses[1])
-    if back == NONE:
+    back = undo_motion(world.body, way.poses[0], way.poses[1])
+    if back == IMPOSSIBLE:
         return False
     join(back, -1, base, 0, world.pad, way.motions)
     for n in range(1, way.motions.shape[0]):

@@ -37,7 +37,7 @@ from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
 from specshield.policy.planner.way import World
 from specshield.policy.tensors import read_tensors
-from specshield.robot.unicycle import Body, make_body
+from specshield.robot.dynamics import Body, calmest_motion, make_body, turns_in_place
 from specshield.rule.progress import signal_rows
 from specshield.rule.residual import bounds_after, residuals, still_open
 from specshield.rule.values import initial_signals, places, regions_of
@@ -118,10 +118,8 @@ class PlannerPolicy:
         for k, i in enumerate(known):
             if i >= 0:
                 field[k] = self.chosen[i]
-        pad = _pad_motion(self._body)
-        stands = bool(self._body.translate[pad] == 0.0 and self._body.rotate[pad] == 0.0)
-        turns = bool(np.any((self._body.translate == 0.0) & (self._body.rotate != 0.0)))
-        band = BAND if turns else 2.0 * OUT_OF_REACH
+        pad, stands = calmest_motion(self._body), self.task.robot.wait_motion >= 0
+        band = BAND if turns_in_place(self._body) else 2.0 * OUT_OF_REACH
         return World(self._body, self.fields, packed, field, band, pad, stands, cost_of(packed.formula.tree))
 
     def propose(
@@ -169,7 +167,7 @@ class PlannerPolicy:
         literals = world.literals._replace(margin=margin)
         known = np.empty(literals.formula.tree.size)
         look(literals.formula, history, rows, known)
-        motions = np.empty((len(self._body.translate), self.task.horizon - t), np.int64)
+        motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
         poses = np.empty((len(motions), motions.shape[1] + 1, 3))
         effort = self.settings.effort * max(1.0, self.task.horizon / USUAL) ** 2
         world = world._replace(literals=literals)
@@ -321,9 +319,3 @@ def cost_of(tree: Tree) -> float:
             passes = b + 1 if op == UNTIL else 1
         work += 2.0 * length * passes
     return 1e-3 * work
-
-
-def _pad_motion(body: Body) -> int:
-    """The motion that stays where the robot is, or what comes nearest: a turn on the spot, else the first."""
-    travel = np.abs(body.translate) + 1e-3 * np.abs(body.rotate)
-    return int(np.argmin(travel))

@@ -44,6 +44,7 @@ from specshield.policy.planner.way import (
     read_at,
     stay,
 )
+from specshield.robot.dynamics import motion_count
 from specshield.stl.tree import tree_value
 
 MAX_DEPTH = 128  # nodes on one way
@@ -175,7 +176,7 @@ def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> 
         if late > 1:
             _add(nodes, d, LATER + by, k, late, 1, -1)
     if not world.stands and n < steps:
-        for m in range(world.body.translate.shape[0]):
+        for m in range(motion_count(world.body)):
             _add(nodes, d, SINGLE, -1, 0, m, -1)
     return False
 

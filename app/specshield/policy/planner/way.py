@@ -14,7 +14,7 @@ from specshield.compiled import leaf
 from specshield.policy.planner.due_dates import Bounds, note, read_pose
 from specshield.policy.planner.fields import Fields
 from specshield.policy.planner.literals import PREDICATE, SIDE, PackedLiterals
-from specshield.robot.unicycle import Body, step
+from specshield.robot.dynamics import Body, step
 
 # What is needed of a literal, the columns of `need`: the step by which it has to hold once; from which step
 # until which it has to hold throughout; and until which step it has to as long as the literal that the robot

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.reachability.tables import SAFE, is_broken, score, slack
 from specshield.policy.reachability.work import Guide, Work, observe
-from specshield.robot.unicycle import step
+from specshield.robot.dynamics import motion_count, step
 
 MAX_ROOTS = 62  # bits of a tag
 ROOM = 128  # poses kept at a step, at most
@@ -70,7 +70,7 @@ def beam(
     roots, k_count = status.shape
     steps = motions.shape[1]
     width = max(min(share * roots, ROOM), share)
-    room = width * guide.body.translate.shape[0]
+    room = width * motion_count(guide.body)
     here, new = _poses(width, k_count), _poses(room, k_count)
     edges = Edges(
         np.empty((steps, room), np.int32), np.empty((steps, room), np.int32),
@@ -146,7 +146,7 @@ def _expand(
         x, y, theta = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
         score(body, rules, tables, x, y, theta, t + n, here.status[w], here.run[w], wait, -1, work.scores)
         lowest = max(band + t + n + 1, _lowest(work.scores))
-        for m in range(body.translate.shape[0]):
+        for m in range(motion_count(body)):
             if work.scores[m] < lowest:
                 continue
             x, y, theta = step(body, here.pose[w, 0], here.pose[w, 1], here.pose[w, 2], m)

@@ -15,7 +15,7 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
-from specshield.policy.dqn.policy import Proposal, as_one, wait_motion
+from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import heading_count, holds_at, make_lattice
 from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
 from specshield.policy.reachability.search import propose_all
@@ -23,7 +23,7 @@ from specshield.policy.reachability.stepwise import MAX_BYTES, digits_of, feasib
 from specshield.policy.reachability.tables import INVALID, SCALE, Tables
 from specshield.policy.reachability.work import Guide
 from specshield.policy.tensors import read_tensors
-from specshield.robot.unicycle import Body, make_body
+from specshield.robot.dynamics import Body, make_body
 from specshield.rule.progress import (
     ALWAYS,
     Rules,
@@ -96,10 +96,10 @@ class ReachabilityPolicy:
         body, rules = self._prepared
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
         rows = signal_rows(self.task, signals, len(history))
-        guide = Guide(body, rules, self.tables, wait_motion(self.task.robot))
+        guide = Guide(body, rules, self.tables, self.task.robot.wait_motion)
         proposals = []
         for past in pasts(rules, history, rows):
-            motions = np.empty((len(body.translate), self.task.horizon + 1 - len(history)), np.int64)
+            motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
             poses = np.empty((*motions.shape, 3))
             preferred = propose_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, poses, int(preferred)))
@@ -123,7 +123,7 @@ def synthesise(
     goals, pitch = _goals(task, rules, settings)
     lattice = make_lattice(body, pitch)
     holds = holds_at(body, rules, lattice)
-    if wait_motion(task.robot) < 0:
+    if task.robot.wait_motion < 0:
         used = np.any(lattice.valid, axis=2)
         bits, feasible = feasible_steps(lattice, rules, holds, task.horizon, used)
         tables = _step_tables(rules, task.horizon, _numbered(used), bits, pitch)
@@ -150,7 +150,7 @@ def load_reachability(weights: bytes | Path, card: Card, task: Task) -> Reachabi
     rules = make_rules(task)
     goals, pitch = _goals(task, rules, settings)
     tensors, (shape, headings) = read_tensors(weights), _shape(task, pitch)
-    if wait_motion(task.robot) < 0:
+    if task.robot.wait_motion < 0:
         cell, bits = _read(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
         _check_fit(cell, shape, bits.shape[1], bits.shape == size, f"bits {list(size)}")
@@ -199,7 +199,7 @@ def check(task: Task, settings: Settings) -> None:
 def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[NDArray[np.int64], float]:
     """The obligations that are not `always`, and the lattice's pitch, where the tables cover the task."""
     goals = np.flatnonzero(rules.kind != ALWAYS)
-    if wait_motion(task.robot) < 0:
+    if task.robot.wait_motion < 0:
         entries, unit = (task.horizon + 1) * -(-state_count(rules) // 8), "bytes"
         limits = FINE_ENTRIES, MAX_BYTES
     else:

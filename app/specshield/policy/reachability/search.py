@@ -14,12 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf, merged
-from specshield.policy.detour import NONE, copy_way, find_sibling, find_twins, turn_by
+from specshield.policy.detour import copy_way, find_sibling, find_twins
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam
 from specshield.policy.reachability.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, rejoin, walk
 from specshield.policy.reachability.work import Guide, Work, fill, make_work, observe
-from specshield.robot.unicycle import Body, simulate, step
+from specshield.robot.dynamics import (
+    IMPOSSIBLE,
+    NOT_NEEDED,
+    displacement,
+    move_back,
+    simulate,
+    step,
+    turn_by,
+)
 from specshield.rule.progress import forgive, recall
 
 ESCAPE_GAIN = 2.0  # [steps] later than where it got stuck: what a way out has to reach
@@ -36,7 +44,7 @@ SMALL_SHARE = 512
 class Starts(NamedTuple):
     """After each first motion [M]: the progress, the slack, whether a way was found.
 
-    turn, move: the motions that undo it, nearly; -1 where none is needed, a turn of NONE where there is none.
+    turn, move: the motions that undo it, nearly, or NOT_NEEDED; a turn may be IMPOSSIBLE.
     sibling (3,): scratch.
     """
 
@@ -90,12 +98,12 @@ def propose_all(
             continue
         turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
         starts.settled[m] = _join(guide, t, walked[:ways], int(m), starts, motions, poses, work)
-        if base >= 0 and turn != NONE and not starts.settled[m]:
+        if base >= 0 and turn != IMPOSSIBLE and not starts.settled[m]:
             _resume(starts.status[m], starts.run[m], work)
             starts.settled[m] = rejoin(
                 guide, t, turn, move, motions[base], poses[base], 0, motions[m], poses[m], work
             )
-        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == NONE):
+        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == IMPOSSIBLE):
             _resume(starts.status[m], starts.run[m], work)
             escapes = ahead >= (0.0 if base < 0 else EASY)
             starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
@@ -138,24 +146,13 @@ def _first_steps(
         x, y, theta = step(body, pose[0], pose[1], pose[2], m)
         motions[m, 0] = m
         poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
-        starts.turn[m] = turn_by(body, -body.rotate[m]) if theta != pose[2] else -1
-        starts.move[m] = _moving_back(body, m, math.hypot(x - pose[0], y - pose[1]))
+        starts.turn[m] = turn_by(body, -displacement(body, m)[1]) if theta != pose[2] else NOT_NEEDED
+        starts.move[m] = move_back(body, m, math.hypot(x - pose[0], y - pose[1]))
         _resume(status, run, work)
         observe(rules, t + 1, x, y, theta, work)
         for k in range(status.shape[0]):
             starts.status[m, k], starts.run[m, k] = work.status[k], work.run[k]
         starts.slack[m] = slack(body, rules, tables, x, y, theta, t + 1, work.status, work.run)
-
-
-@leaf
-def _moving_back(body: Body, motion: int, moved: float) -> int:
-    """The move that brings the robot nearest to where it was, having moved so far [m]; -1: none helps."""
-    ahead = moved if body.translate[motion] > 0.0 else -moved
-    best, left = -1, 0.75 * moved
-    for m in range(body.translate.shape[0]):
-        if body.rotate[m] == 0.0 and abs(ahead + body.translate[m]) < left:
-            best, left = m, abs(ahead + body.translate[m])
-    return best
 
 
 @leaf

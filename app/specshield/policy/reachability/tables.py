@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from specshield.compiled import inlined, leaf
 from specshield.policy.lattice import coordinates
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body, displacement
 from specshield.rule.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 
 SCALE = 64.0  # table codes a step
@@ -231,13 +231,13 @@ def score(
     v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
     grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
     cos, sin = math.cos(grid_theta) / tables.pitch, math.sin(grid_theta) / tables.pitch
-    before, turn = (body.translate[last], body.rotate[last]) if last >= 0 else (0.0, 0.0)
+    before, turn = displacement(body, last) if last >= 0 else (0.0, 0.0)
     for m in range(scores.shape[0]):
-        d = body.translate[m]
-        if table < 0 or d * before < 0.0 or body.rotate[m] * turn < 0.0:
+        d, angle = displacement(body, m)
+        if table < 0 or d * before < 0.0 or angle * turn < 0.0:
             scores[m] = HOPELESS
             continue
-        w = h + body.rotate[m] * headings / (2.0 * math.pi)
+        w = h + angle * headings / (2.0 * math.pi)
         if w < 0.0:
             w += headings
         scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w)

@@ -13,7 +13,7 @@ from specshield.compiled import inlined, leaf
 from specshield.policy.detour import join
 from specshield.policy.reachability.tables import HOPELESS, goals_settled, is_broken, score, slack
 from specshield.policy.reachability.work import Guide, Work, fill, is_over, look, observe, predicate_at
-from specshield.robot.unicycle import step
+from specshield.robot.dynamics import step
 from specshield.rule.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 
 PATIENCE = 5  # steps without gain after which the walk is taken to go round in a circle

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel
 from specshield.policy.reachability.tables import Tables, goals_settled
-from specshield.robot.unicycle import Body
+from specshield.robot.dynamics import Body
 from specshield.rule.progress import EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
 from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
 from specshield.stl.program import VALUE, evaluate_packed

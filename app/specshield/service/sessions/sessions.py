@@ -18,7 +18,7 @@ import numpy as np
 
 from specshield.errors import Conflict, FragmentError, InfeasibleStart, InputError, LimitReached, NotFound
 from specshield.lookahead.lookahead import AHEADS
-from specshield.robot.unicycle import make_body
+from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies

@@ -1,0 +1,69 @@
+"""The known dynamics x_{t+1} = f(x_t, a_t): what one has to offer, and which one is used.
+
+Everything outside this folder imports f from here. The robot's motions are numbered from 0 to M - 1, and only
+its dynamics knows what each of them does. A dynamics offers:
+
+    Body, make_body                the robot on its map, prepared once: a NamedTuple of arrays and numbers
+    step, successors, simulate     f: one motion, every motion, a list of motions, each with its contacts
+    unhindered                     f where nothing is near
+    overlap, in_collision          whether a pose is one that the robot may be in
+    free_distance, swing_radius    how much room a place has, and how much the robot needs to turn there
+    motion_count, displacement,    how many motions there are, where they lead from, and how far
+    displacements, longest_motions
+    turns_in_place, calmest_motion whether it can turn on the spot, and what comes nearest to standing still
+    turn_by, move_back,            the motions that take one back
+    undo_motion, undoing_motions
+
+All but the queries on whole robots are compiled, and compiled anew for each type of `Body`, together with
+what calls them: nothing is dispatched while a decision is made.
+"""
+
+from specshield.robot.body import (
+    Body,
+    calmest_motion,
+    displacement,
+    displacements,
+    longest_motions,
+    make_body,
+    motion_count,
+    swing_radius,
+    turns_in_place,
+    wrap,
+)
+from specshield.robot.contact import TOUCH, free_distance, in_collision, overlap
+from specshield.robot.undo import (
+    IMPOSSIBLE,
+    NOT_NEEDED,
+    move_back,
+    turn_by,
+    undo_motion,
+    undoing_motions,
+)
+from specshield.robot.unicycle import simulate, step, successors, unhindered
+
+__all__ = [
+    "IMPOSSIBLE",
+    "NOT_NEEDED",
+    "TOUCH",
+    "Body",
+    "calmest_motion",
+    "displacement",
+    "displacements",
+    "free_distance",
+    "in_collision",
+    "longest_motions",
+    "make_body",
+    "motion_count",
+    "move_back",
+    "overlap",
+    "simulate",
+    "step",
+    "successors",
+    "swing_radius",
+    "turn_by",
+    "turns_in_place",
+    "undo_motion",
+    "undoing_motions",
+    "unhindered",
+    "wrap",
+]
