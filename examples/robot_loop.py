@@ -15,10 +15,10 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from specshield.sim.cases import load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 
+T = TypeVar("T")
 POLICY = "case1"  # the rule: visit a charger within 60 steps, and again between steps 80 and 140
 START = (4.5, 5.0, 0.0)  # x [m], y [m], theta [rad]
 AWAY = (TransportError, StoreError, ServerError)  # what a call raises while the service cannot answer
@@ -85,7 +86,7 @@ def drive(client: ShieldClient, robot: Any, model: Any, file: Path) -> Verdict:
         notes.write(file)
         if not session.finished:
             robot.execute(action)
-    verdict = close(session, robot.pose)
+    verdict = patiently(lambda: session.close(robot.pose))
     file.unlink()
     return verdict
 
@@ -109,11 +110,7 @@ def begin_or_resume(client: ShieldClient, robot: Any, file: Path) -> tuple[Sessi
     return session, Notes(session.id, robot.pose)
 
 
-def close(session: Session, pose: Iterable[float]) -> Verdict:
-    return patiently(lambda: session.close(pose))
-
-
-def patiently(call: Any) -> Any:
+def patiently(call: Callable[[], T]) -> T:
     """The call's result, as soon as the service is there to give one."""
     while True:
         try:

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from specshield.sim import report
 from tests.serving import serving
 
@@ -68,3 +70,36 @@ def test_the_table_is_what_the_demo_prints():
     assert [line[:26].rstrip() for line in printed.splitlines()[-len(rows) :]] == rows
     (kept,) = re.findall("^rule satisfied.*$", printed, re.MULTILINE)
     assert kept.count("20 of 20") == 2
+
+
+LINKED = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")})
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    """Files that are linked are there, and the headings in them that are named."""
+    text = page.read_text()
+    links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+    for link in links:
+        if re.match(r"[a-z]+://", link):
+            continue
+        name, _, heading = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.exists(), f"{page.name}: {link}"
+        headings = re.findall(r"^#+ (.+)$", target.read_text(), re.MULTILINE) if heading else []
+        anchors = {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in headings}
+        assert not heading or heading in anchors, f"{page.name}: {link}"
+
+
+def test_commands_that_pages_name_are_there():
+    """`python -m benchmarks.x`, `make x`, `examples/x.py` and `tests/x.py` in the pages."""
+    make = (ROOT / "Makefile").read_text()
+    for page in LINKED:
+        text = page.read_text()
+        for module in re.findall(r"-m ((?:benchmarks|evaluation)[\w.]*)", text):
+            path = ROOT.joinpath(*module.split("."))
+            assert path.with_suffix(".py").exists() or path.is_dir(), f"{page.name}: {module}"
+        for target in re.findall(r"`make (\w+)", text):
+            assert re.search(rf"^{target}:", make, re.MULTILINE), f"{page.name}: make {target}"
+        for file in re.findall(r"`((?:examples|tests|evaluation|benchmarks|app|docs)/[\w/.-]+)`", text):
+            assert (ROOT / file).exists() or (page.parent / file).exists(), f"{page.name}: {file}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -22,19 +22,30 @@ from tests.serving import serving
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def test_a_house_of_ones_own(tmp_path: Path) -> None:
-    with serving(tmp_path, SPECSHIELD_WORKER="true") as server:
-        done = subprocess.run(
-            [sys.executable, str(EXAMPLES / "own_house.py"), server.url],
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with serving(tmp_path_factory.mktemp("examples"), SPECSHIELD_WORKER="true") as server:
+        yield server.url
+
+
+def run(example: str, url: str, folder: Path) -> list[str]:
+    """The lines that an example prints, run in `folder`."""
+    command = [sys.executable, str(EXAMPLES / example), url]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    decided, from_where, kept = done.stdout.splitlines()
+    return done.stdout.splitlines()
+
+
+def test_a_house_of_ones_own(url: str, tmp_path: Path) -> None:
+    decided, from_where, kept = run("own_house.py", url, tmp_path)
     assert decided.endswith("decided after 120 steps")
     assert re.search(r"(9\d|100)%", from_where)
     assert kept == "the rule is satisfied after 120 steps"
+
+
+def test_a_loop_that_nothing_disturbs(url: str, tmp_path: Path) -> None:
+    assert run("robot_loop.py", url, tmp_path) == ["the rule is satisfied"]
+    assert not list(tmp_path.iterdir())  # the notes are gone with the session
 
 
 class Restart(Exception):

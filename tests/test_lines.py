@@ -1,0 +1,23 @@
+"""The count of the code's lines."""
+
+from benchmarks import lines
+
+SHIELD = lines.PACKAGE / "shield"
+
+
+def test_a_folder_holds_what_lies_in_it_and_below():
+    counted = {SHIELD / "episode.py": 200, SHIELD / "deep" / "er.py": 30, lines.PACKAGE / "shields.py": 5}
+    assert lines.below(counted, SHIELD) == 230
+    assert lines.below(counted, lines.PACKAGE / "shields.py") == 5
+
+
+def test_bounds_that_hold_are_not_mentioned():
+    assert list(lines.breaches({SHIELD / "episode.py": lines.LONGEST}, lines.MOST_TRUSTED)) == []
+
+
+def test_a_bound_that_is_broken_is_named_with_its_figure():
+    (trusted,) = lines.breaches({}, 5_501)
+    assert trusted == "the trusted core has 5,501 lines; expected at most 5,500"
+    whole, module = lines.breaches({SHIELD / "episode.py": 17_001}, 0)
+    assert whole == "app/ has 17,001 lines; expected at most 17,000"
+    assert module == "app/specshield/shield/episode.py has 17001 lines; expected at most 350"
