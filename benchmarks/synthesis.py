@@ -13,9 +13,9 @@ from benchmarks.houses import RESTLESS
 from benchmarks.states import shipped_dqn
 from benchmarks.timing import quietest
 from specshield.policy.dqn.environment import Environment, free_poses
+from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.rollout import satisfies
-from specshield.policy.dqn.settings import Settings
 from specshield.policy.reachability import policy as reachability
 from specshield.policy.reachability.policy import load_reachability
 from specshield.robot.dynamics import motion_count

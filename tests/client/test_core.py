@@ -6,7 +6,7 @@ import pytest
 from client_script import SESSION, answer, drive, lost, problem
 
 from specshield import errors
-from specshield.client import core
+from specshield.client import calls, core
 from specshield.client.models import Policy
 from specshield.client.wire import Request, get, post
 
@@ -61,21 +61,7 @@ def test_a_gateway_that_stays_is_a_transport_error():
 
 
 def create(**given):
-    arguments = {
-        "policy_id": "p",
-        "policy_ids": None,
-        "initial_pose": (1, 2, 0.5),
-        "id": None,
-        "seed": 0,
-        "threshold": 1.0,
-        "margin": 0.0,
-        "slack": 0,
-        "evaluation": "feasibility",
-        "shaping": "projection",
-        "max_steps": None,
-        "allow_infeasible": False,
-    }
-    return core.create_session(**{**arguments, **given})
+    return calls.create_session(**{"policy_id": "p", "initial_pose": (1, 2, 0.5), **given})
 
 
 def test_a_session_is_created_under_an_id_of_our_own():
@@ -135,21 +121,23 @@ def test_a_callers_id_that_has_moved_on_is_somebody_elses_even_after_a_lost_answ
 
 
 def test_erasing_what_a_lost_try_erased_succeeds_and_what_never_was_does_not():
-    assert drive(core.delete_session("s"), lost(), problem(404, "not-found"))[0] is None
-    assert type(drive(core.delete_session("s"), problem(404, "not-found"))[0]) is errors.NotFound
+    assert drive(calls.delete_session("s"), lost(), problem(404, "not-found"))[0] is None
+    assert type(drive(calls.delete_session("s"), problem(404, "not-found"))[0]) is errors.NotFound
 
 
 def test_deleting_a_policy_is_never_repeated():
     """The first DELETE cancels a training; the second would remove the policy."""
-    error, sent, _ = drive(core.delete_policy("p"), lost())
+    error, sent, _ = drive(calls.delete_policy("p"), lost())
     assert type(error) is errors.TransportTimeout
     assert len(sent) == 1
 
 
 def test_pages():
-    page, (first,), _ = drive(core.page(Policy, "policies", None), answer({"items": [POLICY], "next": "p"}))
+    page, (first,), _ = drive(
+        core.page_of(Policy, "policies", None), answer({"items": [POLICY], "next": "p"})
+    )
     assert (first.path, first.params, page.items[0].id, page.next) == ("/v1/policies", {}, "p", "p")
-    page, (second,), _ = drive(core.page(Policy, "policies", "p"), answer({"items": [], "next": None}))
+    page, (second,), _ = drive(core.page_of(Policy, "policies", "p"), answer({"items": [], "next": None}))
     assert (second.params, page.items, page.next) == ({"cursor": "p"}, (), None)
 
 
@@ -157,7 +145,11 @@ def test_waiting_ends_with_ready_or_failed_and_reports_on_the_way():
     seen = []
     answers = [answer({**POLICY, "progress": p}) for p in (0.1, 0.5)]
     done = answer({**POLICY, "status": "failed", "error": "killed"})
-    policy, _, waits = drive(core.wait_policy("p", 60, 2, lambda p: seen.append(p.progress)), *answers, done)
+    policy, _, waits = drive(
+        calls.wait_policy("p", timeout=60, interval=2, progress=lambda p: seen.append(p.progress)),
+        *answers,
+        done,
+    )
     assert (policy.status, policy.error) == ("failed", "killed")
     assert seen == [0.1, 0.5, 0.5]
     assert waits == [2, 2]
@@ -166,15 +158,18 @@ def test_waiting_ends_with_ready_or_failed_and_reports_on_the_way():
 def test_waiting_outlasts_a_server_that_is_away_for_a_while_but_not_one_that_never_was():
     outage = [lost()] * 4
     policy, _, _ = drive(
-        core.wait_policy("p", 60, 1, None), answer(POLICY), *outage, answer({**POLICY, "status": "ready"})
+        calls.wait_policy("p", timeout=60, interval=1),
+        answer(POLICY),
+        *outage,
+        answer({**POLICY, "status": "ready"}),
     )
     assert policy.status == "ready"
-    error, _, _ = drive(core.wait_policy("p", 60, 1, None), *outage)
+    error, _, _ = drive(calls.wait_policy("p", timeout=60, interval=1), *outage)
     assert type(error) is errors.TransportTimeout
 
 
 def test_waiting_has_an_end():
-    error, _, waits = drive(core.wait_policy("p", 5, 2, None), *[answer(POLICY)] * 3)
+    error, _, waits = drive(calls.wait_policy("p", timeout=5, interval=2), *[answer(POLICY)] * 3)
     assert type(error) is errors.TransportTimeout
     assert "training (50%)" in error.message
     assert sum(waits) == 4
@@ -191,15 +186,16 @@ def test_uploads_are_multipart_and_get_the_time_to_be_prepared():
         "rooms": {},
         "from_the_future": 1,
     }
-    uploaded, (request,), _ = drive(core.upload_map("resolution: 0.05", b"P5"), answer(map_json, 201))
+    uploaded, (request,), _ = drive(calls.upload_map("resolution: 0.05", b"P5"), answer(map_json, 201))
     assert uploaded.bounds == (0, 0, 0.1, 0.05)
     assert isinstance(request, Request)
     assert request.slow
     assert {name: part[1] for name, part in request.files.items()} == {
+        "format": b"map_server",
         "metadata": b"resolution: 0.05",
         "image": b"P5",
     }
-    _, (request,), _ = drive(core.upload_policy(b"weights", {"seed": 0}), answer(POLICY, 202))
+    _, (request,), _ = drive(calls.upload_policy(b"weights", {"seed": 0}), answer(POLICY, 202))
     assert {name: part[1] for name, part in request.files.items()} == {
         "weights": b"weights",
         "card": b'{"seed":0}',
@@ -207,6 +203,6 @@ def test_uploads_are_multipart_and_get_the_time_to_be_prepared():
 
 
 def test_an_answer_that_lacks_a_field_is_a_server_error():
-    error, _, _ = drive(core.get_policy("p"), answer({"id": "p"}))
+    error, _, _ = drive(calls.get_policy("p"), answer({"id": "p"}))
     assert type(error) is errors.ServerError
     assert "status" in error.message

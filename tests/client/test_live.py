@@ -14,7 +14,7 @@ from specshield import errors
 from specshield.client import AsyncShieldClient, Decision, ShieldClient
 
 pytest.importorskip("specshield.service.app", reason="needs the service")
-from specshield.service.schemas import StepResponse
+from specshield.service.schemas.steps import StepResponse
 
 
 @pytest.fixture

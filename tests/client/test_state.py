@@ -46,7 +46,8 @@ def decided(t, action, status="pending", **members):
 
 def step(state, x, *outcomes, logits=LOGITS, main_task_done=None, signals=None, witnesses=False):
     """(decision or error, the bodies sent)"""
-    result, sent, _ = drive(state._step((x, 0, 0), logits, main_task_done, signals, witnesses), *outcomes)
+    flow = state._step((x, 0, 0), logits, main_task_done=main_task_done, signals=signals, witnesses=witnesses)
+    result, sent, _ = drive(flow, *outcomes)
     return result, [json.loads(request.body) for request in sent]
 
 

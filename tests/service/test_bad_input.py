@@ -11,7 +11,7 @@ from PIL import Image
 
 from specshield.policy.planner import policy as planner
 from specshield.robot import robot_from_json
-from specshield.service.schemas import Problem
+from specshield.service.schemas.base import Problem
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.service.world import LOGITS, RESOLUTION, ROBOT, SPEC, START, ahead, cells, grid_json, policy_files
@@ -142,12 +142,14 @@ def test_a_map_over_the_limit_in_cells(client, unchanged, side):
 
 def test_parts_that_are_missing_or_too_many(client, unchanged):
     files = {"metadata": ("map.yaml", YAML)}
-    assert problem(client.post("/v1/maps", files=files), 422, "invalid-input", "body")["got"] == ["metadata"]
-    problem(
-        client.post("/v1/maps", files={**files, "image": ("i", PGM), "more": ("m", b"x")}),
-        422,
-        "invalid-input",
-    )
+    problem(client.post("/v1/maps", files=files), 422, "invalid-map", "image")
+    files["image"] = ("i", PGM)
+    problem(client.post("/v1/maps", files={**files, "more": ("m", b"x")}), 422, "invalid-map", "more")
+    twice = [("metadata", ("m", YAML)), ("metadata", ("m", YAML))]
+    problem(client.post("/v1/maps", files=twice), 422, "invalid-input", "body")
+    problem(client.post("/v1/maps", files=files, data={"format": "procthor"}), 422, "invalid-input", "format")
+    answer = problem(client.post("/v1/policies", files=files), 422, "invalid-input", "body")
+    assert answer["got"] == ["image", "metadata"]
     broken = client.post("/v1/maps", content=b"--x\r\n\r\n", headers={"Content-Type": "multipart/form-data"})
     problem(broken, 422, "invalid-input")
 
@@ -161,6 +163,9 @@ def changed(body, **fields):
     [
         ({"format": "picture"}, "format"),
         ({"house": {}}, "format"),
+        ({"format": "map_server", "metadata": "", "image": ""}, "format"),
+        (changed(grid_json(), colour="red"), "colour"),
+        ({"format": "occupancy_grid", "info": {}}, "data"),
         (changed(grid_json(), data=[0, 0, 101]), ...),
         (changed(grid_json(), data="0"), "data"),
         (changed(grid_json(), info={**grid_json()["info"], "width": 5000}), "info.width"),

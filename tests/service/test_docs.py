@@ -114,6 +114,8 @@ def body_of(operation, description):
     content = operation["requestBody"]["content"]["application/json"]
     if "example" in content:
         return content["example"]
+    if "examples" in content:
+        return content["examples"]["occupancy_grid"]["value"]
     return description["components"]["schemas"][content["schema"]["$ref"].rsplit("/", 1)[1]]["examples"][0]
 
 

@@ -162,7 +162,7 @@ def test_a_worker_waits_for_work_longer_than_the_store_may_take_to_answer(tmp_pa
     try:
         jobs = Jobs(store.url, Settings(data_dir=tmp_path, store_timeout=0.2))
         jobs.worker_lives(["planner"])
-        worker = _Worker(store.url, jobs, [])
+        worker = _Worker(store.url, jobs, ["planner"], [])
         with pytest.raises(DequeueTimeout):  # rq's word for an empty queue
             Queue.dequeue_any(worker.queues, 1, connection=worker.connection)
         assert worker.connection.connection_pool.get_connection().socket_timeout > worker.dequeue_timeout

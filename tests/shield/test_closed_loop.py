@@ -7,7 +7,7 @@ import pytest
 
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
-from specshield.policy.dqn.settings import Settings
+from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.train import train
 from specshield.robot.dynamics import in_collision, make_body, successors
 from specshield.shield.episode import Config, decide, make_shield, start

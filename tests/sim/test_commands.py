@@ -166,7 +166,7 @@ def test_train_computes_a_policy_too(tmp_path):
     [
         (["evaluate", "--case", "case9"], "one of case1, case2"),
         (["train", "--case", "case1", "--method", "dqn", "--option", "units=9000"], "from 4 to 128"),
-        (["train", "--case", "case1", "--method", "magic"], "'dqn', 'planner' or 'reachability'"),
+        (["train", "--case", "case1", "--method", "magic"], "one of dqn, planner, reachability"),
     ],
 )
 def test_a_mistake_is_told_in_a_line(arguments, said):

@@ -11,7 +11,8 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
 
 from specshield.errors import MapError
-from specshield.world.map_server import dump_map, from_occupancy_grid, load_map
+from specshield.world.map_server import dump_map, load_map
+from specshield.world.nav_msgs import from_occupancy_grid
 from specshield.world.occupancy import OccupancyGrid
 
 MAPS = Path(__file__).parents[3] / "shared/data/maps"

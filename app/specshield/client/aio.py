@@ -1,24 +1,25 @@
-"""AsyncShieldClient: sync.py with `await`; what each call does is said there."""
+"""AsyncShieldClient: sync.py with `await`."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine
 from types import TracebackType
-from typing import Any, Literal, Protocol, TypeVar, cast
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
 import httpx
 
-from specshield.client import core
-from specshield.client.core import Flow, Wait
-from specshield.client.models import Decision, Map, Policy, SessionInfo, Spec, TrajectoryItem, Verdict
+from specshield.client import calls
+from specshield.client.core import Flow, Wait, looks_like, page_of
+from specshield.client.models import Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.transport import address, allowed, arguments, check_open, failure, headers, reply
-from specshield.client.wire import TRIES, Content, Failure, Logits, Numbers, Reply, Request
+from specshield.client.wire import TRIES, Failure, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -77,89 +78,62 @@ class AsyncShieldClient:
         return reply(response, time.monotonic() - start, limit)
 
 
-class AsyncSpecs:
+class Resource:
+    """Some of the calls, bound to a client."""
+
     def __init__(self, run: Run) -> None:
         self._run = run
 
-    async def validate(
-        self,
-        formula: str,
-        regions: Mapping[str, Any] | None = None,
-        *,
-        signals: Mapping[str, float] | None = None,
-        map_id: str | None = None,
-    ) -> Spec:
-        return await self._run(core.validate(formula, regions, signals, map_id))
+
+def awaiting(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource, P], Coroutine[Any, Any, T]]:
+    """The method of a resource that makes this call."""
+
+    @looks_like(flow)
+    async def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._run(flow(*args, **kwargs))
+
+    return method
 
 
-class AsyncMaps:
-    def __init__(self, run: Run) -> None:
-        self._run = run
+def awaiting_step(
+    flow: Callable[Concatenate[AsyncSession, P], Flow[T]],
+) -> Callable[Concatenate[AsyncSession, P], Coroutine[Any, Any, T]]:
+    """The method of a session that makes this call, which is a method of its state."""
 
-    async def upload(self, metadata: Content, image: Content) -> Map:
-        return await self._run(core.upload_map(metadata, image))
+    @looks_like(flow)
+    async def method(self: AsyncSession, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._run(flow(self, *args, **kwargs))
 
-    async def procthor(
-        self, house: Mapping[str, Any], asset_sizes: Mapping[str, Any], resolution: float = 0.05
-    ) -> Map:
-        return await self._run(
-            core.post_map(format="procthor", house=house, asset_sizes=asset_sizes, resolution=resolution)
-        )
-
-    async def occupancy_grid(self, info: Mapping[str, Any], data: Sequence[int]) -> Map:
-        return await self._run(core.post_map(format="occupancy_grid", info=info, data=data))
-
-    def list(self) -> AsyncIterator[Map]:
-        return _pages(self._run, Map, "maps")
-
-    async def get(self, id: str) -> Map:
-        return await self._run(core.get_map(id))
-
-    async def image(self, id: str) -> bytes:
-        return await self._run(core.map_image(id))
+    return method
 
 
-class AsyncPolicies:
-    def __init__(self, run: Run) -> None:
-        self._run = run
+def opening(
+    flow: Callable[P, Flow[SessionInfo]],
+) -> Callable[Concatenate[Resource, P], Coroutine[Any, Any, AsyncSession]]:
+    """The method that makes this call and gives the session that it tells of."""
 
-    async def create(
-        self,
-        map_id: str,
-        formula: str,
-        regions: Mapping[str, Any] | None = None,
-        *,
-        signals: Mapping[str, float] | None = None,
-        robot: str | Mapping[str, Any] = "stretch",
-        method: Literal["dqn", "planner", "reachability"] = "reachability",
-        seed: int = 0,
-        options: Mapping[str, Any] | None = None,
-    ) -> Policy:
-        return await self._run(
-            core.create_policy(map_id, formula, regions, signals, robot, method, seed, options)
-        )
+    @looks_like(flow)
+    async def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> AsyncSession:
+        info = await self._run(flow(*args, **kwargs))
+        return AsyncSession(self._run, info, cast(Any, kwargs.get("initial_pose")))
 
-    async def upload(self, weights: Content, card: Content | Mapping[str, Any]) -> Policy:
-        return await self._run(core.upload_policy(weights, card))
+    return method
 
-    def list(self) -> AsyncIterator[Policy]:
-        return _pages(self._run, Policy, "policies")
 
-    async def get(self, id: str) -> Policy:
-        return await self._run(core.get_policy(id))
+def pages(cls: type[T], resource: str) -> Callable[[Resource], AsyncIterator[T]]:
+    """The method that lists all there are."""
 
-    async def delete(self, id: str) -> None:
-        return await self._run(core.delete_policy(id))
+    async def method(self: Resource) -> AsyncIterator[T]:
+        """All of them, in the order of the server's pages."""
+        page = await self._run(page_of(cls, resource, None))
+        while True:
+            for item in page.items:
+                yield item
+            if page.next is None:
+                return
+            page = await self._run(page_of(cls, resource, page.next))
 
-    async def wait(
-        self,
-        id: str,
-        *,
-        timeout: float = 3600.0,
-        interval: float = 1.0,
-        progress: Callable[[Policy], object] | None = None,
-    ) -> Policy:
-        return await self._run(core.wait_policy(id, timeout, interval, progress))
+    return method
 
 
 class AsyncSession(SessionState):
@@ -180,75 +154,36 @@ class AsyncSession(SessionState):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             await self._run(self._close(None, TRIES if error is None else 1))
 
-    async def step(
-        self,
-        pose: Numbers,
-        logits: Logits | None = None,
-        *,
-        main_task_done: bool | None = None,
-        signals: Mapping[str, float] | None = None,
-        witnesses: bool = False,
-    ) -> Decision:
-        return await self._run(self._step(pose, logits, main_task_done, signals, witnesses))
-
-    async def trajectory(self) -> tuple[TrajectoryItem, ...]:
-        return await self._run(self._trajectory())
-
-    async def close(self, pose: Numbers | None = None) -> Verdict:
-        return await self._run(self._close(pose, TRIES))
+    step = awaiting_step(SessionState._step)
+    trajectory = awaiting_step(SessionState._trajectory)
+    close = awaiting_step(SessionState._end)
 
 
-class AsyncSessions:
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    async def create(
-        self,
-        *,
-        initial_pose: Numbers,
-        policy_id: str | None = None,
-        policy_ids: Sequence[str] | None = None,
-        id: str | None = None,
-        seed: int = 0,
-        threshold: float = 1.0,
-        margin: float = 0.0,
-        slack: int = 0,
-        evaluation: Literal["feasibility", "robustness"] = "feasibility",
-        shaping: Literal["projection", "lookahead"] = "projection",
-        max_steps: int | None = None,
-        allow_infeasible: bool = False,
-    ) -> AsyncSession:
-        flow = core.create_session(
-            policy_id,
-            policy_ids,
-            initial_pose,
-            id=id,
-            seed=seed,
-            threshold=threshold,
-            margin=margin,
-            slack=slack,
-            evaluation=evaluation,
-            shaping=shaping,
-            max_steps=max_steps,
-            allow_infeasible=allow_infeasible,
-        )
-        return AsyncSession(self._run, await self._run(flow), initial_pose)
-
-    async def get(self, id: str) -> AsyncSession:
-        return AsyncSession(self._run, await self._run(core.get_session(id)))
-
-    def list(self) -> AsyncIterator[SessionInfo]:
-        return _pages(self._run, SessionInfo, "sessions")
-
-    async def delete(self, id: str) -> None:
-        return await self._run(core.delete_session(id))
+class AsyncSpecs(Resource):
+    validate = awaiting(calls.validate)
 
 
-async def _pages(run: Run, cls: type[T], resource: str) -> AsyncIterator[T]:
-    page = await run(core.page(cls, resource, None))
-    while True:
-        for item in page.items:
-            yield item
-        if page.next is None:
-            return
-        page = await run(core.page(cls, resource, page.next))
+class AsyncMaps(Resource):
+    create = awaiting(calls.create_map)
+    upload = awaiting(calls.upload_map)
+    procthor = awaiting(calls.procthor_map)
+    occupancy_grid = awaiting(calls.occupancy_grid_map)
+    get = awaiting(calls.get_map)
+    image = awaiting(calls.map_image)
+    list = pages(Map, "maps")
+
+
+class AsyncPolicies(Resource):
+    create = awaiting(calls.create_policy)
+    upload = awaiting(calls.upload_policy)
+    get = awaiting(calls.get_policy)
+    delete = awaiting(calls.delete_policy)
+    wait = awaiting(calls.wait_policy)
+    list = pages(Policy, "policies")
+
+
+class AsyncSessions(Resource):
+    create = opening(calls.create_session)
+    get = opening(calls.get_session)
+    delete = awaiting(calls.delete_session)
+    list = pages(SessionInfo, "sessions")

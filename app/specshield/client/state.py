@@ -64,11 +64,19 @@ class SessionState:
     def _step(
         self,
         pose: Numbers,
-        logits: Logits | None,
-        main_task_done: bool | None,
-        signals: Mapping[str, float] | None,
-        witnesses: bool,
+        logits: Logits | None = None,
+        *,
+        main_task_done: bool | None = None,
+        signals: Mapping[str, float] | None = None,
+        witnesses: bool = False,
     ) -> Flow[Decision]:
+        """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
+
+        `main_task_done`: leave it None to run `decision.execute`; the session then remembers a drawn
+        terminal action. A caller that draws from `decision.distribution` itself says True or False.
+        `logits` may be None once it is true. Raises whatever went wrong and stays at t: call again
+        with the same pose and logits, or `record` the pose and move on.
+        """
         t, own = self.t, main_task_done is None
         over = self.main_task_done if main_task_done is None else main_task_done
         body: dict[str, Any] = {
@@ -89,6 +97,10 @@ class SessionState:
         self.finished = decision.finished or (ends and decision.spec_status != "pending")
         return decision
 
+    def _end(self, pose: Numbers | None = None) -> Flow[Verdict]:
+        """End the session; `pose` is the state the last action led to."""
+        return (yield from self._close(pose, TRIES))
+
     def _close(self, pose: Numbers | None, tries: int) -> Flow[Verdict]:
         """With no pose at hand (a session read back, not stepped) it closes on what the server has."""
         poses = self._poses if pose is None else {**self._poses, self.t: pose_values(pose)}
@@ -102,6 +114,7 @@ class SessionState:
         return verdict
 
     def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
+        """The states x_0..x_t that the server has, and its answers."""
         body = yield from call(get("sessions", self.id, "trajectory", slow=True))
         raw: Page[Any] = build(Page, body)
         return tuple(build(TrajectoryItem, item) for item in raw.items)

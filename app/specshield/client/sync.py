@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from types import TracebackType
-from typing import Any, Literal, Protocol, TypeVar, cast
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
 import httpx
 
-from specshield.client import core
-from specshield.client.core import Flow, Wait
-from specshield.client.models import Decision, Map, Policy, SessionInfo, Spec, TrajectoryItem, Verdict
+from specshield.client import calls
+from specshield.client.core import Flow, Wait, looks_like, page_of
+from specshield.client.models import Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.transport import address, allowed, arguments, check_open, failure, headers, reply
-from specshield.client.wire import TRIES, Content, Failure, Logits, Numbers, Reply, Request
+from specshield.client.wire import TRIES, Failure, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -79,105 +80,56 @@ class ShieldClient:
         return reply(response, time.monotonic() - start, limit)
 
 
-class Specs:
+class Resource:
+    """Some of the calls, bound to a client."""
+
     def __init__(self, run: Run) -> None:
         self._run = run
 
-    def validate(
-        self,
-        formula: str,
-        regions: Mapping[str, Any] | None = None,
-        *,
-        signals: Mapping[str, float] | None = None,
-        map_id: str | None = None,
-    ) -> Spec:
-        """Parse a formula; FormulaError says where it is wrong.
 
-        Once regions, signals or a map (whose rooms are names) are given, every name must be one of theirs.
-        """
-        return self._run(core.validate(formula, regions, signals, map_id))
+def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource, P], T]:
+    """The method of a resource that makes this call."""
+
+    @looks_like(flow)
+    def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return self._run(flow(*args, **kwargs))
+
+    return method
 
 
-class Maps:
-    def __init__(self, run: Run) -> None:
-        self._run = run
+def blocking_step(flow: Callable[Concatenate[Session, P], Flow[T]]) -> Callable[Concatenate[Session, P], T]:
+    """The method of a session that makes this call, which is a method of its state."""
 
-    def upload(self, metadata: Content, image: Content) -> Map:
-        """A ROS map_server map: YAML and PGM or PNG, each its content or the path object of a file."""
-        return self._run(core.upload_map(metadata, image))
+    @looks_like(flow)
+    def method(self: Session, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return self._run(flow(self, *args, **kwargs))
 
-    def procthor(
-        self, house: Mapping[str, Any], asset_sizes: Mapping[str, Any], resolution: float = 0.05
-    ) -> Map:
-        """A ProcTHOR house, drawn at `resolution` [m]; map (x, y) is house (x, z)."""
-        return self._run(
-            core.post_map(format="procthor", house=house, asset_sizes=asset_sizes, resolution=resolution)
-        )
-
-    def occupancy_grid(self, info: Mapping[str, Any], data: Sequence[int]) -> Map:
-        """A nav_msgs/OccupancyGrid: its `info`, and `data` row by row from the lowest y."""
-        return self._run(core.post_map(format="occupancy_grid", info=info, data=data))
-
-    def list(self) -> Iterator[Map]:
-        return _pages(self._run, Map, "maps")
-
-    def get(self, id: str) -> Map:
-        return self._run(core.get_map(id))
-
-    def image(self, id: str) -> bytes:
-        """The map as PNG."""
-        return self._run(core.map_image(id))
+    return method
 
 
-class Policies:
-    def __init__(self, run: Run) -> None:
-        self._run = run
+def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resource, P], Session]:
+    """The method that makes this call and gives the session that it tells of."""
 
-    def create(
-        self,
-        map_id: str,
-        formula: str,
-        regions: Mapping[str, Any] | None = None,
-        *,
-        signals: Mapping[str, float] | None = None,
-        robot: str | Mapping[str, Any] = "stretch",
-        method: Literal["dqn", "planner", "reachability"] = "reachability",
-        seed: int = 0,
-        options: Mapping[str, Any] | None = None,
-    ) -> Policy:
-        """Have a policy made; returns at once (see `wait`). The same request again is the same policy.
+    @looks_like(flow)
+    def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> Session:
+        return Session(self._run, self._run(flow(*args, **kwargs)), cast(Any, kwargs.get("initial_pose")))
 
-        `signals` names the other signals of the formula, with the value each holds before its first sample.
-        """
-        return self._run(core.create_policy(map_id, formula, regions, signals, robot, method, seed, options))
+    return method
 
-    def upload(self, weights: Content, card: Content | Mapping[str, Any]) -> Policy:
-        """A policy trained elsewhere: safetensors and its card, each the content or a path object."""
-        return self._run(core.upload_policy(weights, card))
 
-    def list(self) -> Iterator[Policy]:
-        return _pages(self._run, Policy, "policies")
+def pages(cls: type[T], resource: str) -> Callable[[Resource], Iterator[T]]:
+    """The method that lists all there are."""
 
-    def get(self, id: str) -> Policy:
-        return self._run(core.get_policy(id))
+    def method(self: Resource) -> Iterator[T]:
+        """All of them, in the order of the server's pages."""
+        page = self._run(page_of(cls, resource, None))
+        while True:
+            yield from page.items
+            if page.next is None:
+                return
+            page = self._run(page_of(cls, resource, page.next))
 
-    def delete(self, id: str) -> None:
-        """Cancel its training, or remove it. InUse while sessions use it."""
-        return self._run(core.delete_policy(id))
-
-    def wait(
-        self,
-        id: str,
-        *,
-        timeout: float = 3600.0,
-        interval: float = 1.0,
-        progress: Callable[[Policy], object] | None = None,
-    ) -> Policy:
-        """Ask every `interval` [s] until it is `ready` or `failed`; `progress` sees every answer.
-
-        TransportTimeout after `timeout` [s]; the training goes on.
-        """
-        return self._run(core.wait_policy(id, timeout, interval, progress))
+    return method
 
 
 class Session(SessionState):
@@ -199,95 +151,36 @@ class Session(SessionState):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             self._run(self._close(None, TRIES if error is None else 1))
 
-    def step(
-        self,
-        pose: Numbers,
-        logits: Logits | None = None,
-        *,
-        main_task_done: bool | None = None,
-        signals: Mapping[str, float] | None = None,
-        witnesses: bool = False,
-    ) -> Decision:
-        """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
-
-        `main_task_done`: leave it None to run `decision.execute`; the session then remembers a drawn
-        terminal action. A caller that draws from `decision.distribution` itself says True or False.
-        `logits` may be None once it is true. Raises whatever went wrong and stays at t: call again
-        with the same pose and logits, or `record` the pose and move on.
-        """
-        return self._run(self._step(pose, logits, main_task_done, signals, witnesses))
-
-    def trajectory(self) -> tuple[TrajectoryItem, ...]:
-        """The states x_0..x_t that the server has, and its answers."""
-        return self._run(self._trajectory())
-
-    def close(self, pose: Numbers | None = None) -> Verdict:
-        """End the session; `pose` is the state the last action led to."""
-        return self._run(self._close(pose, TRIES))
+    step = blocking_step(SessionState._step)
+    trajectory = blocking_step(SessionState._trajectory)
+    close = blocking_step(SessionState._end)
 
 
-class Sessions:
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    def create(
-        self,
-        *,
-        initial_pose: Numbers,
-        policy_id: str | None = None,
-        policy_ids: Sequence[str] | None = None,
-        id: str | None = None,
-        seed: int = 0,
-        threshold: float = 1.0,
-        margin: float = 0.0,
-        slack: int = 0,
-        evaluation: Literal["feasibility", "robustness"] = "feasibility",
-        shaping: Literal["projection", "lookahead"] = "projection",
-        max_steps: int | None = None,
-        allow_infeasible: bool = False,
-    ) -> Session:
-        """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
-
-        `threshold` is delta; the guarantee is for 1 with evaluation "feasibility", the defaults. With
-        "robustness" it is the mean robustness [m] asked for, of which 1 is often too much. `margin` and
-        `slack` are the robustness [m] and the steps to keep in hand.
-        InfeasibleStart where no action has a satisfying future, unless `allow_infeasible`.
-        """
-        flow = core.create_session(
-            policy_id,
-            policy_ids,
-            initial_pose,
-            id=id,
-            seed=seed,
-            threshold=threshold,
-            margin=margin,
-            slack=slack,
-            evaluation=evaluation,
-            shaping=shaping,
-            max_steps=max_steps,
-            allow_infeasible=allow_infeasible,
-        )
-        return Session(self._run, self._run(flow), initial_pose)
-
-    def get(self, id: str) -> Session:
-        """A session begun earlier, ready for its next step.
-
-        If the last action run was a terminal one, say `main_task_done=True` there: only the caller knows.
-        """
-        return Session(self._run, self._run(core.get_session(id)))
-
-    def list(self) -> Iterator[SessionInfo]:
-        return _pages(self._run, SessionInfo, "sessions")
-
-    def delete(self, id: str) -> None:
-        """Erase it with its trajectory."""
-        return self._run(core.delete_session(id))
+class Specs(Resource):
+    validate = blocking(calls.validate)
 
 
-def _pages(run: Run, cls: type[T], resource: str) -> Iterator[T]:
-    page = run(core.page(cls, resource, None))
-    while True:
-        yield from page.items
-        if page.next is None:
-            return
-        page = run(core.page(cls, resource, page.next))
+class Maps(Resource):
+    create = blocking(calls.create_map)
+    upload = blocking(calls.upload_map)
+    procthor = blocking(calls.procthor_map)
+    occupancy_grid = blocking(calls.occupancy_grid_map)
+    get = blocking(calls.get_map)
+    image = blocking(calls.map_image)
+    list = pages(Map, "maps")
+
+
+class Policies(Resource):
+    create = blocking(calls.create_policy)
+    upload = blocking(calls.upload_policy)
+    get = blocking(calls.get_policy)
+    delete = blocking(calls.delete_policy)
+    wait = blocking(calls.wait_policy)
+    list = pages(Policy, "policies")
+
+
+class Sessions(Resource):
+    create = opening(calls.create_session)
+    get = opening(calls.get_session)
+    delete = blocking(calls.delete_session)
+    list = pages(SessionInfo, "sessions")

@@ -1,22 +1,94 @@
-"""Reading back a policy of any method."""
+"""The ways to make a policy, by name. To add one: a file that defines a `Method`, and a line below (or an
+entry point of the group `specshield.methods` in a package of its own).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
-from specshield.errors import PolicyError
-from specshield.policy.card import Card
-from specshield.policy.dqn.policy import Proposer, load_dqn
-from specshield.policy.planner.policy import load_planner
-from specshield.policy.reachability.policy import load_reachability
-from specshield.task import Task
+from specshield.errors import InputError, PolicyError
+from specshield.registry import Registry
 
-READERS: dict[str, Callable[[bytes | Path, Card, Task], Proposer]] = {
-    "dqn": load_dqn,
-    "planner": load_planner,
-    "reachability": load_reachability,
-}
+if TYPE_CHECKING:  # a worker waits for jobs without the weight of the core
+    from specshield.policy.card import Card
+    from specshield.policy.dqn.policy import Proposer
+    from specshield.task import Task
+
+DEFAULT = "reachability"
+
+
+class Made(Protocol):
+    """A policy with its two files."""
+
+    @property
+    def card(self) -> Card: ...
+
+    def weights(self) -> bytes: ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """What the making of one policy is given beside its task and options.
+
+    spec: the rule as it was asked for, for the card. checkpoints: a folder to save to, and to go on from.
+    on_progress: told the share that is done, the seconds that are left, and what there is to say of it.
+    should_stop: whether to give up.
+    """
+
+    seed: int = 0
+    spec: dict[str, Any] | None = None
+    checkpoints: Path | None = None
+    on_progress: Callable[[float, float, str], None] = lambda done, seconds_left, said: None
+    should_stop: Callable[[], bool] = lambda: False
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to make a policy for a task.
+
+    about: one sentence. options: a frozen dataclass of `option` fields (policy/options.py). needs: modules
+    that have to be installed where policies are made; those that only serve need none of them.
+
+    check(task, options) raises what `make` would for a task that the method cannot serve, and makes nothing.
+    make(task, options, run) makes the policy; it may take hours, in a process of its own.
+    load(weights, card, task) reads one back, from the bytes or the path of its weights, and raises
+    PolicyError where they do not fit the task.
+
+    Whatever is slow to import is imported inside of these.
+    """
+
+    about: str
+    options: type[Any]
+    check: Callable[[Task, Any], None]
+    make: Callable[[Task, Any, Run], Made]
+    load: Callable[[bytes | Path, Card, Task], Proposer]
+    needs: tuple[str, ...] = ()
+
+
+METHODS = Registry(
+    "method",
+    Method,
+    "specshield.methods",
+    {
+        "dqn": "specshield.policy.dqn.method:METHOD",
+        "planner": "specshield.policy.planner.method:METHOD",
+        "reachability": "specshield.policy.reachability.method:METHOD",
+    },
+)
+
+
+def available() -> list[str]:
+    """The names of the methods that this machine has all modules for."""
+    return [name for name, method in METHODS.usable() if not missing(method)]
+
+
+def missing(method: Method) -> list[str]:
+    """The modules that making a policy by this method needs and that are not installed here."""
+    return [module for module in method.needs if find_spec(module) is None]
 
 
 def load_policy(weights: bytes | Path, card: Card, task: Task) -> Proposer:
@@ -28,9 +100,10 @@ def load_policy(weights: bytes | Path, card: Card, task: Task) -> Proposer:
             got=card.get("task_hash"),
             expected=task.content_hash,
         )
-    read = READERS.get(str(card.get("method")))
-    if read is None:
+    try:
+        method = METHODS.get(str(card.get("method")))
+    except InputError as error:
         raise PolicyError(
-            "unknown method", path="card.method", got=card.get("method"), expected=f"one of {sorted(READERS)}"
-        )
-    return read(weights, card, task)
+            error.message, path="card.method", got=error.got, expected=error.expected
+        ) from error
+    return method.load(weights, card, task)

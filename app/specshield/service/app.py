@@ -20,7 +20,7 @@ from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe, guarded
 from specshield.service.routes import maps, policies, sessions, specs, system
-from specshield.service.schemas import Problem
+from specshield.service.schemas.base import Problem
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
 from specshield.service.state import Server, problem_documents
@@ -133,7 +133,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             "ValidationError",
         ):  # FastAPI's own, which never leave this server
             schemas.pop(name, None)
-        for model in (Problem, *maps.MODELS, *policies.MODELS):  # referred to by hand
+        for model in (Problem, *policies.MODELS):  # referred to by hand
             described = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(described.pop("$defs", {}))
             schemas[model.__name__] = described

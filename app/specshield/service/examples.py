@@ -24,20 +24,6 @@ SPEC_REQUEST: dict[str, Any] = {
     },
 }
 
-GRID_MAP: dict[str, Any] = {
-    "format": "occupancy_grid",
-    "info": {
-        "resolution": 1.0,
-        "width": 5,
-        "height": 4,
-        "origin": {
-            "position": {"x": 0.0, "y": 0.0, "z": 0.0},
-            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-        },
-    },
-    "data": [0] * 12 + [100, -1] + [0] * 6,
-}
-
 POLICY: dict[str, Any] = {
     "map_id": "case1",
     "robot": "stretch",

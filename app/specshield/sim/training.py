@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from specshield.errors import Unsupported
-from specshield.policy.dqn.settings import read_settings
-from specshield.policy.planner import policy as planner
-from specshield.policy.reachability import policy as reachability
+from specshield.policy.methods import DEFAULT, METHODS, Run
+from specshield.policy.options import read_options
 from specshield.policy.tensors import replace_file
-from specshield.sim.cases import MODELS, Case, load_case
+from specshield.sim.cases import MODELS, load_case
 from specshield.sim.progress import StatusLine, duration
 
 
@@ -28,61 +27,40 @@ def train(
 ) -> int:
     """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`; the exit status.
 
-    options: "name=value", of the method's settings. What a DQN has learned is saved to `out`/checkpoint at
-    every evaluation; `resume` takes that up after a kill.
+    options: "name=value", of the method's options. A method that saves how far it is does so in
+    `out`/checkpoint; `resume` goes on from there after a kill.
     """
-    loaded = load_case(case)
-    out = out or MODELS / (loaded.name if method == "reachability" else f"{loaded.name}-{method}")
-    if method == "dqn":
-        weights, card = _learn(loaded, seed, updates, _options(options), out / "checkpoint", resume)
-    elif method == "reachability":
-        table = reachability.synthesise(
-            loaded.task, reachability.read_settings(_options(options)), dict(loaded.spec)
-        )
-        weights, card = table.weights(), table.card
-    elif method == "planner":
-        plans = planner.synthesise(loaded.task, planner.read_settings(_options(options)), dict(loaded.spec))
-        weights, card = plans.weights(), plans.card
-    else:
-        expected = "'dqn', 'planner' or 'reachability'"
-        raise Unsupported("unknown method", path="method", got=method, expected=expected)
-    out.mkdir(parents=True, exist_ok=True)
-    replace_file(out / "policy.safetensors", weights)
-    (out / "card.json").write_text(json.dumps(card, indent=1) + "\n")
-    shutil.rmtree(out / "checkpoint", ignore_errors=True)
-    metrics = card["metrics"]
-    alone = f"satisfies alone from {metrics['satisfied']:.1%}, " if "satisfied" in metrics else ""
-    print(f"{out}: {alone}feasible from {metrics['feasible_start']:.1%}; {duration(metrics['wall_time_s'])}")
-    return 0
-
-
-def _learn(
-    case: Case, seed: int, updates: int | None, options: dict[str, Any], checkpoint: Path, resume: bool
-) -> tuple[bytes, dict[str, Any]]:
-    from specshield.policy.dqn.train import Progress, train
-
-    settings = read_settings(options | ({} if updates is None else {"updates": updates}))
-    status = StatusLine()
+    began, made_by, loaded = time.monotonic(), METHODS.get(method), load_case(case)
+    given = _parse(options) | ({} if updates is None else {"updates": updates})
+    chosen = read_options(made_by.options, given)
+    out = out or MODELS / (loaded.name if method == DEFAULT else f"{loaded.name}-{method}")
+    checkpoint, status = out / "checkpoint", StatusLine()
     if not resume:
         shutil.rmtree(checkpoint, ignore_errors=True)
 
-    def show(progress: Progress) -> None:
-        rate = "not measured yet" if progress.satisfied is None else f"satisfied {progress.satisfied:.1%}"
-        done = f"{case.name}: update {progress.update} of {progress.updates}"
-        status.say(f"{done}, {rate}, {duration(progress.eta_s)} left")
+    def show(done: float, seconds_left: float, said: str) -> None:
+        status.say(f"{loaded.name}: {said or f'{done:.0%}'}, {duration(seconds_left)} left")
 
-    policy = train(case.task, settings, seed, show, checkpoint, spec=dict(case.spec))
+    policy = made_by.make(loaded.task, chosen, Run(seed, dict(loaded.spec), checkpoint, show))
     status.clear()
-    return policy.weights(), policy.card
+    out.mkdir(parents=True, exist_ok=True)
+    replace_file(out / "policy.safetensors", policy.weights())
+    (out / "card.json").write_text(json.dumps(policy.card, indent=1) + "\n")
+    shutil.rmtree(checkpoint, ignore_errors=True)
+    measured = {"satisfied": "satisfies alone from", "feasible_start": "feasible from"}
+    metrics = policy.card["metrics"]
+    shares = [f"{words} {metrics[name]:.1%}" for name, words in measured.items() if name in metrics]
+    print(f"{out}: {', '.join(shares)}; {duration(time.monotonic() - began)}")
+    return 0
 
 
-def _options(texts: Sequence[str]) -> dict[str, Any]:
-    """The settings that "name=value" texts name, each value read as JSON or else as the text it is."""
-    settings: dict[str, Any] = {}
+def _parse(texts: Sequence[str]) -> dict[str, Any]:
+    """The options that "name=value" texts name, each value read as JSON or else as the text it is."""
+    found: dict[str, Any] = {}
     for text in texts:
         name, _, value = text.partition("=")
         try:
-            settings[name] = json.loads(value)
+            found[name] = json.loads(value)
         except ValueError:
-            settings[name] = value
-    return settings
+            found[name] = value
+    return found

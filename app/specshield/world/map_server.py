@@ -1,13 +1,12 @@
-"""Maps as ROS has them: map_server YAML with an image, and nav_msgs/OccupancyGrid as JSON.
+"""Maps of ROS's map_server: a YAML file with an image.
 
-Both give values per cell, -1 unknown and 0 to 100 occupied in percent, as nav2_map_server publishes them;
-FREE_AT_MOST then says which cells are free. Everything else, the unknown included, is occupied.
+They give a value per cell, -1 for unknown and 0 to 100 for how occupied it is in percent, as nav2_map_server
+publishes it; FREE_AT_MOST then says which cells are free. Everything else, the unknown included, is occupied.
 """
 
 from __future__ import annotations
 
 import io
-import math
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from PIL import Image
 
 from specshield.errors import MapError
 from specshield.world import checks
+from specshield.world.formats import MapFormat, Rooms
 from specshield.world.occupancy import MAX_SIDE, OccupancyGrid, check_size
 
 FREE_AT_MOST = 25  # percent: what nav2's map_saver writes as free by default
@@ -62,7 +62,7 @@ def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
         values = np.where(occupancy > occupied_thresh, 100, np.where(occupancy < free_thresh, 0, middle))
         if mode == "scale":
             values[opacity < 1.0] = UNKNOWN
-    return _from_values(values[::-1], resolution, (x, y, yaw))
+    return from_values(values[::-1], resolution, (x, y, yaw))
 
 
 def dump_map(grid: OccupancyGrid, image: str = "map.pgm") -> tuple[str, bytes]:
@@ -76,39 +76,8 @@ def dump_map(grid: OccupancyGrid, image: str = "map.pgm") -> tuple[str, bytes]:
     return text, b"P5\n%d %d\n255\n" % (grid.width, grid.height) + pixels.tobytes()
 
 
-def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
-    """nav_msgs/OccupancyGrid: its `info` as an object, its `data` as a flat list, row 0 the lowest y."""
-    width, height = (
-        checks.integer(checks.member(info, key, "info"), f"info.{key}", 1, MAX_SIDE)
-        for key in ("width", "height")
-    )
-    resolution = checks.number(checks.member(info, "resolution", "info"), "info.resolution", 1e-4, 100.0)
-    origin = checks.member(info, "origin", "info")
-    position = checks.member(origin, "position", "info.origin")
-    x, y = (
-        checks.number(checks.member(position, key, "info.origin.position"), f"info.origin.position.{key}")
-        for key in "xy"
-    )
-    yaw = _yaw(checks.member(origin, "orientation", "info.origin"))
-    checks.items(data, "data", width * height, width * height)
-    try:
-        values = np.array(data)
-    except (ValueError, OverflowError):
-        values = np.array(None)
-    if values.dtype.kind != "i" or values.ndim != 1:
-        raise MapError(
-            "data holds something other than integers", path="data", expected="integers from -1 to 100"
-        )
-    wrong = np.flatnonzero((values < UNKNOWN) | (values > 100))
-    if wrong.size:
-        i = int(wrong[0])
-        raise checks.wrong("occupancy", f"data[{i}]", int(values[i]), "an integer from -1 (unknown) to 100")
-    return _from_values(values.reshape(height, width), resolution, (x, y, yaw))
-
-
-def _from_values(
-    values: NDArray[Any], resolution: float, origin: tuple[float, float, float]
-) -> OccupancyGrid:
+def from_values(values: NDArray[Any], resolution: float, origin: tuple[float, float, float]) -> OccupancyGrid:
+    """The grid of values [height, width], row 0 the lowest y."""
     return OccupancyGrid((values < 0) | (values > FREE_AT_MOST), resolution, origin)
 
 
@@ -193,15 +162,22 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[NDArray[np.float64], 
         ) from error
 
 
-def _yaw(orientation: Any) -> float:
-    """The yaw of a unit quaternion about z."""
-    path = "info.origin.orientation"
-    x, y, z, w = (checks.number(checks.member(orientation, k, path), f"{path}.{k}") for k in "xyzw")
-    if abs(x * x + y * y + z * z + w * w - 1) > 1e-3 or math.hypot(x, y) > 1e-3:
+def _parse(metadata: bytes, image: bytes) -> tuple[OccupancyGrid, Rooms]:
+    try:
+        text = metadata.decode()
+    except UnicodeDecodeError as error:
         raise MapError(
-            "a map is turned about z alone",
-            path=path,
-            got=[x, y, z, w],
-            expected="a unit quaternion, x = y = 0",
-        )
-    return 2 * math.atan2(z, w)
+            "the metadata is not text", path="metadata", got=str(error), expected="YAML in UTF-8"
+        ) from None
+    return load_map(text, image), {}
+
+
+FORMAT = MapFormat(
+    "A map of ROS's map_server, as two files.",
+    {
+        "metadata": {"description": "The map_server YAML; its `image:` is ignored."},
+        "image": {"description": "The image: PGM or PNG."},
+    },
+    _parse,
+    files=True,
+)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from specshield.errors import MapError
 from specshield.world import checks
+from specshield.world.formats import MapFormat
 from specshield.world.occupancy import OccupancyGrid, check_size
 from specshield.world.regions import Polygon, Region, Union, signed_distance
 
@@ -29,7 +30,8 @@ Array = NDArray[np.float64]
 def load_house(house: Any, asset_sizes: Any, resolution: float) -> tuple[OccupancyGrid, dict[str, Region]]:
     """(grid, rooms) of a ProcTHOR house.
 
-    asset_sizes: {assetId: {"size": [x, y, z]}}, full extents in metres, for every object and child.
+    asset_sizes: the full extents in metres of every object's and child's asset, by assetId: [x, y, z] or
+    {"x": x, "y": y, "z": z}, either of them also as the member `size` or `boundingBox` of an object.
     rooms: polygons named by roomType; where a type comes twice, Bedroom_1, Bedroom_2 and Bedroom, their
     union. MapError names an unknown asset, a missing member or a number that cannot be.
     """
@@ -157,9 +159,7 @@ def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Array, Array]]:
                 got=checks.shown(asset),
                 expected="a key of asset_sizes",
             )
-        where = f"asset_sizes.{asset}"
-        size = checks.items(checks.member(sizes[asset], "size", where), f"{where}.size", 3, 3)
-        half = np.array([checks.number(v, f"{where}.size[{i}]", 0.0, 1000.0) for i, v in enumerate(size)]) / 2
+        half = np.array(_size(sizes[asset], f"asset_sizes.{asset}")) / 2
         x, y, z = _vector(checks.member(thing, "position", path), f"{path}.position")
         edges = (
             half[:, None] * _rotation(_vector(checks.member(thing, "rotation", path), f"{path}.rotation")).T
@@ -167,6 +167,19 @@ def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Array, Array]]:
         lowest = y - np.abs(edges[:, 1]).sum()
         if checks.member(thing, "kinematic", path) is True and lowest < STANDS_BELOW:
             yield np.array([x, z]), edges[:, [0, 2]]
+
+
+def _size(value: Any, path: str) -> list[float]:
+    """The extents [m] along x, y and z, in any of the forms that `load_house` takes."""
+    for key in ("size", "boundingBox"):
+        if isinstance(value, Mapping) and key in value:
+            value, path = value[key], f"{path}.{key}"
+    if isinstance(value, Mapping):
+        return [
+            checks.number(checks.member(value, axis, path), f"{path}.{axis}", 0.0, 1000.0) for axis in "xyz"
+        ]
+    extents = checks.items(value, path, 3, 3)
+    return [checks.number(extent, f"{path}[{i}]", 0.0, 1000.0) for i, extent in enumerate(extents)]
 
 
 def _rotation(degrees: tuple[float, float, float]) -> Array:
@@ -225,3 +238,29 @@ def _points(parent: Mapping[str, Any], key: str, path: str, low: int) -> list[tu
 def _vector(value: Any, path: str) -> tuple[float, float, float]:
     x, y, z = (checks.number(checks.member(value, axis, path), f"{path}.{axis}") for axis in "xyz")
     return x, y, z
+
+
+def _parse(house: Any, asset_sizes: Any, resolution: Any) -> tuple[OccupancyGrid, dict[str, Region]]:
+    try:
+        return load_house(house, asset_sizes, resolution)
+    except MapError as error:
+        below = (error.path or "").startswith(("asset_sizes", "resolution"))
+        raise error if below else error.at("house") from None
+
+
+FORMAT = MapFormat(
+    "A ProcTHOR house. Map (x, y) is the house's (x, z) in metres; theta = pi/2 - yaw. Its rooms are names.",
+    {
+        "house": {"type": "object", "description": "The house's JSON."},
+        "asset_sizes": {
+            "type": "object",
+            "description": "Bounding box of every asset it uses, by asset id: `[x, y, z]` or "
+            '`{"x": x, "y": y, "z": z}` in metres, or an object that has this as `size` or `boundingBox`.',
+        },
+        "resolution": {
+            "type": "number", "minimum": 1e-4, "maximum": 100, "default": 0.05,
+            "description": "Side of a cell [m].",
+        },
+    },
+    _parse,
+)  # fmt: skip

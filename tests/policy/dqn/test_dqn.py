@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from specshield.errors import FragmentError, PolicyError
+from specshield.errors import FragmentError
+from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import NAMES
-from specshield.policy.dqn.settings import Settings, options_of, read_settings
 from specshield.policy.dqn.train import Progress, Stopped, _Run, measure, train
 from specshield.policy.methods import load_policy
+from specshield.policy.options import read_options
 from tests.policy.rooms import flat
 
 TASK = flat("F[0,30] West and G[0,30] not Hole")
@@ -41,7 +42,7 @@ def test_a_short_training_beats_chance_clearly():
     assert 0.0 <= reports[2].satisfied <= 1.0
     again = load_policy(policy.weights(), policy.card, TASK)
     assert same(again.network._asdict(), policy.network._asdict())
-    assert read_settings(policy.card["options"]) == SMALL
+    assert read_options(Settings, policy.card["options"]) == SMALL
 
 
 @pytest.mark.parametrize("reward", ["progress", "paper"])
@@ -98,33 +99,3 @@ def test_measured_rates_have_exact_intervals():
         measured = measure(task, _Run(task, TINY, 0).q_network.weights(), 20, 0)
         for name in ("satisfied", "feasible_start"):
             assert (measured[name], measured[f"{name}_interval"]) == (rate, interval)
-
-
-@pytest.mark.parametrize(
-    ("options", "path"),
-    [
-        ({"unit": 64}, "options.unit"),
-        ({"units": 64.0}, "options.units"),
-        ({"units": True}, "options.units"),
-        ({"units": 129}, "options.units"),
-        ({"updates": 0}, "options.updates"),
-        ({"learning_rate": float("nan")}, "options.learning_rate"),
-        ({"learning_rate": "fast"}, "options.learning_rate"),
-        ({"discount": 1.1}, "options.discount"),
-        ({"reward": "sparse"}, "options.reward"),
-        ({"exploration": [0.5]}, "options.exploration"),
-        ({"exploration": [0.5, 2.0]}, "options.exploration"),
-    ],
-)
-def test_bad_options_name_the_field(options, path):
-    with pytest.raises(PolicyError) as caught:
-        read_settings(options)
-    assert caught.value.path == path
-    assert caught.value.expected
-
-
-def test_options_are_read_back_as_they_were():
-    assert read_settings({}) == Settings()
-    chosen = Settings(units=32, learning_rate=1e-4, exploration=(0.9, 0.1))
-    assert read_settings(options_of(chosen)) == chosen
-    assert str(read_settings({"discount": 1}).discount) == "1.0"  # 1 and 1.0 are one policy

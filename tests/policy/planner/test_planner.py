@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from specshield.errors import InfeasibleStart, PolicyError
 from specshield.policy.methods import load_policy
-from specshield.policy.planner.policy import Settings, read_settings, synthesise
+from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import simulate
 from specshield.shield.episode import Carry, decide, make_shield, start
@@ -299,9 +299,6 @@ def test_a_policy_comes_back_from_its_files_as_it_was():
         load_policy(policy.weights(), {**policy.card, "options": {"pitch": 0.1}}, task)
     with pytest.raises(PolicyError, match="safetensors"):
         load_policy(policy.weights()[:-9], policy.card, task)
-    with pytest.raises(PolicyError, match="not in range") as caught:
-        read_settings({"effort": 0})
-    assert caught.value.path == "options.effort"
 
 
 def test_where_there_is_nothing_to_find_it_ends_and_says_the_same_again():

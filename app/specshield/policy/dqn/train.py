@@ -25,10 +25,11 @@ from torch import nn
 
 from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import Environment, free_poses
+from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import NAMES, Network, make_network
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.dqn.rollout import satisfies
-from specshield.policy.dqn.settings import Settings, options_of
+from specshield.policy.options import options_to_json
 from specshield.robot.dynamics import motion_count
 from specshield.task import Task
 
@@ -83,7 +84,7 @@ def train(
                 on_progress(Progress(run.update, settings.updates, run.latest, left))
     metrics = measure(task, run.best, settings.evaluation_starts, seed)
     metrics["wall_time_s"] = round(run.elapsed + time.monotonic() - began, 1)
-    card = make_card(task, "dqn", options_of(settings), seed, metrics, spec)
+    card = make_card(task, "dqn", options_to_json(settings), seed, metrics, spec)
     return Policy(task, card, make_network(run.best, run.inputs, run.outputs))
 
 
@@ -252,7 +253,7 @@ class _Run:
             for name in ("exp_avg", "exp_avg_sq", "step"):
                 arrays[f"adam.{i}.{name}"] = state[name].detach().cpu().numpy().reshape(-1)
         meta = {
-            "task": self.task.content_hash, "settings": options_of(self.settings), "update": self.update,
+            "task": self.task.content_hash, "settings": options_to_json(self.settings), "update": self.update,
             "elapsed": self.elapsed + time.monotonic() - self.began, "latest": self.latest,
             "best_rate": self.best_rate, "random": self.random.bit_generator.state,
         }  # fmt: skip
@@ -268,7 +269,7 @@ class _Run:
             return
         with safe_open(path, framework="numpy") as opened:
             meta = json.loads(opened.metadata()["meta"])
-        if (meta["task"], meta["settings"]) != (self.task.content_hash, options_of(self.settings)):
+        if (meta["task"], meta["settings"]) != (self.task.content_hash, options_to_json(self.settings)):
             return
         arrays = load_file(path)
         self.q_network.set_weights({n: arrays[f"q.{n}"] for n in NAMES})

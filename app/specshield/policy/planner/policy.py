@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -31,10 +31,12 @@ from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
 from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
+from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to, values_at
 from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
+from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
 from specshield.policy.tensors import read_tensors
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turns_in_place
@@ -52,34 +54,6 @@ MAX_FIELDS = 32
 USUAL = 150
 BAND = 6.0  # [steps] how far the fields may err; without a turn in place, a lattice has few of the ways
 STARTS = 50  # poses that a new policy is tried from
-
-
-@dataclass(frozen=True)
-class Settings:
-    """pitch: of the lattice [m]. effort: what one plan may cost [about us], a decision 2 to 3 times that.
-
-    Over USUAL steps of horizon it grows with the horizon's square: a way has more legs, and each costs more.
-    """
-
-    pitch: float = 0.1
-    effort: float = 10_000.0
-
-
-def read_settings(options: Mapping[str, Any]) -> Settings:
-    """Settings from JSON. Raises PolicyError with the path of the option at fault."""
-    limits = {"pitch": (0.02, 1.0), "effort": (100.0, 1e7)}
-    for name, value in options.items():
-        if name not in limits:
-            raise PolicyError(
-                f"unknown option {name!r}", path=f"options.{name}", got=name,
-                expected=f"one of {sorted(limits)}",
-            )  # fmt: skip
-        low, high = limits[name]
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-            raise PolicyError(
-                "not in range", path=f"options.{name}", got=value, expected=f"from {low:g} to {high:g}"
-            )
-    return Settings(**{name: float(value) for name, value in options.items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,13 +199,13 @@ def synthesise(
         "size_bytes": int(code.nbytes + cell.nbytes),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
-    card = make_card(task, "planner", asdict(settings), 0, metrics, spec)
+    card = make_card(task, "planner", options_to_json(settings), 0, metrics, spec)
     return PlannerPolicy(task, card, settings, fields, chosen)
 
 
 def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
-    settings = read_settings(card.get("options", {}))
+    settings = read_options(Settings, card.get("options", {}))
     _, literals = literals_of(task, task.formula)
     tensors = read_tensors(weights)
     wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "chosen": (np.int32, 2)}

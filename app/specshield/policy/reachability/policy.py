@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,9 @@ from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
 from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import heading_count, holds_at, make_lattice
+from specshield.policy.options import options_to_json, read_options
 from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
+from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.search import propose_all
 from specshield.policy.reachability.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
 from specshield.policy.reachability.tables import INVALID, SCALE, Tables
@@ -35,41 +37,6 @@ from specshield.task import Task
 
 MAX_ENTRIES = 100_000_000  # 400 MB while the tables are made
 FINE_ENTRIES = 1_000_000  # a lattice three times finer that needs no more is used instead
-
-
-@dataclass(frozen=True)
-class Settings:
-    """pitch: of the lattice [m], a third of it where the map is small. beam: how many poses the search near a
-    deadline keeps for each motion.
-    """
-
-    pitch: float = 0.1
-    beam: int = 12
-
-
-def read_settings(options: Mapping[str, Any]) -> Settings:
-    """Settings from JSON. Raises PolicyError with the path of the option at fault."""
-    limits = {"pitch": (0.02, 1.0), "beam": (1, 256)}
-    for name, value in options.items():
-        if name not in limits:
-            raise PolicyError(
-                f"unknown option {name!r}",
-                path=f"options.{name}",
-                got=name,
-                expected=f"one of {sorted(limits)}",
-            )
-        low, high = limits[name]
-        whole = name == "beam"
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int if whole else (int, float))
-            or not low <= value <= high
-        ):
-            raise PolicyError(
-                "not in range", path=f"options.{name}", got=value,
-                expected=f"a {'whole ' if whole else ''}number from {low:g} to {high:g}",
-            )  # fmt: skip
-    return Settings(**options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,13 +107,13 @@ def synthesise(
         "size_bytes": int(size),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
-    card = make_card(task, "reachability", asdict(settings), 0, metrics, spec)
+    card = make_card(task, "reachability", options_to_json(settings), 0, metrics, spec)
     return ReachabilityPolicy(task, card, settings, tables)
 
 
 def load_reachability(weights: bytes | Path, card: Card, task: Task) -> ReachabilityPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
-    settings = read_settings(card.get("options", {}))
+    settings = read_options(Settings, card.get("options", {}))
     rules = make_rules(task)
     goals, pitch = _goals(task, rules, settings)
     tensors, (shape, headings) = read_tensors(weights), _shape(task, pitch)

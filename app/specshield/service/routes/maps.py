@@ -8,21 +8,41 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import TypeAdapter
 
-from specshield.errors import MapError
-from specshield.service import examples
 from specshield.service.library.maps import Map
 from specshield.service.routes import uploads
-from specshield.service.schemas import GridMap, HouseMap, Id, MapList, MapResponse, MapUpload
+from specshield.service.schemas.base import Id
+from specshield.service.schemas.maps import MapList, MapResponse
 from specshield.service.state import Cursor, Limit, Server, ServerState, problems
-from specshield.world.map_server import from_occupancy_grid, load_map
-from specshield.world.procthor import load_house
+from specshield.world.formats import FORMATS, read_map
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
-MODELS = (HouseMap, GridMap)  # documented by hand
-UPLOAD: TypeAdapter[HouseMap | GridMap] = TypeAdapter(MapUpload)
+FILES = "map_server"  # the format of a map sent as files that do not say which it is
+BODY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 MapId = Annotated[
     Id, Path(description="Id or name of a map.", openapi_examples={"case1": {"value": "case1"}})
 ]
+
+
+def _described() -> dict[str, Any]:
+    """The body of `create` in OpenAPI: one schema for each format that is installed."""
+    schemas: dict[bool, list[dict[str, Any]]] = {True: [], False: []}
+    examples: dict[str, Any] = {}
+    for name, format in FORMATS.usable():
+        kind = {"type": "string", "format": "binary"} if format.files else {}
+        properties: dict[str, Any] = {member: {**kind, **told} for member, told in format.members.items()}
+        required = format.required
+        if name != FILES:
+            properties["format"], required = {"const": name}, [*required, "format"]
+        about = {"title": name, "description": format.about, "required": required}
+        schemas[format.files].append({"type": "object", **about, "properties": properties})
+        if format.example is not None and not format.files:
+            examples[name] = {"value": {"format": name, **format.example}}
+    content = {
+        "application/json": {"schema": {"oneOf": schemas[False]}, "examples": examples},
+        "multipart/form-data": {"schema": {"oneOf": schemas[True]}},
+    }
+    said = "A map in one of these formats: as JSON, where `format` says which it is, or as files."
+    return {"requestBody": {"required": True, "description": said, "content": content}}
 
 
 @router.post(
@@ -31,40 +51,28 @@ MapId = Annotated[
     response_model=MapResponse,
     summary="Send a map",
     responses=problems(_429="The server keeps no more maps."),
-    openapi_extra=uploads.request_body(
-        "A map_server map as two files, or JSON: a ProcTHOR house or a nav_msgs/OccupancyGrid.",
-        UPLOAD,
-        examples.GRID_MAP,
-        {"metadata": "The map_server YAML; its `image:` is ignored.", "image": "The image: PGM or PNG."},
-    ),
+    openapi_extra=_described(),
 )
 async def create(request: Request, server: ServerState) -> Any:
     """Maps are immutable and known by the hash of their content: the same map again is the one there is.
 
-    Outside the map everything is occupied, and so is what is unknown. In a ProcTHOR house map (x, y) is the
-    house's (x, z), theta = pi/2 - yaw, and its rooms become names for formulas.
+    Outside the map everything is occupied, and so is what is unknown. Rooms become names for formulas.
     """
     if uploads.is_multipart(request):
-        metadata, image = await uploads.parts(request, "metadata", "image")
-        return (await asyncio.to_thread(_from_files, server, metadata, image)).to_json()
-    return (await asyncio.to_thread(_from_json, server, await request.body())).to_json()
+        files = await uploads.files(request)
+        name = files.pop("format", FILES.encode()).decode(errors="replace")
+        return (await asyncio.to_thread(_add, server, name, files, True)).to_json()
+    body = await request.body()
+
+    def read() -> Map:
+        members = uploads.parse(BODY, body)
+        return _add(server, members.pop("format", None), members, False)
+
+    return (await asyncio.to_thread(read)).to_json()
 
 
-def _from_files(server: Server, metadata: bytes, image: bytes) -> Map:
-    try:
-        text = metadata.decode()
-    except UnicodeDecodeError as error:
-        raise MapError(
-            "the metadata is not text", path="metadata", got=str(error), expected="YAML in UTF-8"
-        ) from None
-    return server.maps.add(load_map(text, image), {})
-
-
-def _from_json(server: Server, content: bytes) -> Map:
-    body = uploads.parse(UPLOAD, content)
-    if isinstance(body, HouseMap):
-        return server.maps.add(*load_house(body.house, body.asset_sizes, body.resolution))
-    return server.maps.add(from_occupancy_grid(body.info, body.data), {})
+def _add(server: Server, name: Any, members: dict[str, Any], files: bool) -> Map:
+    return server.maps.add(*read_map(name, members, files))
 
 
 @router.get("", response_model=MapList, summary="List the maps", responses=problems())

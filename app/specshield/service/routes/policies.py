@@ -8,19 +8,22 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import TypeAdapter
 
-from specshield.errors import FragmentError, InUse, TrainingUnavailable
+from specshield.errors import FragmentError, InputError, InUse, TrainingUnavailable
+from specshield.policy.methods import METHODS
+from specshield.policy.options import options_to_json, read_options
 from specshield.service import examples
 from specshield.service.library.policies import Description, Record, describe
 from specshield.service.routes import uploads
-from specshield.service.schemas import Card, Id, PolicyList, PolicyRequest, PolicyResponse
+from specshield.service.schemas.base import Id
+from specshield.service.schemas.policies import Card, PolicyList, PolicyRequest, PolicyResponse
 from specshield.service.state import Cursor, Limit, Server, ServerState, problems
-from specshield.service.training import methods
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
 MODELS = (PolicyRequest,)  # documented by hand
 REQUEST = TypeAdapter(PolicyRequest)
 CARD = TypeAdapter(Card)
+PARTS = {"weights": "policy.safetensors", "card": "card.json"}
 PolicyId = Annotated[
     Id, Path(description="Id or name of a policy.", openapi_examples={"case1": {"value": "case1"}})
 ]
@@ -36,24 +39,43 @@ PolicyId = Annotated[
         _429="The server keeps no more policies.",
         _503="`training-unavailable`: no worker is there to train; or the store is away.",
     ),
-    openapi_extra=uploads.request_body(
-        "What to train, as JSON; or a policy trained elsewhere, as two files.",
-        REQUEST,
-        examples.POLICY,
-        {"weights": "policy.safetensors", "card": "card.json"},
-    ),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "description": "What to make, as JSON; or a policy that was made elsewhere, as two files.",
+            "content": {
+                "application/json": {
+                    "schema": {"$ref": "#/components/schemas/PolicyRequest"},
+                    "example": examples.POLICY,
+                },
+                "multipart/form-data": {
+                    "schema": {
+                        "type": "object",
+                        "required": list(PARTS),
+                        "properties": {
+                            name: {"type": "string", "format": "binary", "description": file}
+                            for name, file in PARTS.items()
+                        },
+                    }
+                },
+            },
+        }
+    },
 )
 async def create(request: Request, server: ServerState) -> Any:
-    """Training takes minutes: read the policy to see how far it is.
+    """The answer comes at once; making the policy takes seconds to minutes: read it to see how far it is.
 
     Policies are immutable and known by the hash of task, method, options and seed: the same request again
-    answers the policy there is, and queues it once more if it failed. `reachability` computes, in seconds,
-    and `dqn` learns, in minutes, for conjunctions of `F[a,b]`, `G[a,b]` and `F[a,c] G[d,b]` over boolean
-    combinations of predicates; `planner` is made in seconds for any formula, and plans at every decision.
+    answers the policy there is, and queues it once more if it failed.
     """
     if uploads.is_multipart(request):
-        weights, card = await uploads.parts(request, "weights", "card")
-        return _show(server, await asyncio.to_thread(_add, server, weights, card))
+        files = await uploads.files(request)
+        if files.keys() != PARTS.keys():
+            expected = " and ".join(PARTS)
+            raise InputError(
+                "these are not a policy's parts", path="body", got=sorted(files), expected=expected
+            )
+        return _show(server, await asyncio.to_thread(_add, server, files["weights"], files["card"]))
     return await asyncio.to_thread(_ask, server, await request.body())
 
 
@@ -65,22 +87,27 @@ def _add(server: Server, weights: bytes, content: bytes) -> Record:
 def _ask(server: Server, content: bytes) -> dict[str, Any]:
     body = uploads.parse(REQUEST, content).model_dump(exclude_unset=True)
     asked = PolicyRequest(**body)
-    options = methods.complete(asked.method, asked.options)
-    robot = body.get("robot", "stretch")
-    about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, options)
+    method = METHODS.get(asked.method)
+    options = read_options(method.options, asked.options)
+    robot, settings = body.get("robot", "stretch"), options_to_json(options)
+    about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, settings)
     about = server.policies.resolve(about)
     task = server.policies.task(about)
     try:
-        methods.check(asked.method, task, options)
+        method.check(task, options)
     except FragmentError as error:
         raise (error if error.path == "robot" else error.at("spec.formula")) from None
     record = server.policies.find(about, task)
     if record is not None and _training(server, record).status != "failed":
         return _show(server, record)
-    here = server.worker is not None and asked.method in methods.available()
-    if not (here or server.jobs.worker_there(asked.method)):
+    own = [] if server.worker is None else server.worker.methods
+    if asked.method not in own and not server.jobs.worker_there(asked.method):
+        needs = f" where {' and '.join(method.needs)} is installed" if method.needs else ""
         raise TrainingUnavailable(
-            f"no worker is there that makes policies by {asked.method}; start one with `specshield worker`"
+            f"no worker is running that makes policies by {asked.method}",
+            path="method",
+            got=asked.method,
+            expected=f"a worker: start one with `specshield worker`{needs}, then ask again",
         )
     record = record or server.policies.add(about, task)
     server.jobs.start(record.id, asked.method)

@@ -9,13 +9,11 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from specshield.service import examples, metrics
-from specshield.service.schemas import (
+from specshield.service.schemas.base import Id
+from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse
+from specshield.service.schemas.steps import (
     CloseRequest,
     CloseResponse,
-    Id,
-    SessionList,
-    SessionRequest,
-    SessionResponse,
     StepRequest,
     StepResponse,
     Trajectory,

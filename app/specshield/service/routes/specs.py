@@ -7,7 +7,7 @@ import asyncio
 from fastapi import APIRouter
 
 from specshield.errors import FormulaError
-from specshield.service.schemas import SpecRequest, SpecResponse
+from specshield.service.schemas.specs import SpecRequest, SpecResponse
 from specshield.service.state import ServerState, problems
 from specshield.stl import parse
 from specshield.task import POSE_NAMES, parse_regions, parse_signals

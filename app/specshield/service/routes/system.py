@@ -6,7 +6,7 @@ from fastapi import APIRouter, Response
 
 from specshield.errors import StoreError
 from specshield.service import metrics
-from specshield.service.schemas import Health
+from specshield.service.schemas.base import Health
 from specshield.service.state import ServerState, problems
 
 router = APIRouter(tags=["system"])

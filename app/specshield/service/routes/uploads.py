@@ -12,25 +12,25 @@ from specshield.errors import InputError
 from specshield.service.problems import from_validation
 
 T = TypeVar("T")
+MOST_PARTS = 16  # of a multipart body
 
 
 def is_multipart(request: Request) -> bool:
     return request.headers.get("content-type", "").lower().startswith("multipart/form-data")
 
 
-async def parts(request: Request, *names: str) -> list[bytes]:
-    """The parts of a multipart body, which has to have these and no others."""
-    async with request.form(max_files=len(names), max_fields=len(names)) as form:
-        found = {name: form.getlist(name) for name in form}
-        if sorted(found) != sorted(names) or any(len(values) != 1 for values in found.values()):
+async def files(request: Request) -> dict[str, bytes]:
+    """The parts of a multipart body by name. Raises InputError where two have one name."""
+    async with request.form(max_files=MOST_PARTS, max_fields=MOST_PARTS) as form:
+        names = [name for name, _ in form.multi_items()]
+        if len(set(names)) < len(names):
             raise InputError(
-                "the parts are not the ones expected",
-                path="body",
-                got=sorted(found),
-                expected=" and ".join(names),
+                "two parts have one name", path="body", got=sorted(names), expected="each part once"
             )
-        values = [found[name][0] for name in names]
-        return [await value.read() if isinstance(value, UploadFile) else value.encode() for value in values]
+        return {
+            name: await part.read() if isinstance(part, UploadFile) else part.encode()
+            for name, part in form.items()
+        }
 
 
 def parse(adapter: TypeAdapter[T], content: bytes, below: str = "") -> T:
@@ -47,25 +47,3 @@ def _body(content: bytes) -> Any:
         return TypeAdapter(Any).validate_json(content)
     except ValidationError:
         return None
-
-
-def request_body(
-    required: str, json: TypeAdapter[Any], example: Any, files: dict[str, str]
-) -> dict[str, Any]:
-    """OpenAPI of such a body. files: what each part holds."""
-    properties = {
-        name: {"type": "string", "format": "binary", "description": text} for name, text in files.items()
-    }
-    multipart = {"schema": {"type": "object", "required": list(files), "properties": properties}}
-    schema = json.json_schema(ref_template="#/components/schemas/{model}")
-    schema.pop("$defs", None)
-    return {
-        "requestBody": {
-            "required": True,
-            "description": required,
-            "content": {
-                "application/json": {"schema": schema, "example": example},
-                "multipart/form-data": multipart,
-            },
-        }
-    }

@@ -1,1 +1,1 @@
-"""Policies in the making: jobs, workers, methods."""
+"""Policies in the making: jobs and workers."""

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from specshield.errors import SpecshieldError
+from specshield.policy.methods import available
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 
@@ -20,14 +21,18 @@ log = logging.getLogger("specshield")
 
 
 class TrainingWorker:
-    """At most one a data folder, however many servers there are: it holds a lock while it lives."""
+    """At most one a data folder, however many servers there are: it holds a lock while it lives.
+
+    methods: those that the worker makes policies by; none where it is another server's.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        self.methods: list[str] = []
         self._process: subprocess.Popen[bytes] | None = None
 
     def ensure(self) -> None:
-        """Start it, unless it runs here or beside another process."""
+        """Start the worker, unless it runs already: as this process's child or as another server's."""
         if self._process is not None:
             if self._process.poll() is None:
                 return
@@ -43,6 +48,7 @@ class TrainingWorker:
                 pass_fds=[lock],
                 start_new_session=True,
             )
+            self.methods = available()
         except BlockingIOError:
             pass
         finally:

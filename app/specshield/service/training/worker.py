@@ -17,10 +17,11 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from specshield.errors import SpecshieldError, StoreError
+from specshield.policy.methods import METHODS, Run, available, missing
+from specshield.policy.options import read_options
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
-from specshield.service.training import methods
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, queue_of
 
 log = logging.getLogger("specshield")
@@ -40,16 +41,23 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = ()) -> No
     jobs = Jobs(url, settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
-    with _regularly(lambda: jobs.worker_lives(methods.available())):
-        _Worker(url, jobs, others).work(logging_level="WARNING")
-    raise StoreError("the worker cannot go on; what rq has logged says why", expected="a store that answers")
+    methods = available()  # what is installed later is made by the next worker, whose queues include it
+    lacking = {name: missing(method) for name, method in METHODS.usable() if name not in methods}
+    for name, modules in lacking.items():
+        log.warning("this worker makes no policies by %s: %s is not installed", name, " and ".join(modules))
+    with _regularly(lambda: jobs.worker_lives(methods)):
+        _Worker(url, jobs, methods, others).work(logging_level="WARNING")
+    raise StoreError(
+        "the worker lost the store and cannot go on; rq's last lines in the log say why",
+        expected="a store that answers",
+    )
 
 
 class _Worker(Worker):
     """rq's worker, which on SIGTERM ends the run at once: what it has learned is in its checkpoint."""
 
-    def __init__(self, url: str, jobs: Jobs, others: Sequence[str]) -> None:
-        self._training = [queue_of(method) for method in methods.available()]
+    def __init__(self, url: str, jobs: Jobs, methods: Sequence[str], others: Sequence[str]) -> None:
+        self._training = [queue_of(method) for method in methods]
         super().__init__(
             [*self._training, *others],
             # Not that of `jobs`: rq waits for work longer than any answer of the store may take, and sets the
@@ -95,7 +103,7 @@ class _Worker(Worker):
 
 
 def train(id: str, attempt: str) -> None:
-    """One run, in a process of its own. Whatever ends it is said in the policy's `error`."""
+    """One run, in a process of its own. The policy's `error` says why a run failed, whatever the reason."""
     follow_parent()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     settings = Settings()
@@ -132,19 +140,12 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: thr
     policies = Policies(settings, Maps(settings))
     about = policies.record(id).about
 
-    def on_progress(done: float, eta_s: float) -> None:
-        jobs.report(id, attempt, progress=round(done, 4), eta_s=round(eta_s, 1))
+    def on_progress(done: float, seconds_left: float, said: str) -> None:
+        jobs.report(id, attempt, progress=round(done, 4), eta_s=round(seconds_left, 1))
 
-    policy = methods.make(
-        about.method,
-        policies.task(about),
-        about.options,
-        about.seed,
-        about.spec,
-        policies.checkpoints(id),
-        on_progress,
-        cancelled.is_set,
-    )
+    method = METHODS.get(about.method)
+    run = Run(about.seed, about.spec, policies.checkpoints(id), on_progress, cancelled.is_set)
+    policy = method.make(policies.task(about), read_options(method.options, about.options), run)
     policies.finish(id, policy.weights(), {**policy.card, "map_id": about.map_id, "seed": about.seed})
 
 

@@ -1,0 +1,234 @@
+"""What can be asked of the service, one generator a call (core.py). The shells perform them: sync.py as they
+are here, aio.py with `await`.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+from specshield.client.core import Flow, Wait, call, deliver, erase
+from specshield.client.models import Map, Policy, SessionInfo, Spec, build
+from specshield.client.wire import (
+    Content,
+    Numbers,
+    Request,
+    check,
+    content,
+    encode,
+    get,
+    json_object,
+    path,
+    pose_values,
+    post,
+)
+from specshield.errors import InputError, SessionExists, StoreError, TransportError, TransportTimeout
+
+
+def validate(
+    formula: str,
+    regions: Mapping[str, Any] | None = None,
+    *,
+    signals: Mapping[str, float] | None = None,
+    map_id: str | None = None,
+) -> Flow[Spec]:
+    """Parse a formula; FormulaError says where it is wrong.
+
+    Once regions, signals or a map (whose rooms are names) are given, every name must be one of theirs.
+    """
+    optional = {"regions": regions, "signals": signals, "map_id": map_id}
+    body = {"formula": formula, **{name: value for name, value in optional.items() if value is not None}}
+    return build(Spec, (yield from call(post("specs", "validate", body=body))))
+
+
+def create_map(format: str, **members: Any) -> Flow[Map]:
+    """Send a map in any format that the server has (its /docs lists them), by the format's own members.
+
+    A member that is bytes or the path object of a file makes all of them go as files, as `map_server` wants.
+    """
+    if not any(isinstance(member, bytes | os.PathLike) for member in members.values()):
+        return build(Map, (yield from call(post("maps", body={"format": format, **members}, slow=True))))
+    parts = {name: content(member, name) for name, member in {"format": format, **members}.items()}
+    files = {name: (name, part, "application/octet-stream") for name, part in parts.items()}
+    return build(Map, (yield from call(Request("POST", path("maps"), files=files, slow=True))))
+
+
+def upload_map(metadata: Content, image: Content) -> Flow[Map]:
+    """A ROS map_server map: YAML and PGM or PNG, each its content or the path object of a file."""
+    read = {"metadata": content(metadata, "metadata"), "image": content(image, "image")}
+    return (yield from create_map("map_server", **read))
+
+
+def procthor_map(
+    house: Mapping[str, Any], asset_sizes: Mapping[str, Any], resolution: float = 0.05
+) -> Flow[Map]:
+    """A ProcTHOR house, drawn at `resolution` [m]; map (x, y) is house (x, z)."""
+    return (yield from create_map("procthor", house=house, asset_sizes=asset_sizes, resolution=resolution))
+
+
+def occupancy_grid_map(info: Mapping[str, Any], data: Sequence[int]) -> Flow[Map]:
+    """A nav_msgs/OccupancyGrid: its `info`, and `data` row by row from the lowest y."""
+    return (yield from create_map("occupancy_grid", info=info, data=data))
+
+
+def get_map(id: str) -> Flow[Map]:
+    """A map by its id, or by its name if it came with the server."""
+    return build(Map, (yield from call(get("maps", id))))
+
+
+def map_image(id: str) -> Flow[bytes]:
+    """The map as PNG: white is free, black occupied."""
+    delivery = yield from deliver(get("maps", id, "image.png", slow=True))
+    check(delivery.reply)
+    return delivery.reply.content
+
+
+def create_policy(
+    map_id: str,
+    formula: str,
+    regions: Mapping[str, Any] | None = None,
+    *,
+    signals: Mapping[str, float] | None = None,
+    robot: str | Mapping[str, Any] = "stretch",
+    method: str = "reachability",
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+) -> Flow[Policy]:
+    """Have a policy made; returns at once (see `wait`). The same request again is the same policy.
+
+    `signals` names the other signals of the formula, with the value each holds before its first sample. The
+    server's /docs lists the methods that it has and the options of each.
+    """
+    body = {
+        "map_id": map_id,
+        "robot": robot,
+        "spec": {"formula": formula, "regions": regions or {}, "signals": signals or {}},
+        "method": method,
+        "seed": seed,
+        "options": options or {},
+    }
+    return build(Policy, (yield from call(post("policies", body=body, slow=True))))
+
+
+def upload_policy(weights: Content, card: Content | Mapping[str, Any]) -> Flow[Policy]:
+    """A policy made elsewhere: safetensors and its card, each the content or a path object."""
+    told = encode(card) if isinstance(card, Mapping) else content(card, "card")
+    files = {
+        "weights": ("policy.safetensors", content(weights, "weights"), "application/octet-stream"),
+        "card": ("card.json", told, "application/json"),
+    }
+    return build(Policy, (yield from call(Request("POST", path("policies"), files=files, slow=True))))
+
+
+def get_policy(id: str) -> Flow[Policy]:
+    """A policy by its id, or by its name if it came with the server: how far it is, what was measured."""
+    return build(Policy, (yield from call(get("policies", id))))
+
+
+def delete_policy(id: str) -> Flow[None]:
+    """Cancel its training, or remove it. InUse while sessions use it.
+
+    Sent once: the first DELETE cancels a training, a second one would remove what is left of it.
+    """
+    return (yield from erase(Request("DELETE", path("policies", id), tries=1)))
+
+
+def wait_policy(
+    id: str,
+    *,
+    timeout: float = 3600.0,
+    interval: float = 1.0,
+    progress: Callable[[Policy], object] | None = None,
+) -> Flow[Policy]:
+    """Ask every `interval` [s] until it is `ready` or `failed`; `progress` sees every answer.
+
+    A server that goes away for a while is waited for, once it has answered. Raises TransportTimeout after
+    `timeout` [s]; the training goes on.
+    """
+    seconds, policy = 0.0, None
+    while True:
+        try:
+            delivery = yield from deliver(get("policies", id))
+            seconds += delivery.seconds
+            policy = build(Policy, json_object(delivery.reply))
+        except (TransportError, StoreError) as error:
+            if policy is None:
+                raise
+            seconds += error.details.get("seconds", 0.0)
+        else:
+            if progress is not None:
+                progress(policy)
+            if policy.status in ("ready", "failed"):
+                return policy
+        if seconds + interval > timeout:
+            raise TransportTimeout(
+                f"policy {id} is {policy.status} ({policy.progress:.0%}) after {seconds:.0f} s", policy=policy
+            )
+        yield Wait(interval)
+        seconds += interval
+
+
+def create_session(
+    *,
+    initial_pose: Numbers,
+    policy_id: str | None = None,
+    policy_ids: Sequence[str] | None = None,
+    id: str | None = None,
+    seed: int = 0,
+    threshold: float = 1.0,
+    margin: float = 0.0,
+    slack: int = 0,
+    evaluation: Literal["feasibility", "robustness"] = "feasibility",
+    shaping: str = "projection",
+    max_steps: int | None = None,
+    allow_infeasible: bool = False,
+) -> Flow[SessionInfo]:
+    """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
+
+    `threshold` is delta; the guarantee is for 1 with evaluation "feasibility", the defaults. With
+    "robustness" it is the mean robustness [m] asked for, of which 1 is often too much. `margin` and
+    `slack` are the robustness [m] and the steps to keep in hand. `shaping` is "projection" or one of the
+    preferences that the server's /docs lists.
+    Raises InfeasibleStart where no action has a satisfying future, unless `allow_infeasible`.
+    """
+    if (policy_id is None) == (policy_ids is None):
+        raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
+    key = str(uuid.uuid4()) if id is None else id
+    body: dict[str, Any] = {
+        "id": key,
+        "initial_pose": pose_values(initial_pose, "initial_pose"),
+        "seed": seed,
+        "threshold": threshold,
+        "margin": margin,
+        "slack": slack,
+        "evaluation": evaluation,
+        "shaping": shaping,
+        "allow_infeasible": allow_infeasible,
+    }
+    body.update({"policy_id": policy_id} if policy_ids is None else {"policy_ids": list(policy_ids)})
+    body.update({} if max_steps is None else {"max_steps": max_steps})
+    delivery = yield from deliver(post("sessions", body=body, slow=True))
+    try:
+        return build(SessionInfo, json_object(delivery.reply))
+    except SessionExists:  # after a lost answer of our own it is this very session, which is read back
+        if delivery.tries == 1:
+            raise
+        info = yield from get_session(key)
+        if id is not None and info.next_t > 0:  # the caller's id was in use before
+            raise
+        return info
+
+
+def get_session(id: str) -> Flow[SessionInfo]:
+    """A session begun earlier, ready for its next step.
+
+    If the last action run was a terminal one, say `main_task_done=True` there: only the caller knows.
+    """
+    return build(SessionInfo, (yield from call(get("sessions", id))))
+
+
+def delete_session(id: str) -> Flow[None]:
+    """Erase it with its trajectory."""
+    return (yield from erase(Request("DELETE", path("sessions", id))))

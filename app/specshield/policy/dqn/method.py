@@ -1,0 +1,79 @@
+"""Deep Q-learning as one of the methods: its options, and where its parts are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from specshield.policy.methods import Made, Method, Run
+from specshield.policy.options import option
+
+if TYPE_CHECKING:
+    from specshield.policy.card import Card
+    from specshield.policy.dqn.policy import Proposer
+    from specshield.task import Task
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a caller may choose."""
+
+    reward: str = option(
+        "progress", "The funnels' reward: as the paper has it, or for progress towards what is next.",
+        choices=("progress", "paper"),
+    )  # fmt: skip
+    units: int = option(64, "Width of the network's two hidden layers.", low=4, high=128)
+    updates: int = option(16_000, "Steps of learning.", low=1, high=1_000_000)
+    robots: int = option(512, "Robots that are simulated side by side.", low=1, high=4096)
+    batch: int = option(1024, "Transitions an update learns from.", low=1, high=65536)
+    learning_rate: float = option(1e-3, "Adam's, falling to 2 % of it.", low=1e-7, high=1.0)
+    discount: float = option(0.98, "Of the reward, for each step.", low=0.0, high=1.0)
+    returns: int = option(5, "Steps of an n-step return.", low=1, high=64)
+    polyak: float = option(
+        0.02, "How far the target network moves to the network, an update.", low=1e-6, high=1.0
+    )
+    replay: int = option(1_000_000, "Transitions kept to learn from.", low=1000, high=4_000_000)
+    exploration: tuple[float, float] = option(
+        (0.5, 0.008), "Chance of a random motion, of the boldest and of the most careful robot.", high=1.0
+    )
+    gap: float = option(
+        0.6, "Share of an action's loss against the best one that is taken off its target.", high=1.0
+    )
+    evaluate_every: int = option(
+        1000, "Updates between two measurements; each also saves a checkpoint.", low=1, high=1_000_000
+    )
+    evaluation_starts: int = option(1000, "Starts of a measurement.", low=1, high=100_000)
+
+
+def _check(task: Task, options: Settings) -> None:
+    from specshield.rule.progress import make_rules
+
+    make_rules(task)
+
+
+def _make(task: Task, options: Settings, run: Run) -> Made:
+    from specshield.policy.dqn.train import Progress, train
+
+    def report(progress: Progress) -> None:
+        rate = "not measured yet" if progress.satisfied is None else f"satisfied {progress.satisfied:.1%}"
+        said = f"update {progress.update} of {progress.updates}, {rate}"
+        run.on_progress(progress.update / progress.updates, progress.eta_s, said)
+
+    return train(task, options, run.seed, report, run.checkpoints, run.should_stop, run.spec)
+
+
+def _load(weights: bytes | Path, card: Card, task: Task) -> Proposer:
+    from specshield.policy.dqn.policy import load_dqn
+
+    return load_dqn(weights, card, task)
+
+
+METHOD = Method(
+    "Learned in minutes by deep Q-learning, as in the paper. For the formulas that `reachability` takes.",
+    Settings,
+    _check,
+    _make,
+    _load,
+    needs=("torch",),
+)

@@ -1,0 +1,56 @@
+"""The planner as one of the methods: its options, and where its parts are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from specshield.policy.methods import Made, Method, Run
+from specshield.policy.options import option
+
+if TYPE_CHECKING:
+    from specshield.policy.card import Card
+    from specshield.policy.dqn.policy import Proposer
+    from specshield.task import Task
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a caller may choose."""
+
+    pitch: float = option(0.1, "Side of a cell of the lattice [m].", low=0.02, high=1.0)
+    effort: float = option(
+        10_000.0,
+        "What one plan may cost [about us]; a decision costs 2 to 3 times that. Over 150 steps of horizon it "
+        "grows with the horizon's square: a way has more legs, and each costs more.",
+        low=100.0,
+        high=1e7,
+    )
+
+
+def _check(task: Task, options: Settings) -> None:
+    from specshield.policy.planner import policy
+
+    policy.check(task, options)
+
+
+def _make(task: Task, options: Settings, run: Run) -> Made:
+    from specshield.policy.planner import policy
+
+    return policy.synthesise(task, options, run.spec)
+
+
+def _load(weights: bytes | Path, card: Card, task: Task) -> Proposer:
+    from specshield.policy.planner import policy
+
+    return policy.load_planner(weights, card, task)
+
+
+METHOD = Method(
+    "Made in seconds for any formula; it searches for a plan at every decision, which then takes longer.",
+    Settings,
+    _check,
+    _make,
+    _load,
+)

@@ -1,0 +1,57 @@
+"""What every schema shares, and problems. Metres, radians counter-clockwise, map frame (REP-103)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from specshield.service import examples
+
+SpecStatus = Literal["pending", "satisfied", "violated"]
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
+Pose = Annotated[
+    list[Coordinate], Field(min_length=3, max_length=3, description="[x, y, theta]: [m, m, rad], map frame.")
+]
+Point = Annotated[
+    list[Coordinate], Field(min_length=2, max_length=2, description="[x, y] in metres, map frame.")
+]
+Name = Annotated[str, Field(min_length=1, max_length=64)]
+
+
+class Strict(BaseModel):
+    """Requests: no unknown fields, no conversions, no NaN or infinity."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, protected_namespaces=())
+
+
+class Answer(BaseModel):
+    model_config = ConfigDict(protected_namespaces=())
+
+
+class FieldError(Answer):
+    path: str = Field(description="The field: `poses[0][2]`.")
+    got: JsonValue = Field(None, description="What it held, shortened.")
+    expected: str = Field(description="What is valid.")
+
+
+class Problem(Answer):
+    """An error, as RFC 9457 has it. Other members may follow, such as `position` or `expected_t`."""
+
+    model_config = ConfigDict(extra="allow", json_schema_extra={"examples": [examples.PROBLEM]})
+
+    type: str = Field(description="A stable word to branch on, such as `history-gap`.")
+    title: str = Field(description="The word, readable.")
+    status: int = Field(description="The HTTP status.")
+    detail: str = Field(description="What was wrong, for a person.")
+    path: str | None = Field(None, description="The field at fault.")
+    got: JsonValue = Field(None, description="What the field held, shortened.")
+    expected: str | None = Field(None, description="What is valid there.")
+    errors: list[FieldError] | None = Field(
+        None, description="Every field that failed, where there are several."
+    )
+
+
+class Health(Answer):
+    status: Literal["ok"]

@@ -1,0 +1,94 @@
+"""Sessions: how they begin, and how they stand."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ConfigDict, Field, JsonValue, model_validator
+
+from specshield.service import examples
+from specshield.service.schemas.base import Answer, Id, Pose, SpecStatus, Strict
+
+
+class SessionRequest(Strict):
+    model_config = ConfigDict(json_schema_extra={"examples": [examples.SESSION]})
+
+    policy_id: Id | None = Field(None, description="Id or name of the policy.")
+    policy_ids: list[Id] | None = Field(
+        None,
+        min_length=1,
+        max_length=8,
+        description="Several policies for one task: an action is feasible if any says so.",
+    )
+    initial_pose: Pose = Field(description="x_0: [m, m, rad], map frame; inside the map and free.")
+    id: Id | None = Field(None, description="An id of your own; the server makes one up otherwise.")
+    seed: int = Field(0, ge=0, lt=2**63, description="`action` is drawn from the seed and t.")
+    threshold: float = Field(
+        1.0,
+        gt=0.0,
+        description="delta, the least expected J of a step. The guarantee is for 1 with evaluation "
+        "`feasibility`: 0.99^150 is 0.22. With `robustness` it is in metres and guarantees nothing.",
+    )
+    margin: float = Field(
+        0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
+    )
+    slack: int = Field(
+        0,
+        ge=0,
+        le=1000,
+        description="Steps to keep in hand: each F of the conjunction is met so much earlier, if it can be.",
+    )
+    evaluation: Literal["feasibility", "robustness"] = Field(
+        "feasibility",
+        description="What J is: 1 or 0, for whether the rule can be kept (`feasibility`), or the robustness "
+        "itself (`robustness`). The latter keeps no more than its mean at `threshold`, so actions that break "
+        "the rule may keep some probability; where no action reaches the threshold, as often with 1 m, the "
+        "answer is a `fallback`: choose one that fits the rule.",
+    )
+    shaping: Literal["projection", "lookahead"] = Field(
+        "projection",
+        description="How the prior is bent. `lookahead` is for formulas that `reachability` takes.",
+    )
+    max_steps: int | None = Field(
+        None, ge=1, description="The session ends there [steps]. Default: max(600, T + 1)."
+    )
+    allow_infeasible: bool = Field(False, description="Start even where no action has a satisfying future.")
+
+    @model_validator(mode="after")
+    def _one_way_to_name_policies(self) -> SessionRequest:
+        if (self.policy_id is None) == (self.policy_ids is None):
+            raise ValueError("exactly one of policy_id and policy_ids")
+        return self
+
+    @property
+    def policies(self) -> list[str]:
+        return self.policy_ids or [str(self.policy_id)]
+
+
+class SessionResponse(Answer):
+    id: str = Field(description="For the paths below /v1/sessions.")
+    policy_ids: list[str] = Field(description="Ids of its policies.")
+    map_id: str = Field(description="Id of its map.")
+    spec: dict[str, JsonValue] = Field(description="`formula`, `regions`, `signals`.")
+    horizon: int = Field(description="The horizon T in steps; the last shaped decision is at T - 1.")
+    actions: list[str] = Field(description="Names, in the order of the logits.")
+    terminal_actions: list[int] = Field(description="Indices of the actions that end the main task.")
+    seed: int = Field(description="Of the draws of `action`.")
+    threshold: float = Field(description="delta.")
+    margin: float = Field(description="Robustness kept in hand [the unit of the formula, m].")
+    slack: int = Field(description="Steps kept in hand.")
+    evaluation: str = Field(description="`feasibility` or `robustness`.")
+    shaping: str = Field(description="`projection` or `lookahead`.")
+    max_steps: int = Field(description="The last step there can be.")
+    next_t: int = Field(description="The step expected next.")
+    feasible: bool = Field(description="Whether some action from x_0 had a satisfying future.")
+    spec_status: SpecStatus = Field(description="Of the history so far, whatever may follow.")
+    main_task_done: bool = Field(description="As the last step said.")
+    finished: bool = Field(description="No further step will be taken.")
+    created_at: str = Field(description="RFC 3339.")
+    expires_at: str = Field(description="RFC 3339; every change moves it on.")
+
+
+class SessionList(Answer):
+    items: list[SessionResponse]
+    next: str | None = Field(description="`cursor` of the next page; null on the last.")

@@ -1,0 +1,87 @@
+"""Regions and rules."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field
+
+from specshield.service import examples
+from specshield.service.schemas.base import Answer, Id, Point, Strict
+
+
+class Circle(Strict):
+    type: Literal["circle"]
+    center: Point
+    radius: float = Field(gt=0, le=1e8, description="In metres.")
+
+
+class Rectangle(Strict):
+    """Axis-parallel, in the map frame."""
+
+    type: Literal["rectangle"]
+    min: Point
+    max: Point
+
+
+class Polygon(Strict):
+    """Simple: the edges touch only at their ends. The last vertex joins the first."""
+
+    type: Literal["polygon"]
+    vertices: list[Point] = Field(min_length=3, max_length=10_000, description="In order, [x, y] in metres.")
+
+
+Shape = Annotated[Circle | Rectangle | Polygon, Field(discriminator="type")]
+
+
+class Union(Strict):
+    """Everything inside any member."""
+
+    type: Literal["union"]
+    members: list[Shape] = Field(min_length=1, max_length=256, description="Regions that are no unions.")
+
+
+Region = Annotated[Circle | Rectangle | Polygon | Union, Field(discriminator="type")]
+Regions = Annotated[
+    dict[str, Region],
+    Field(
+        max_length=256,
+        description="Regions by name; in a formula a name is the signed distance [m], positive inside.",
+    ),
+]
+Signals = Annotated[
+    dict[str, float],
+    Field(
+        max_length=64,
+        description="Other signals by name, each with the value it holds before its first sample.",
+    ),
+]
+Formula = Annotated[
+    str,
+    Field(
+        min_length=1,
+        max_length=10_000,
+        description="Signal temporal logic: `F[0,60] (Charger1 or Charger2) and G[0,150] not Forbidden`.",
+    ),
+]
+
+
+class SpecRequest(Strict):
+    model_config = ConfigDict(json_schema_extra={"examples": [examples.SPEC_REQUEST]})
+
+    formula: Formula
+    regions: Regions | None = Field(None, description="Regions by name.")
+    signals: Signals | None = Field(None, description="Initial values of other signals, by name.")
+    map_id: Id | None = Field(None, description="A map, whose rooms are then names too.")
+
+
+class SpecResponse(Answer):
+    formula: str = Field(description="Canonical text; it parses back to an equal formula.")
+    horizon: int = Field(description="The horizon T in steps: T + 1 states decide the formula.")
+    names: list[str] = Field(description="The names it uses, sorted.")
+
+
+class Spec(Strict):
+    formula: Formula
+    regions: Regions = Field(default_factory=dict)
+    signals: Signals = Field(default_factory=dict)

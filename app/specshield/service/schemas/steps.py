@@ -1,0 +1,113 @@
+"""Steps: what a decision is asked with, what it answers, and what ends a session."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import ConfigDict, Field, model_validator
+
+from specshield.service import examples
+from specshield.service.schemas.base import Answer, Pose, SpecStatus, Strict
+from specshield.service.schemas.sessions import SessionResponse
+
+
+class StepRequest(Strict):
+    model_config = ConfigDict(json_schema_extra={"examples": [examples.STEP]})
+
+    t: int = Field(
+        ge=0,
+        le=1_000_000,
+        description="The step to decide. It is the lock: sent again, it returns the stored answer.",
+    )
+    poses: list[Pose] = Field(
+        min_length=1,
+        max_length=10_001,
+        description="Ends with x_t; the whole history or any newest part that joins what the server has.",
+    )
+    logits: list[float | None] | None = Field(
+        None,
+        max_length=256,
+        description="Logits, one an action; null is minus infinity. Not needed after the main task.",
+    )
+    main_task_done: bool = Field(False, description="The main task is over; stays true once it is.")
+    signals: dict[str, float] | None = Field(
+        None,
+        max_length=64,
+        description="Samples at t of the signals that the spec declares; one left out holds its last value.",
+    )
+    witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
+
+
+class Residual(Answer):
+    translation: float = Field(description="In metres.")
+    rotation: float = Field(description="In radians.")
+
+
+class StepResponse(Answer):
+    t: int = Field(description="The step that was decided.")
+    mode: Literal["prior", "shaped", "completion", "fallback", "violated"] = Field(
+        description="How `distribution` came about."
+    )
+    distribution: list[float] = Field(description="pi*: the probability of each action.")
+    j_values: list[float | None] = Field(description="J of each action; null where it was not evaluated.")
+    robustness: list[float | None] = Field(
+        description="rho of the joint trajectory that certifies (or fails) each action."
+    )
+    action: int = Field(description="Drawn from `distribution` by the session's seed and t.")
+    action_name: str = Field(description="Its name.")
+    completion_action: int | None = Field(
+        description="The certified continuation; null once the specification is settled."
+    )
+    spec_status: SpecStatus = Field(description="Of x_0 .. x_t, whatever may follow.")
+    feasible_mass: float | None = Field(description="pi_FM(S_t), of the non-terminal actions.")
+    kl: float | None = Field(
+        description="KL(pi* || pi_FM) in nats; null where pi* leaves the prior's support."
+    )
+    reason: str | None = Field(description="Why the mode is a fallback, or what else there is to know.")
+    finished: bool = Field(description="No further step will be taken.")
+    in_collision: bool = Field(description="x_t touches an obstacle: the world is what it is.")
+    next_poses: list[Pose] = Field(description="f(x_t, a) for each action.")
+    residual: Residual | None = Field(
+        description="How far x_t is from where the executed action should have led."
+    )
+    witness: list[int] | None = Field(description="Action indices that follow `action` to the horizon.")
+    witnesses: list[list[int] | None] | None = Field(
+        None, description="The same for each action, if asked for."
+    )
+
+
+class CloseRequest(Strict):
+    model_config = ConfigDict(json_schema_extra={"examples": [examples.CLOSE]})
+
+    t: int | None = Field(
+        None, ge=0, le=1_000_000, description="The last step reached. Default: the last one stored."
+    )
+    poses: list[Pose] | None = Field(
+        None, min_length=1, max_length=10_001, description="Ends with x_t, joined as in a step."
+    )
+
+    @model_validator(mode="after")
+    def _both_or_neither(self) -> CloseRequest:
+        if (self.t is None) != (self.poses is None):
+            raise ValueError("t and poses come together")
+        return self
+
+
+class CloseResponse(SessionResponse):
+    robustness_bounds: list[float | None] = Field(
+        description="[lo, hi] on the robustness over every continuation; equal at the horizon; null: none."
+    )
+
+
+class TrajectoryItem(Answer):
+    t: int = Field(description="The step.")
+    pose: Pose
+    signals: dict[str, float] = Field(description="The samples held at t.")
+    decision: StepResponse | None = Field(
+        description="The answer given; null for a pose sent later or by close."
+    )
+
+
+class Trajectory(Answer):
+    items: list[TrajectoryItem]
+    next: None = Field(None, description="Always null: a trajectory is one page.")

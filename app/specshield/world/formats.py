@@ -1,0 +1,83 @@
+"""The forms in which a map can be sent, by name. To add one: a file that defines a `MapFormat`, and a line
+below (or an entry point of the group `specshield.map_formats` in a package of its own).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from specshield.errors import InputError, MapError
+from specshield.registry import Registry
+from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Region
+
+Rooms = Mapping[str, Region]
+
+
+@dataclass(frozen=True)
+class MapFormat:
+    """A form in which a map can be sent.
+
+    about: what it is, in a sentence or two. members: the JSON schema of each member of a map in this form,
+    by name; those with a `default` may be left out. files: whether the members are files (a multipart body)
+    instead of members of a JSON object. parse: takes the members by name, files as bytes, and gives the grid
+    with its rooms; raises MapError with the path of the member at fault. example: members that it takes.
+    """
+
+    about: str
+    members: Mapping[str, Mapping[str, Any]]
+    parse: Callable[..., tuple[OccupancyGrid, Rooms]]
+    files: bool = False
+    example: Mapping[str, Any] | None = None
+
+    @property
+    def required(self) -> list[str]:
+        return [name for name, schema in self.members.items() if "default" not in schema]
+
+
+FORMATS = Registry(
+    "format",
+    MapFormat,
+    "specshield.map_formats",
+    {
+        "map_server": "specshield.world.map_server:FORMAT",
+        "occupancy_grid": "specshield.world.nav_msgs:FORMAT",
+        "procthor": "specshield.world.procthor:FORMAT",
+    },
+)
+
+
+def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tuple[OccupancyGrid, Rooms]:
+    """The grid and the rooms of a map that was sent as `members` of the format `name`.
+
+    files: whether they were sent as files. Raises InputError for a format that is unknown or was sent the
+    wrong way, MapError for a member that is missing, unknown or wrong.
+    """
+    if name is None:
+        raise InputError(
+            "the body does not say which format the map has", path="format", expected=_one_of(FORMATS.names())
+        )
+    format = FORMATS.get(str(name))
+    if format.files != files:
+        ways = {True: "files (multipart/form-data)", False: "a JSON object"}
+        raise InputError(
+            f"a map of the format {name} is not sent this way", path="format", got=ways[files],
+            expected=f"{ways[format.files]} with {' and '.join(format.required)}",
+        )  # fmt: skip
+    for member in format.required:
+        if member not in members:
+            raise MapError("this member is missing", path=member, expected=f"it belongs to the format {name}")
+    for member in members:
+        if member not in format.members:
+            raise MapError(
+                f"the format {name} has no such member", path=str(member)[:200], got=members[member],
+                expected=_one_of(sorted(format.members)),
+            )  # fmt: skip
+    defaults = {member: schema["default"] for member, schema in format.members.items() if "default" in schema}
+    return format.parse(**{**defaults, **members})
+
+
+def _one_of(names: list[str]) -> str:
+    return f"one of {', '.join(names)}"
