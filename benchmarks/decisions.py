@@ -13,7 +13,7 @@ from benchmarks.states import Floats, State, along, shipped_dqn, starts
 from benchmarks.timing import quietest, summary
 from specshield.policy.reachability import policy as reachability
 from specshield.shield.episode import Shield, decide, make_shield
-from specshield.shield.feasibility import futures, prefix_of, rho
+from specshield.shield.feasibility import futures, prefix_of, simulated
 from specshield.shield.shaping import log_softmax, restrict
 from specshield.sim.cases import load_case
 from specshield.stl import SATISFIED_ABOVE
@@ -126,19 +126,19 @@ def warm(shield: Shield, state: State) -> None:
 
 def parts(shield: Shield, states: Sequence[State], repeats: int) -> dict[str, float]:
     """Median milliseconds of a decision's parts: the policy's continuations, their robustness, the rest."""
-    task, policy = shield.task, shield.policies[0]
+    task, policy = shield.task, shield.proposers[0]
     total, proposing, judging, prefixing = [], [], [], []
     for state in states:
         prefix = prefix_of(task, task.formula, shield.view, state.history, {})
-        tried = futures(prefix, shield.body, shield.policies, None, 0.0)
+        tried = futures(prefix, shield.body, shield.proposers, None, 0.0)
         total.append(ask(shield, state, repeats))
         proposing.append(quietest(lambda s=state: policy.propose(s.history, {}, 0.0), repeats))
-        judging.append(quietest(lambda p=prefix, f=tried: rho(p, f), repeats))
+        judging.append(quietest(lambda p=prefix, f=tried: simulated(p, shield.body, [f.motions], 0), repeats))
         prefixing.append(
             quietest(lambda s=state: prefix_of(task, task.formula, shield.view, s.history, {}), repeats)
         )
     medians = {
-        "decide": total, "policy.propose": proposing, "robustness of the futures": judging,
+        "decide": total, "policy.propose": proposing, "simulating and judging the futures": judging,
         "bounds of the prefix": prefixing,
     }  # fmt: skip
     result = {name: 1e3 * float(np.median(values)) for name, values in medians.items()}

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks.rules import RULES
 from benchmarks.rules import make as make_rule
+from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.planner import policy as planner
 from specshield.robot import STRETCH
@@ -62,7 +63,7 @@ def settings() -> list[Setting]:
             steps = FEW if method == "planner" else STEPS
             found.append(Setting(f"{case} {method}, disturbed", case, method, Config(), True, steps))
             found.append(Setting(f"{case} {method}, margin and slack", case, method, wary, True, steps))
-        found.append(Setting(f"{case} lookahead", case, "reachability", Config(shaping="lookahead")))
+        found.append(Setting(f"{case} lookahead", case, "lookahead"))
         values = Config(evaluation="robustness", threshold=0.05)
         found.append(Setting(f"{case} robustness", case, "reachability", values, False, FEW))
         found.append(Setting(f"{case} threshold", case, "reachability", Config(threshold=0.9), False, FEW))
@@ -77,6 +78,9 @@ def shield_of(setting: Setting) -> tuple[Case, Shield]:
     case = load_case(setting.case)
     if setting.method == "planner":
         return case, make_shield([planner.synthesise(case.task)], setting.config)
+    if setting.method == "lookahead":
+        computed = [shipped(case, "reachability")]
+        return case, make_shield(computed, setting.config, prepare(case.task, computed))
     policy = shipped(case, setting.method.removesuffix("-literal"))
     if setting.method.endswith("-literal"):
         policy = replace(policy, literal=True)  # type: ignore[type-var]

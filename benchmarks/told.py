@@ -24,7 +24,6 @@ from evaluation.runs import Record
 from specshield.lookahead.belief import Belief
 from specshield.lookahead.lookahead import prepare
 from specshield.lookahead.surrogate import cell_of
-from specshield.policy.reachability.policy import ReachabilityPolicy
 from specshield.sim.learned.model import LearnedModel
 from specshield.sim.robot import SimulatedRobot
 
@@ -77,8 +76,7 @@ def _experiment(case: str, seed: int, when: str) -> Experiment:
 def _tell(experiment: Experiment, from_start: bool) -> None:
     """In this process, which is of one pool: what is believed is replaced by what is so."""
     setting = experiment.setting
-    tables = next(p for p in setting.ours.policies if isinstance(p, ReachabilityPolicy))
-    ahead = prepare(setting.case.task, tables)
+    ahead = prepare(setting.case.task, setting.ours.proposers)
     goals = ahead.goals
     row, column = cell_of(ahead.body, goals.pitch, *goals.distance.shape[1:], *setting.case.target)
     around = goals.distance[

@@ -15,6 +15,7 @@ from evaluation.houses import load_house_case
 from evaluation.methods import Decoding, Method, Shielded, Simplex
 from specshield import __version__
 from specshield.errors import InputError, NotFound
+from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body
@@ -134,7 +135,9 @@ class Setting:
             "simplex": lambda: Simplex(make_shield(self.policies, careful)),
             "paper": lambda: Shielded(self.paper, carries=False),
             "ours": lambda: Shielded(make_shield(self.policies, careful)),
-            "lookahead": lambda: Shielded(make_shield(self.policies, replace(careful, shaping="lookahead"))),
+            "lookahead": lambda: Shielded(
+                make_shield(self.policies, careful, prepare(self.task, self.policies))
+            ),
         }
         return make[kind]()
 

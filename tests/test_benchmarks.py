@@ -13,6 +13,7 @@ from benchmarks.plain import Plain
 from benchmarks.states import shipped_dqn, starts
 from benchmarks.sweep import made_robot
 from specshield.policy.reachability import policy as reachability
+from specshield.robot.dynamics import make_body, simulate
 from specshield.rule.progress import BROKEN, SETTLED, make_rules, replay
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
@@ -44,7 +45,10 @@ def test_the_plain_batched_version_has_our_robustness(dqn):
 def is_tie(plain, dqn, history, m):
     """Whether the rollouts of motion m part at a step where the two best Q-values are as good as equal."""
     theirs = plain.rollouts(history, np.array([m]))[0]
-    ours = np.concatenate([history, dqn.propose(history, {}, 0.0).poses[m]])
+    motions = dqn.propose(history, {}, 0.0).motions[m]
+    poses = np.empty((len(motions), 3))
+    simulate(make_body(dqn.task.robot, dqn.task.grid), history[-1], motions, poses)
+    ours = np.concatenate([history, poses])
     parted = int(np.argmax(np.abs(theirs - ours).max(axis=1) > ROUNDING))
     rules = make_rules(dqn.task)
     status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)

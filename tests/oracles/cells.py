@@ -13,9 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from specshield.policy.dqn.policy import Proposal
 from specshield.robot import robot_from_json
-from specshield.robot.dynamics import make_body, simulate
+from specshield.robot.dynamics import make_body
+from specshield.shield.proposal import Proposal
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -117,13 +117,6 @@ class Cells:
             self.keeps({name: (cells == np.array(c)).all(axis=-1) for name, c in self.regions.items()})
         )
 
-    def proposal(self, history, rows):
-        """The Proposal with these motions [M, n]."""
-        poses = np.empty((*rows.shape, 3))
-        for motions, out in zip(rows, poses, strict=True):
-            simulate(self.body, np.asarray(history[-1], float), motions, out)
-        return rows, poses
-
 
 class Exhaustive:
     """A perfect proposer: for each motion a future that keeps the formula, if any does, drawn at random."""
@@ -141,7 +134,7 @@ class Exhaustive:
             rows.append(motions[self.random.choice(good)] if len(good) else motions[motions[:, 0] == m][-1])
         good = motions[kept]
         preferred = int(self.random.choice(good)[0]) if len(good) else WAIT
-        return Proposal(*self.cells.proposal(history, np.array(rows)), preferred)
+        return Proposal(np.array(rows), preferred)
 
 
 class Scripted:
@@ -155,7 +148,7 @@ class Scripted:
     def propose(self, history, signals, margin):
         t, n = len(history) - 1, self.task.horizon + 1 - len(history)
         rows = [([m, *self.script(t, m)] + [WAIT] * n)[:n] for m in range(MOTIONS)]
-        return Proposal(*self.cells.proposal(history, np.array(rows)), self.preferred)
+        return Proposal(np.array(rows), self.preferred)
 
 
 def waits(t, motion):

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from specshield.policy.dqn.network import make_network
-from specshield.policy.dqn.policy import Policy, Proposal
+from specshield.policy.dqn.policy import Policy
 from specshield.policy.planner import policy as planner
 from specshield.policy.reachability import policy as reachability
 from specshield.rule.residual import still_open
 from specshield.shield.episode import Config, decide, make_shield
+from specshield.shield.proposal import Proposal
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted, ways
 from tests.policy.rooms import random_weights, sizes
 
@@ -114,7 +115,7 @@ class Everything:
 
     def propose(self, history, signals, margin):
         rows = ways(self.task.horizon + 1 - len(history))
-        return Proposal(*self.cells.proposal(history, rows), WAIT)
+        return Proposal(rows, WAIT)
 
 
 def tables(task):

@@ -571,8 +571,6 @@ def test_a_later_pose_in_collision_is_answered_and_flagged(pose):
         ({"evaluation": "vibes"}, "evaluation", InputError),
         ({"margin": -0.1}, "margin", InputError),
         ({"margin": math.inf}, "margin", InputError),
-        ({"shaping": "lookahead", "threshold": 0.9}, "shaping", InputError),
-        ({"shaping": "sideways"}, "shaping", InputError),
     ],
 )
 def test_bad_settings(config, path, error):

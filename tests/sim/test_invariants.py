@@ -122,7 +122,7 @@ def check(decision, logits, terminal, horizon):
 
 
 def test_once_feasible_always_feasible_whatever_the_model_wants(case, shield):
-    n = EPISODES[case.name, shield.policies[0].card["method"]]
+    n = EPISODES[case.name, shield.proposers[0].card["method"]]
     with ThreadPoolExecutor(2) as threads:
         outcomes = list(threads.map(lambda i: episode(case, shield, i), range(n)))
     ran = [outcome for outcome in outcomes if outcome is not None]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from specshield.lookahead import lookahead
+from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.shield.decision import Carry, Config
 from specshield.shield.episode import close, decide, make_shield, start
@@ -52,7 +53,7 @@ def episode(case, shield, seed, each=lambda decision, logits: None):
 
 def test_the_guarantee_stays_and_the_path_costs_less(world):
     case, shield = world
-    ahead = replace(shield, config=Config(shaping="lookahead"))
+    ahead = replace(shield, preference=prepare(shield.task, shield.proposers))
     differs = []
 
     def check(decision, logits):
@@ -75,7 +76,7 @@ def test_the_guarantee_stays_and_the_path_costs_less(world):
 
 def test_a_decision_made_again_is_the_same(world):
     case, shield = world
-    ahead = replace(shield, config=Config(shaping="lookahead", seed=4))
+    ahead = replace(shield, config=Config(seed=4), preference=prepare(shield.task, shield.proposers))
     model, robot = make_model("goal-seeker", case), SimulatedRobot(case, tuple(begin(case, ahead, 1)))
     model.reset(np.random.default_rng(1))
     history, carry = [], None
@@ -83,14 +84,16 @@ def test_a_decision_made_again_is_the_same(world):
         history.append(robot.pose)
         logits = model.logits(robot)
         decision = decide(ahead, history, logits, carry=carry)
-        if t == 6:
-            lookahead.prepare.cache_clear()  # as in another process
+        other = ahead
+        if t == 6:  # as in another process
+            lookahead._prepare.cache_clear()
+            other = replace(ahead, preference=prepare(shield.task, shield.proposers))
         again = decide(
-            ahead, history, logits, carry=None if carry is None else Carry.from_json(carry.to_json())
+            other, history, logits, carry=None if carry is None else Carry.from_json(carry.to_json())
         )
         assert np.array_equal(decision.distribution, again.distribution)
         assert decision.action == again.action
         assert decision.carry.to_json() == again.carry.to_json()
         carry = decision.carry
         robot.execute(decision.action)
-    assert carry.belief is not None
+    assert carry.memory is not None

@@ -110,6 +110,7 @@ class Decision:
     execute: int
     timings: Mapping[str, float]  # [ms], from the Server-Timing header
     witnesses: tuple[tuple[int, ...] | None, ...] | None = None
+    warnings: tuple[str, ...] = ()  # what did not go as it should, such as a policy that was not used
 
 
 @dataclass(frozen=True)

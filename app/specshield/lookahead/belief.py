@@ -7,9 +7,7 @@ would have said. Where the model's own habits predict it far better than those d
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,16 +65,19 @@ class Belief:
         going = 0.5 * (1.0 + math.tanh(0.5 * float(wander - goals.min())))
         return np.append(going * odds / odds.sum(), 1.0 - going)
 
-    def to_json(self) -> dict[str, Any]:
-        arrays = {name: getattr(self, name).tolist() for name in ("cost", "normal", "moment", "habit")}
-        return {**arrays, "excess": self.excess}
+    def to_bytes(self) -> bytes:
+        parts = (self.cost, self.normal.ravel(), self.moment, self.habit, [self.excess])
+        return np.concatenate(parts).astype("<f8").tobytes()
 
     @staticmethod
-    def from_json(value: Mapping[str, Any]) -> Belief:
-        cost, normal, moment, habit = (
-            np.array(value[name], dtype=np.float64) for name in ("cost", "normal", "moment", "habit")
+    def from_bytes(content: bytes, motions: int) -> Belief:
+        """What `to_bytes` wrote, for a robot of so many motions."""
+        values = np.frombuffer(content, "<f8").copy()
+        goals = len(values) - FEATURES * FEATURES - FEATURES - motions - 1
+        cost, normal, moment, habit, excess = np.split(
+            values, np.cumsum([goals, FEATURES * FEATURES, FEATURES, motions])
         )
-        return Belief(cost, normal, moment, habit, value["excess"])
+        return Belief(cost, normal.reshape(FEATURES, FEATURES), moment, habit, float(excess[0]))
 
 
 def begin(goals: int, motions: int) -> Belief:

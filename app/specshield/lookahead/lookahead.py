@@ -9,7 +9,7 @@ preference inside S_t changes: safety rests on S_t alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -38,6 +38,7 @@ from specshield.policy.lattice import pose_of
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body, successors
 from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
+from specshield.shield.proposal import Proposer
 from specshield.task import Task
 
 Floats = NDArray[np.float64]
@@ -70,17 +71,25 @@ class LookAhead:
     shares: Floats
     tables: NDArray[np.uint16]
 
-    def begin(self) -> Belief:
-        return beliefs.begin(len(self.goals.distance), len(self.task.robot.motions))
+    def begin(self) -> bytes:
+        return beliefs.begin(len(self.goals.distance), len(self.task.robot.motions)).to_bytes()
 
     def step(
+        self, memory: bytes, history: Floats, signals: Mapping[str, Floats], log_prior: Floats
+    ) -> tuple[bytes, Floats]:
+        """As `Preference.step`. The memory is the belief.
+
+        The log-weight of an action is -trust * D of the pose it leads to, D taken from its least value: at
+        most 0, and 0 for a terminal action and where nothing is known.
+        """
+        belief = Belief.from_bytes(memory, len(self.task.robot.motions))
+        belief, weights = self.advance(belief, history, signals, log_prior)
+        return belief.to_bytes(), weights
+
+    def advance(
         self, belief: Belief, history: Floats, signals: Mapping[str, Floats], log_prior: Floats
     ) -> tuple[Belief, Floats]:
-        """What is believed after the model's log_prior [A] at x_t, and what to add to it inside S_t, [A].
-
-        history [t + 1, 3] with t < T; signals {name: [t + 1]}. The addition is -trust * D of the next pose, D
-        above the least: at most 0, and 0 for a terminal action and where nothing is known.
-        """
+        """What is believed after the model's log_prior [A] at x_t, and the log-weights [A]."""
         robot, pose = self.task.robot, history[-1]
         x, y, theta = (float(v) for v in pose)
         nexts = np.empty((len(robot.motions), 3))
@@ -123,12 +132,18 @@ class LookAhead:
         return result
 
 
-@lru_cache(AHEADS)
-def prepare(task: Task, policy: ReachabilityPolicy | None = None) -> LookAhead:
-    """The look-ahead for a task; `policy`: one made for it, if there is any.
+def prepare(task: Task, proposers: Sequence[Proposer] = ()) -> LookAhead:
+    """The look-ahead for a task, from the tables of a reachability policy among `proposers` if there is one.
 
-    Raises FragmentError outside the fragment, PolicyError or Unsupported for a task too large.
+    A process keeps the last AHEADS. Raises FragmentError outside the fragment, PolicyError or Unsupported for
+    a task too large.
     """
+    computed = [each for each in proposers if isinstance(each, ReachabilityPolicy)]
+    return _prepare(task, computed[0] if computed else None)
+
+
+@lru_cache(AHEADS)
+def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     goals = make_goals(body, task.grid)
     if len(goals.distance) == 0:

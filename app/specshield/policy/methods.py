@@ -15,7 +15,7 @@ from specshield.registry import Registry
 
 if TYPE_CHECKING:  # a worker waits for jobs without the weight of the core
     from specshield.policy.card import Card
-    from specshield.policy.dqn.policy import Proposer
+    from specshield.shield.proposal import Proposer
     from specshield.task import Task
 
 DEFAULT = "reachability"

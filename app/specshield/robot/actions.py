@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from specshield.errors import RobotError
 
+# A witness is stored as one byte a motion: the uint8 in shield/judgement.py and shield/feasibility.py holds
+# no motion above 255. More actions than this would need wider witnesses there.
 MAX_ACTIONS = 256
 MAX_TRANSLATE = 10.0  # [m] a step
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel
 from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
-from specshield.stl import Formula
+from specshield.stl import Always, And, Formula, Node, Until
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
-from specshield.stl.tree import Tree, compile_tree, tree_bounds, tree_value
+from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_bounds, tree_value
 from specshield.task import Task
 from specshield.world.regions import PackedRegions
 
@@ -22,15 +23,17 @@ Ints = NDArray[np.int64]
 
 
 class View(NamedTuple):
-    """A formula over a task with R regions and S signals. Its leaves read `values` (rule/values.py).
+    """A formula over a task with R regions and S signals. Its l leaves read `values` (rule/values.py).
 
-    first, last [R]: the steps between which some leaf reads a region.
+    first, last [R]: the steps between which some leaf reads a region. binds [l]: whether each value of a leaf
+    is an upper bound on rho, as under the G of a conjunction.
     """
 
     tree: Tree
     regions: PackedRegions
     first: Ints
     last: Ints
+    binds: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=256)
@@ -46,40 +49,81 @@ def view_of(task: Task, formula: Formula) -> View:
             r = int(place) - REGIONS
             if 0 <= r < len(names):
                 first[r], last[r] = min(first[r], tree.leaf_start[n]), max(last[r], tree.leaf_stop[n] - 1)
-    return View(tree, regions_of(task), first, last)
+    return View(tree, regions_of(task), first, last, np.array(list(_binding(formula, True)), np.bool_))
+
+
+def _binding(formula: Node, binds: bool) -> Iterator[bool]:
+    """`View.binds`, in the order of the tree's leaves."""
+    if not is_temporal(formula):
+        yield binds
+        return
+    if isinstance(formula, Until):
+        sides = formula.parts if formula.b > 0 else formula.parts[1:]  # as in stl/tree.py
+        for side in sides:
+            yield from _binding(side, False)
+        return
+    for part in formula.parts:
+        yield from _binding(part, binds and isinstance(formula, (And, Always)))
+
+
+@inlined
+def value_count(view: View, signals: Floats) -> int:
+    """How long `values` is. signals (m, S)."""
+    return int(REGIONS + view.first.shape[0] + signals.shape[1])
+
+
+@inlined
+def read_step(
+    view: View,
+    poses: Floats,
+    signals: Floats,
+    start: int,
+    k: int,
+    values: Floats,
+    stack: Floats,
+    buffer: Floats,
+) -> float:
+    """The leaves at step start + k, at poses[k], into `buffer`. What the step before read is used again.
+
+    poses (n, 3), the first of them at step `start`; signals (m, S): of the same steps, the last held. Returns
+    the least value of the leaves that bind, inf where none does, NaN where some leaf is no number. values
+    (`value_count`,), stack: scratch, left as they are between the steps.
+    """
+    tree, regions, held = view.tree, view.first.shape[0], signals.shape[0] - 1
+    t, x, y, theta = start + k, poses[k, 0], poses[k, 1], poses[k, 2]
+    placed = k > 0 and x == poses[k - 1, 0] and y == poses[k - 1, 1]
+    same = placed and theta == poses[k - 1, 2] and k > held
+    if not same:
+        fill_pose(x, y, theta, values)
+        for s in range(signals.shape[1]):
+            values[REGIONS + regions + s] = signals[min(k, held), s]
+    for r in range(regions):
+        if view.first[r] <= t <= view.last[r] and not (placed and t > view.first[r]):
+            fill_region(view.regions, r, x, y, values)
+    least = np.inf
+    for n in range(tree.leaf_at.shape[0]):
+        if tree.leaf_start[n] <= t < tree.leaf_stop[n]:
+            i = tree.leaf_at[n] + t - tree.leaf_start[n]
+            if same and t > tree.leaf_start[n]:
+                buffer[i] = buffer[i - 1]
+            else:
+                buffer[i] = evaluate_packed(n, tree.programs, values, stack)
+            if math.isnan(buffer[i]):
+                return math.nan
+            if view.binds[n] and buffer[i] < least:
+                least = buffer[i]
+    return least
 
 
 @inlined
 def _read(
     view: View, poses: Floats, signals: Floats, start: int, values: Floats, stack: Floats, buffer: Floats
 ) -> bool:
-    """The leaves at the steps from `start` on, poses (n, 3), into `buffer`; False where one is no number.
-
-    signals (m, S): of the same steps, the last held. values (3 + R + S,), stack: scratch.
-    """
-    tree, first_signal = view.tree, REGIONS + view.first.shape[0]
-    regions, leaves, held = view.first.shape[0], tree.leaf_at.shape[0], signals.shape[0] - 1
-    sound = True
+    """`read_step` for all poses (n, 3); False where some leaf is no number."""
     for k in range(poses.shape[0]):
-        t, x, y, theta = start + k, poses[k, 0], poses[k, 1], poses[k, 2]
-        placed = k > 0 and x == poses[k - 1, 0] and y == poses[k - 1, 1]
-        same = placed and theta == poses[k - 1, 2] and k > held
-        if not same:
-            fill_pose(x, y, theta, values)
-            for s in range(signals.shape[1]):
-                values[first_signal + s] = signals[min(k, held), s]
-        for r in range(regions):
-            if view.first[r] <= t <= view.last[r] and not (placed and t > view.first[r]):
-                fill_region(view.regions, r, x, y, values)
-        for n in range(leaves):
-            if tree.leaf_start[n] <= t < tree.leaf_stop[n]:
-                i = tree.leaf_at[n] + t - tree.leaf_start[n]
-                if same and t > tree.leaf_start[n]:
-                    buffer[i] = buffer[i - 1]
-                else:
-                    buffer[i] = evaluate_packed(n, tree.programs, values, stack)
-                    sound = sound and not math.isnan(buffer[i])
-    return sound
+        if math.isnan(read_step(view, poses, signals, start, k, values, stack, buffer)):
+            return False
+    return True
 
 
 @kernel
@@ -89,7 +133,7 @@ def look(view: View, poses: Floats, signals: Floats, known: Floats) -> tuple[flo
     poses (t + 1, 3), signals (t + 1, S). known (tree.size,): the leaves at the steps to t are written there.
     """
     tree, stop = view.tree, poses.shape[0]
-    values = np.empty(REGIONS + view.first.shape[0] + signals.shape[1])
+    values = np.empty(value_count(view, signals))
     if not _read(view, poses, signals, 0, values, np.empty(STACK_SIZE), known):
         return math.nan, math.nan
     low, high = known.copy(), known.copy()
@@ -107,7 +151,7 @@ def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Fl
     held (1, S): the values that the signals keep from step t + 1 on.
     """
     tree = view.tree
-    values = np.empty(REGIONS + view.first.shape[0] + held.shape[1])
+    values = np.empty(value_count(view, held))
     stack, buffer = np.empty(STACK_SIZE), np.empty(tree.size)
     for f in range(poses.shape[0]):
         for n in range(tree.leaf_at.shape[0]):
@@ -116,16 +160,3 @@ def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Fl
                 buffer[i] = known[i]
         sound = _read(view, poses[f], held, t + 1, values, stack, buffer)
         rho[f] = tree_value(tree, buffer) if sound else math.nan
-
-
-@kernel
-def best_rows(motions: Ints, rho: Floats, rows: Ints) -> None:
-    """The row of the most robust future for each motion, rows (M,); the lowest on ties, -1 where it has none.
-
-    motions (N, T - t): the futures', rho (N,).
-    """
-    rows[:] = -1
-    for f in range(motions.shape[0]):
-        m = motions[f, 0]
-        if rows[m] < 0 or rho[f] > rho[rows[m]]:
-            rows[m] = f

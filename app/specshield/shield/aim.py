@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from specshield.rule.residual import still_open
 from specshield.rule.view import view_of
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Best, Futures, Prefix, best_of, prefix_of, rho
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, prefix_of, rho_of
 from specshield.stl import SATISFIED_ABOVE
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,7 @@ def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[
     def at(slack: int) -> Best:
         formula = still_open(prefix.task, prefix.formula, prefix.poses, prefix.rows, slack)
         part = prefix_of(prefix.task, formula, view_of(prefix.task, formula), prefix.poses, prefix.signals)
-        return best_of(tried, np.where(whole > SATISFIED_ABOVE, rho(part, tried), -np.inf), motions)
+        return best_of(tried, np.where(whole > SATISFIED_ABOVE, rho_of(part, tried), -np.inf), motions)
 
     best = at(shield.config.slack)
     if (best.robustness > margin).any():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from base64 import b64decode, b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -11,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import InputError, PolicyError
-from specshield.lookahead.belief import Belief
-from specshield.policy.dqn.policy import Proposer
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.view import View, view_of
+from specshield.shield.preference import Preference
+from specshield.shield.proposal import Proposer
 from specshield.stl import Verdict
 from specshield.task import Task
 
@@ -28,16 +29,15 @@ class Config:
     """A session's settings. Raises InputError or Unsupported with the field's path.
 
     threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho
-    > margin [m]. slack: J asks for each F of the conjunction this many steps early. Where either cannot be
-    had, the most that can. shaping: whether the model's preference inside S_t is looked ahead for. max_steps:
-    None is max(600, T + 1). seed: of the drawn actions.
+    > margin [m]. slack: J asks for each F of the conjunction this many steps early. Where the margin or the
+    slack cannot be had, J asks for as much of it as can be. max_steps: None is max(600, T + 1). seed: of the
+    drawn actions.
     """
 
     threshold: float = 1.0
     margin: float = 0.0
     slack: int = 0
     evaluation: str = "feasibility"
-    shaping: str = "projection"
     max_steps: int | None = None
     seed: int = 0
 
@@ -49,16 +49,7 @@ class Config:
                 got=self.evaluation,
                 expected="'feasibility' or 'robustness'",
             )
-        if self.shaping not in ("projection", "lookahead"):
-            raise InputError(
-                "unknown shaping", path="shaping", got=self.shaping, expected="'projection' or 'lookahead'"
-            )
         binary = self.evaluation == "feasibility"
-        if self.shaping == "lookahead" and not (binary and self.threshold == 1.0):
-            raise InputError(
-                "look-ahead chooses within the feasible set", path="shaping", got=self.shaping,
-                expected="'projection', or evaluation 'feasibility' with threshold 1",
-            )  # fmt: skip
         if not math.isfinite(self.threshold) or (binary and not 0.0 < self.threshold <= 1.0):
             raise InputError(
                 "the threshold is out of range", path="threshold", got=self.threshold,
@@ -76,27 +67,47 @@ class Config:
 
 @dataclass(frozen=True)
 class Shield:
-    """A task, the policies that certify it and a session's settings, prepared once."""
+    """A task, the policies that propose futures for it and a session's settings, prepared once.
+
+    Raises InputError where a preference is given to a session that does not choose within S_t.
+    """
 
     task: Task
-    policies: tuple[Proposer, ...]
+    proposers: tuple[Proposer, ...]
     config: Config
     body: Body = field(repr=False)
     view: View = field(repr=False)
+    preference: Preference | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.preference is not None:
+            check_preferring(self.config)
 
     @property
     def max_steps(self) -> int:
         return self.config.max_steps or max(600, self.task.horizon + 1)
 
 
-def make_shield(policies: Sequence[Proposer], config: Config | None = None) -> Shield:
-    """A shield for the task that the policies share. Raises PolicyError where they do not share one."""
-    if not policies:
+def check_preferring(config: Config) -> None:
+    """Raises InputError for settings that a preference does not go with."""
+    if config.evaluation != "feasibility" or config.threshold != 1.0:
+        raise InputError(
+            "a preference chooses within the feasible set, and these settings leave mass outside it",
+            path="shaping", got=f"evaluation {config.evaluation!r}, threshold {config.threshold:g}",
+            expected="shaping 'projection', or evaluation 'feasibility' with threshold 1",
+        )  # fmt: skip
+
+
+def make_shield(
+    proposers: Sequence[Proposer], config: Config | None = None, preference: Preference | None = None
+) -> Shield:
+    """A shield for the task that the proposers share. Raises PolicyError where they do not share one."""
+    if not proposers:
         raise PolicyError(
             "a shield needs a policy", path="policy_ids", got=[], expected="at least one policy"
         )
-    task = policies[0].task
-    for i, policy in enumerate(policies):
+    task = proposers[0].task
+    for i, policy in enumerate(proposers):
         if policy.task.content_hash != task.content_hash:
             raise PolicyError(
                 "the policies were made for different tasks", path=f"policy_ids[{i}]",
@@ -104,10 +115,11 @@ def make_shield(policies: Sequence[Proposer], config: Config | None = None) -> S
             )  # fmt: skip
     return Shield(
         task,
-        tuple(policies),
+        tuple(proposers),
         config or Config(),
         make_body(task.robot, task.grid),
         view_of(task, task.formula),
+        preference,
     )
 
 
@@ -116,37 +128,37 @@ class Carry:
     """What one decision hands to the next: each motion's next pose and its certified continuation.
 
     next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it; None: not certified.
-    belief: what look-ahead shaping believes of the model.
+    memory: of the session's preference.
     """
 
     t: int
     next_poses: Floats
     witnesses: tuple[bytes | None, ...]
-    belief: Belief | None = None
+    memory: bytes | None = None
 
     def to_json(self) -> dict[str, Any]:
         witnesses = [None if w is None else w.hex() for w in self.witnesses]
         value = {"t": self.t, "next_poses": self.next_poses.tolist(), "witnesses": witnesses}
-        return value | ({} if self.belief is None else {"belief": self.belief.to_json()})
+        return value | ({} if self.memory is None else {"memory": b64encode(self.memory).decode()})
 
     @staticmethod
     def from_json(value: Mapping[str, Any]) -> Carry:
         witnesses = tuple(None if w is None else bytes.fromhex(w) for w in value["witnesses"])
         poses = np.array(value["next_poses"], dtype=np.float64).reshape(-1, 3)
-        belief = Belief.from_json(value["belief"]) if "belief" in value else None
-        return Carry(value["t"], poses, witnesses, belief)
+        memory = b64decode(value["memory"]) if "memory" in value else None
+        return Carry(value["t"], poses, witnesses, memory)
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The answer to one step; A actions. The fields are those of the HTTP contract (DESIGN.md, section 3).
+    """The answer to one step; A actions. The fields are those of the HTTP contract.
 
     distribution [A]: pi*. j_values, robustness: one an action, None where nothing was evaluated; robustness
     is rho of the joint trajectory that certifies (or fails) the action [m]. feasible_mass: pi_FM(S_t), kl
     [nats]: of the answer from the prior, None where it leaves the prior's support or no logits were sent.
     next_poses [A, 3]. residual: (m, rad) between x_t and the nearest pose the last decision foresaw, None
     where there was none. witness: the action indices that follow `action`; witnesses: the same for every
-    action.
+    action. warnings: what did not go as it should, such as a policy that was not used.
     """
 
     t: int
@@ -167,4 +179,5 @@ class Decision:
     in_collision: bool
     witness: tuple[int, ...] | None
     witnesses: tuple[tuple[int, ...] | None, ...]
+    warnings: tuple[str, ...]
     carry: Carry

@@ -16,12 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
-from specshield.lookahead.lookahead import LookAhead, prepare
-from specshield.policy.reachability.policy import ReachabilityPolicy
 from specshield.robot.dynamics import in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
-from specshield.shield.feasibility import futures, prefix_of, rho
+from specshield.shield.feasibility import futures, prefix_of
 from specshield.shield.judgement import (
     Judged,
     as_actions,
@@ -63,14 +61,14 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
             "the footprint touches an obstacle", path="initial_pose", got=list(pose),
             expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
         )  # fmt: skip
-    if shield.config.shaping == "lookahead":
-        look_ahead(shield)  # raises for a task that it does not cover
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
-    values = rho(prefix, futures(prefix, shield.body, shield.policies, None, shield.config.margin))
-    if not np.any(values > SATISFIED_ABOVE):
+    tried = futures(prefix, shield.body, shield.proposers, None, shield.config.margin)
+    best = float(tried.rho.max(initial=-np.inf))
+    if not best > SATISFIED_ABOVE:
+        found = f"the best robustness found is {best:.3f}" if len(tried.rho) else "; ".join(tried.warnings)
         raise InfeasibleStart(
-            f"no action from here has a future that satisfies the formula: the best robustness is "
-            f"{values.max():.3f}", path="initial_pose", got=list(pose),
+            f"no future from here was found that satisfies the formula: {found}",
+            path="initial_pose", got=list(pose),
             expected="a pose from which some action, followed by a policy, satisfies it; or allow_infeasible",
         )  # fmt: skip
 
@@ -106,7 +104,7 @@ def decide(
     nexts = np.empty((len(robot.motions), 3))
     successors(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
-    belief, preference = None if carry is None else carry.belief, None
+    memory, weights = None if carry is None else carry.memory, None
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     margin = SATISFIED_ABOVE + shield.config.margin  # is nothing left that could change whether it is kept?
@@ -118,10 +116,10 @@ def decide(
         answer = _unmodified(shield, log_prior)
     else:
         judged = judge(shield, prefix, tail, violated=spec_status == "violated")
-        if shield.config.shaping == "lookahead" and log_prior is not None and spec_status == "pending":
-            ahead = look_ahead(shield)
-            belief, preference = ahead.step(belief or ahead.begin(), poses, signals, log_prior)
-        answer = _answer(shield, log_prior, judged, main_task_done, preference)
+        if shield.preference is not None and log_prior is not None and spec_status == "pending":
+            before = shield.preference.begin() if memory is None else memory
+            memory, weights = shield.preference.step(before, poses, signals, log_prior)
+        answer = _answer(shield, log_prior, judged, main_task_done, weights)
         if spec_status == "violated":
             answer = replace(answer, mode="violated")
 
@@ -149,7 +147,8 @@ def decide(
         witnesses=tuple(as_actions(shield, certified, a) for a in range(len(robot.actions)))
         if witnesses
         else (),
-        carry=Carry(t, nexts, certified, belief),
+        warnings=() if judged is None else judged.tried.warnings,
+        carry=Carry(t, nexts, certified, memory),
     )
 
 
@@ -168,11 +167,11 @@ def _answer(
     log_prior: Floats | None,
     judged: Judged,
     main_task_done: bool,
-    preference: Floats | None,
+    weights: Floats | None,
 ) -> _Answer:
     """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`.
 
-    preference [A]: log-weights inside S_t beside the model's.
+    weights [A]: the preference's log-weights inside S_t beside the model's log-probabilities.
     """
     terminal = shield.task.robot.terminal
     any_feasible = bool(judged.feasible.any())
@@ -192,7 +191,7 @@ def _answer(
         shaped = shaping.tilt(conditional, judged.values, config.threshold)
         attainable = bool(judged.values.max() >= config.threshold)
     elif config.threshold == 1.0:
-        wanted = conditional if preference is None else conditional + preference
+        wanted = conditional if weights is None else conditional + weights
         shaped = shaping.restrict(wanted, judged.feasible)
     else:
         shaped = shaping.soften(conditional, judged.feasible, config.threshold)
@@ -202,21 +201,6 @@ def _answer(
     mode = "fallback" if shaped is None else "shaped"
     body = certified if shaped is None else shaped
     return _Answer(np.where(terminal, prior, (1.0 - ending) * body), mode, reason, conditional)
-
-
-def look_ahead(shield: Shield) -> LookAhead:
-    """Prepared once a process. Raises FragmentError, PolicyError, Unsupported for what it does not cover."""
-    computed = [policy for policy in shield.policies if isinstance(policy, ReachabilityPolicy)]
-    return prepare(shield.task, computed[0] if computed else None)
-
-
-def prepare_ahead(shield: Shield, poses: Floats) -> None:
-    """`look_ahead`, and the kernels that its first step needs. poses [1, 3]: some pose of the robot's."""
-    ahead, robot = look_ahead(shield), shield.task.robot
-    signals = {name: np.array([value]) for name, value in shield.task.signals.items()}
-    ahead.step(
-        ahead.begin(), _history(poses), signals, np.full(len(robot.actions), -math.log(len(robot.actions)))
-    )
 
 
 def _unmodified(shield: Shield, log_prior: Floats | None) -> _Answer:

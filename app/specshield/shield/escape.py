@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel
 from specshield.robot.dynamics import Body, motion_count, successors
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Futures, Prefix
+from specshield.shield.feasibility import Futures, Prefix, simulated
+from specshield.shield.proposal import ask
 from specshield.stl import SATISFIED_ABOVE, Always, robustness
 from specshield.task import Task
 
@@ -20,7 +21,7 @@ Ints = NDArray[np.int64]
 
 WORK = 1024  # poses tried at a step, about
 LONGEST = 24  # [steps]
-WAYS = 4  # that are gone on with: each asks every policy
+WAYS = 4  # that are gone on with: each asks every proposer
 ALIKE = 1e3  # [1/m, 1/rad] poses as near as a millimetre count as one
 
 
@@ -53,7 +54,7 @@ def escape(
 ) -> tuple[int, Futures | None]:
     """How many steps it takes until every `broken` whose window is not over holds again, 0 where no way out
     was found; and, where it takes more than one, such ways, or the one that came nearest to being out, and
-    then on as the policies propose.
+    then on as the proposers propose.
 
     No way breaks one of `kept`, if there is one that does not. Each way has another first motion. The signals
     keep their last values.
@@ -135,19 +136,19 @@ def _trace(layers: Sequence[Layer], at: int) -> tuple[Ints, Floats]:
 
 
 def _onward(shield: Shield, prefix: Prefix, ways: Sequence[tuple[Ints, Floats]]) -> Futures:
-    """The ways to the horizon: from the end of each by what the policies propose there."""
-    motions, poses = [], []
+    """The ways to the horizon: from the end of each by what the proposers propose there."""
+    rows, warnings, count = list[Ints](), list[str](), motion_count(shield.body)
     for taken, reached in ways:
-        k = len(taken)
-        if prefix.t + k == prefix.task.horizon:
-            motions.append(taken[None])
-            poses.append(reached[None])
+        k, left = len(taken), prefix.steps - len(taken)
+        if left == 0:
+            rows.append(taken[None])
             continue
         history = np.concatenate([prefix.poses, reached])
         signals = {n: np.append(v, np.full(k, v[-1])) for n, v in prefix.signals.items()}
-        for policy in shield.policies:
-            proposal = policy.propose(history, signals, 0.0)
-            rows = len(proposal.motions)
-            motions.append(np.hstack([np.tile(taken, (rows, 1)), proposal.motions]))
-            poses.append(np.hstack([np.tile(reached, (rows, 1, 1)), proposal.poses]))
-    return Futures(np.concatenate(motions), np.concatenate(poses), int(ways[0][0][0]))
+        for proposer in shield.proposers:
+            proposal, wrong = ask(proposer, history, signals, 0.0, count, left)
+            if proposal is None:
+                warnings.append(str(wrong))
+                continue
+            rows.append(np.hstack([np.tile(taken, (len(proposal.motions), 1)), proposal.motions]))
+    return simulated(prefix, shield.body, rows, int(ways[0][0][0]), warnings)

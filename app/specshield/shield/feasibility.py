@@ -1,28 +1,34 @@
 """J: does a candidate action have a future that satisfies the formula? (paper, Def. 2 and eq. 6)
 
-Policies propose continuations; each is joined to the executed prefix and judged by its robustness: always the
-joint trajectory, since one future has to satisfy every conjunct. A continuation that certifies an action is
-its witness.
+Proposers hand over motions. The shield simulates every row with f from x_t, joins it to the executed prefix
+and computes the robustness of the joint trajectory: one future has to satisfy every conjunct. A future that
+certifies an action is its witness.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.policy.dqn.policy import Proposer
-from specshield.robot.dynamics import Body, simulate
+from specshield.compiled import inlined, kernel
+from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
 from specshield.rule.progress import signal_rows
-from specshield.rule.view import View, best_rows, look, rate
-from specshield.stl import Formula, robustness, robustness_bounds
+from specshield.rule.view import View, look, rate, read_step, value_count
+from specshield.shield.proposal import Proposer, ask
+from specshield.stl import SATISFIED_ABOVE, Formula, robustness_bounds
+from specshield.stl.program import STACK_SIZE
+from specshield.stl.tree import tree_value
 from specshield.task import Task
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Signals = Mapping[str, Floats]
+SLOTS = 8  # remembered motions for each step of a future: enough that few share one
+NOT_FINITE = "the formula's arithmetic is not finite along some futures; these certify nothing"
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,11 @@ class Prefix:
     def t(self) -> int:
         return len(self.poses) - 1
 
+    @property
+    def steps(self) -> int:
+        """How many motions a future has: T - t."""
+        return self.task.horizon - self.t
+
 
 def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: Signals) -> Prefix:
     """The prefix as `formula` sees it, the task's own or a part of it; view: that of the formula.
@@ -63,68 +74,180 @@ def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: 
 
 @dataclass(frozen=True)
 class Futures:
-    """The continuations that were tried at one step, several a motion.
+    """The futures that were tried at one step, several a motion, as the shield itself simulated them.
 
-    motions [N, T - t]: each begins with the motion it is for. poses [N, T - t, 3]: where they lead.
-    preferred: what the first policy would do itself.
+    motions [N, T - t]: each begins with the motion it is for. poses [N, T - t, 3]: where they lead. rho [N]:
+    of each joined to the prefix, -inf where it was given up on the way. preferred: what the first proposer
+    would do itself. warnings: which proposers were not used and why.
     """
 
     motions: Ints
     poses: Floats
+    rho: Floats
     preferred: int
+    warnings: tuple[str, ...]
 
 
 def futures(
-    prefix: Prefix, body: Body, policies: Sequence[Proposer], tail: bytes | None, margin: float
+    prefix: Prefix, body: Body, proposers: Sequence[Proposer], tail: bytes | None, margin: float
 ) -> Futures:
-    """Every continuation worth trying from x_t, t < T: the witness's tail, then what each policy proposes.
+    """Every future worth trying from x_t, t < T: the witness's tail, then what each proposer proposes.
 
-    tail: motions from x_t to the horizon, one a byte, T - t of them, re-simulated from the pose there is.
+    tail: motions from x_t to the horizon, one a byte, T - t of them, simulated anew from the pose there is.
     """
-    history, steps = prefix.poses, prefix.task.horizon - prefix.t
-    margins = (margin, 0.0) if margin > 0.0 else (0.0,)  # what cannot be had with the margin may be without
-    proposals = [policy.propose(history, prefix.signals, each) for each in margins for policy in policies]
-    motions, poses = [p.motions for p in proposals], [p.poses for p in proposals]
-    if tail is not None and len(tail) == steps:
-        kept, after = np.frombuffer(tail, np.uint8).astype(np.int64)[None], np.empty((1, steps, 3))
-        simulate(body, history[-1], kept[0], after[0])
-        motions.insert(0, kept)
-        poses.insert(0, after)
-    if len(motions) == 1:
-        return Futures(motions[0], poses[0], proposals[0].preferred)
-    return Futures(np.concatenate(motions), np.concatenate(poses), proposals[0].preferred)
+    count, rows, warnings = motion_count(body), list[Ints](), list[str]()
+    if tail is not None and len(tail) == prefix.steps:
+        rows.append(np.frombuffer(tail, np.uint8).astype(np.int64)[None])
+    preferred = None
+    for each in (
+        (margin, 0.0) if margin > 0.0 else (0.0,)
+    ):  # what cannot be had with the margin may be without
+        for proposer in proposers:
+            proposal, wrong = ask(proposer, prefix.poses, prefix.signals, each, count, prefix.steps)
+            if proposal is None:
+                warnings.append(str(wrong))
+                continue
+            rows.append(proposal.motions)
+            preferred = proposal.preferred if preferred is None else preferred
+    if preferred is None:  # no proposer could be used: the shield can still try to stand
+        still = calmest_motion(body)
+        standing = np.full((count, prefix.steps), still)
+        standing[:, 0] = np.arange(count)
+        rows, preferred = [*rows, standing], still
+    return simulated(prefix, body, rows, preferred, warnings)
+
+
+def simulated(
+    prefix: Prefix, body: Body, rows: Sequence[Ints], preferred: int, warnings: Sequence[str] = ()
+) -> Futures:
+    """The futures of these motions, [n, T - t] each, all within range: simulated and judged in one pass."""
+    motions = np.concatenate([np.empty((0, prefix.steps), np.int64), *rows]) if len(rows) != 1 else rows[0]
+    poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
+    violated = (
+        prefix.high <= SATISFIED_ABOVE
+    )  # then every row is wanted whole: parts of the rule are judged on it
+    finite = _simulate_and_rate(
+        body, prefix.view, prefix.known, prefix.t, prefix.poses[-1], prefix.rows[-1:],
+        prefix.task.robot.wait_motion, not violated, motions, poses, rho,
+    )  # fmt: skip
+    said = warnings if finite else [*warnings, NOT_FINITE]
+    return Futures(motions, poses, rho, preferred, tuple(dict.fromkeys(said)))
 
 
 def together(tried: Futures, more: Futures) -> Futures:
     """Both, as `more` prefers."""
-    motions, poses = np.concatenate([tried.motions, more.motions]), np.concatenate([tried.poses, more.poses])
-    return Futures(motions, poses, more.preferred)
+    return Futures(
+        np.concatenate([tried.motions, more.motions]),
+        np.concatenate([tried.poses, more.poses]),
+        np.concatenate([tried.rho, more.rho]),
+        more.preferred,
+        tuple(dict.fromkeys([*tried.warnings, *more.warnings])),
+    )
 
 
-def rho(prefix: Prefix, tried: Futures) -> Floats:
-    """The robustness of each future joined to the prefix, shape (N,).
-
-    Raises SampleError where the formula's arithmetic is not finite on one.
-    """
+def rho_of(prefix: Prefix, tried: Futures) -> Floats:
+    """The robustness of each future by another formula than it was tried with, shape (N,): a part of it."""
     values = np.empty(len(tried.motions))
     rate(prefix.view, prefix.known, prefix.t, tried.poses, prefix.rows[-1:], values)
-    if np.isnan(values).any():
-        before = np.broadcast_to(prefix.poses, (len(values), *prefix.poses.shape))
-        samples = prefix.task.samples(np.concatenate([before, tried.poses], axis=1), prefix.signals)
-        robustness(prefix.formula, {name: samples[name] for name in prefix.formula.names})
-    return values
+    return np.where(np.isnan(values), -np.inf, values)
+
+
+@kernel
+def _simulate_and_rate(
+    body: Body,
+    view: View,
+    known: Floats,
+    t: int,
+    pose: Floats,
+    held: Floats,
+    wait: int,
+    gives_up: bool,
+    motions: Ints,
+    poses: Floats,
+    rho: Floats,
+) -> bool:
+    """Simulates each row of motions (N, T - t) from x_t, pose (3,), and computes rho (N,) of the joint
+    trajectory; poses (N, T - t, 3) are written. False where the arithmetic was not finite on some row.
+
+    known (tree.size,): the leaves of the prefix; held (1, S): the values that the signals keep; wait: the
+    motion that leaves the pose as it is, -1 where the robot has none. With `gives_up`, a row is given up
+    where the formula can no longer be satisfied on it and an earlier row of its first motion is at least as
+    robust: rho is then -inf, and the poses that follow repeat the last.
+    """
+    tree, steps, finite = view.tree, motions.shape[1], True
+    values, stack, buffer = np.empty(value_count(view, held)), np.empty(STACK_SIZE), np.empty(tree.size)
+    best = np.full(motion_count(body), -np.inf)
+    # Most rows come onto the way of another from the very same pose: there f has been computed already.
+    met = np.full(1 << math.ceil(math.log2(SLOTS * steps)), -1, np.int64)
+    for f in range(motions.shape[0]):
+        first, row = motions[f, 0], poses[f]
+        for n in range(tree.leaf_at.shape[0]):
+            at = tree.leaf_at[n]
+            for i in range(at, at + min(t + 1, tree.leaf_stop[n]) - tree.leaf_start[n]):
+                buffer[i] = known[i]
+        x, y, theta = pose[0], pose[1], pose[2]
+        k, whole = 0, True
+        while k < steps and whole:
+            m = motions[f, k]
+            if m != wait:
+                slot = _slot(x, y, theta, m, met.shape[0])
+                g, j = met[slot] // steps, met[slot] % steps
+                before = poses[g, j - 1] if j > 0 else pose
+                if met[slot] >= 0 and motions[g, j] == m and _is_pose(before, x, y, theta):
+                    x, y, theta = poses[g, j, 0], poses[g, j, 1], poses[g, j, 2]
+                else:
+                    x, y, theta = step(body, x, y, theta, m)
+                    met[slot] = f * steps + k
+            row[k, 0], row[k, 1], row[k, 2] = x, y, theta
+            least = read_step(view, row, held, t + 1, k, values, stack, buffer)
+            if math.isnan(least):
+                whole = finite = False
+            elif gives_up and least <= SATISFIED_ABOVE and least <= best[first]:
+                whole = False
+            k += 1
+        for rest in range(k, steps):
+            row[rest, 0], row[rest, 1], row[rest, 2] = x, y, theta
+        rho[f] = tree_value(tree, buffer) if whole else -np.inf
+        best[first] = max(best[first], rho[f])
+    return finite
+
+
+@inlined
+def _slot(x: float, y: float, theta: float, motion: int, slots: int) -> int:
+    """Where a motion from a pose is remembered, of `slots`, a power of two (Teschner et al., 2003)."""
+    key = int(1e7 * x) * 73856093 ^ int(1e7 * y) * 19349663 ^ int(1e7 * theta) * 83492791 ^ motion * 40503
+    return (key ^ key >> 17) & (slots - 1)
+
+
+@inlined
+def _is_pose(pose: Floats, x: float, y: float, theta: float) -> bool:
+    """Whether it is the same to the last bit."""
+    return bool(pose[0] == x and pose[1] == y and pose[2] == theta)
 
 
 @dataclass(frozen=True)
 class Best:
-    """The most robust future of each motion. robustness [M]; row [M]: its row in `Futures`."""
+    """The most robust future of each motion.
+
+    robustness [M]: -inf where no future was proposed. row [M]: its row in `Futures`, -1 where there is none.
+    """
 
     robustness: Floats
     row: Ints
 
 
 def best_of(tried: Futures, values: Floats, motions: int) -> Best:
-    """The future of each motion with the highest of `values` (N,), the lowest row on ties; each has one."""
-    rows = np.empty(motions, np.int64)
-    best_rows(tried.motions, values, rows)
-    return Best(values[rows], rows)
+    """The future of each motion with the highest of `values` (N,), the lowest row on ties."""
+    rows, robustness = np.empty(motions, np.int64), np.empty(motions)
+    _best_rows(tried.motions, values, rows, robustness)
+    return Best(robustness, rows)
+
+
+@kernel
+def _best_rows(motions: Ints, values: Floats, rows: Ints, robustness: Floats) -> None:
+    rows[:] = -1
+    robustness[:] = -np.inf
+    for f in range(motions.shape[0]):
+        m = motions[f, 0]
+        if rows[m] < 0 or values[f] > robustness[m]:
+            rows[m], robustness[m] = f, values[f]

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.compiled import kernel
 from specshield.rule.residual import again, joined, left_over
 from specshield.rule.view import view_of
 from specshield.shield import shaping
 from specshield.shield.aim import aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, flat, is_place
-from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho, together
+from specshield.shield.feasibility import (
+    Best,
+    Futures,
+    Prefix,
+    best_of,
+    futures,
+    prefix_of,
+    rho_of,
+    together,
+)
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
@@ -29,8 +41,8 @@ class Judged:
     best: Best
     feasible_motion: Bools  # [M]
     feasible: Bools  # [A], S_t; false for a terminal action
-    values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf for a terminal action
-    robustness: Floats  # [A], rho of the whole formula along the same trajectories
+    values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf where nothing was evaluated
+    robustness: Floats  # [A], rho of the whole formula along the same trajectories; -inf likewise
     completion: int
     margin_unattainable: bool  # the margin asked for was lowered
 
@@ -43,13 +55,13 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
     """
     robot, asked = shield.task.robot, shield.config.margin
     motions = len(robot.motions)
-    tried = futures(prefix, shield.body, shield.policies, tail, asked)
-    whole = kept = rho(prefix, tried)
+    tried = futures(prefix, shield.body, shield.proposers, tail, asked)
+    kept = tried.rho
     best, part = best_of(tried, kept, motions), prefix
     if violated:
         tried, best, part = _left(shield, prefix, tried)
-        whole, kept = rho(prefix, tried), rho(part, tried)
-    feasible, lowered = _kept(best, asked)
+        kept = rho_of(part, tried)
+    feasible, lowered = _kept(best.robustness, asked)
     values = best.robustness
     if lowered or (shield.config.slack and _some(best)):
         best, feasible, lowered = aim(shield, part, tried, kept)
@@ -58,17 +70,26 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
         first = tail[0]
     elif some and not feasible[first]:
         first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
-    of = robot.motion_of
-    return Judged(
-        tried=tried,
-        best=best,
-        feasible_motion=feasible,
-        feasible=feasible[of] & ~robot.terminal,
-        values=np.where(robot.terminal, -np.inf, values[of]),
-        robustness=whole[best.row][of],
-        completion=int(robot.representative[first]),
-        margin_unattainable=lowered,
-    )
+    completion = int(robot.representative[first])
+    by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
+    return Judged(tried, best, feasible, *by_action, completion, lowered)
+
+
+@kernel
+def _by_action(
+    motion_of: Ints, feasible: Bools, values: Floats, row: Ints, rho: Floats
+) -> tuple[Bools, Floats, Floats]:
+    """`Judged.feasible`, `values` and `robustness`, each [A], out of what is known of the motions."""
+    count = motion_of.shape[0]
+    all_feasible, all_values = np.zeros(count, np.bool_), np.full(count, -np.inf)
+    robustness = np.full(count, -np.inf)
+    for a in range(count):
+        m = motion_of[a]
+        if m >= 0:
+            all_feasible[a], all_values[a] = feasible[m], values[m]
+            if row[m] >= 0:
+                robustness[a] = rho[row[m]]
+    return all_feasible, all_values, robustness
 
 
 def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best, Prefix]:
@@ -109,10 +130,10 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best
     for parts in filter(None, options()):
         formula = joined(parts)
         part = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
-        best = best_of(tried, rho(part, tried), len(task.robot.motions))
+        best = best_of(tried, rho_of(part, tried), len(task.robot.motions))
         if _some(best):
             break
-    return tried, best or best_of(tried, rho(part, tried), len(task.robot.motions)), part
+    return tried, best or best_of(tried, rho_of(part, tried), len(task.robot.motions)), part
 
 
 def _holds_now(prefix: Prefix, formula: Always) -> bool:
@@ -125,12 +146,17 @@ def _some(best: Best) -> bool:
     return bool(best.robustness.max() > SATISFIED_ABOVE)
 
 
-def _kept(best: Best, asked: float) -> tuple[Bools, bool]:
-    """Which motions keep the margin asked for, or else the largest there is; whether it was lowered."""
-    feasible = best.robustness > SATISFIED_ABOVE + asked
-    if feasible.any() or not _some(best):
+@kernel
+def _kept(robustness: Floats, asked: float) -> tuple[Bools, bool]:
+    """Which motions keep the margin asked for, or else the largest there is; whether it was lowered.
+
+    robustness [M]: of each motion's best future.
+    """
+    feasible = robustness > SATISFIED_ABOVE + asked
+    highest = robustness.max()
+    if feasible.any() or not highest > SATISFIED_ABOVE:
         return feasible, False
-    return best.robustness >= best.robustness.max(), True
+    return robustness >= highest, True
 
 
 def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, ...]:
@@ -152,19 +178,24 @@ def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int)
 
 
 def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
-    terminal = shield.task.robot.terminal
+    """J of each action; a terminal one has the highest of the others (docs/architecture.md)."""
+    robot = shield.task.robot
     if judged is None:
-        return (None,) * len(terminal)
+        return (None,) * len(robot.actions)
     binary = shield.config.evaluation == "feasibility"
     values = judged.feasible.astype(np.float64) if binary else judged.values
-    return tuple(np.where(terminal, values[~terminal].max(), values).tolist())
+    return _as_numbers(np.where(robot.terminal, values.max(), values))
 
 
 def robustness_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
-    terminal = shield.task.robot.terminal
     if judged is None:
-        return (None,) * len(terminal)
-    return tuple(None if end else v for end, v in zip(terminal, judged.robustness.tolist(), strict=True))
+        return (None,) * len(shield.task.robot.actions)
+    return _as_numbers(judged.robustness)
+
+
+def _as_numbers(values: Floats) -> tuple[float | None, ...]:
+    """None where nothing was evaluated."""
+    return tuple([None if value == -math.inf else value for value in values.tolist()])
 
 
 def feasible_mass_of(conditional: Floats | None, judged: Judged | None) -> float | None:

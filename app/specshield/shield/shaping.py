@@ -2,7 +2,7 @@
 
 pi* = argmin KL(pi || prior) subject to E_pi[J] >= threshold (paper, Problem 1). All take log-probabilities,
 so that no large multiplier is ever exponentiated, and condition on not ending: a terminal action keeps
-exactly its prior mass and takes no part (DESIGN.md, section 1).
+exactly its prior mass and takes no part (docs/architecture.md, the terminal token).
 
 Only threshold = 1 with binary J carries a guarantee: a threshold holds per step, and 0.99 ** 150 = 0.22.
 """
@@ -74,12 +74,16 @@ def soften(log_prior: Floats, feasible: Bools, threshold: float) -> Floats | Non
 def tilt(log_prior: Floats, values: Floats, threshold: float) -> Floats | None:
     """Real-valued J: prior exp(lambda J) / Z with the smallest lambda >= 0 whose mean J reaches `threshold`.
 
-    values: J of each action, shape (A,). None where the threshold is above max J on the prior's support;
-    where it equals that maximum, the prior restricted to the actions that reach it.
+    values: J of each action, shape (A,), -inf where nothing was evaluated: such an action gets no mass. None
+    where the threshold is above max J on the prior's support; where it equals that maximum, the prior
+    restricted to the actions that reach it.
     """
-    support = np.isfinite(log_prior)
+    wanted = np.isfinite(log_prior)
+    support = wanted & np.isfinite(values)
     if not np.any(support):
         return None
+    if not np.array_equal(wanted, support):
+        log_prior = log_softmax(np.where(support, log_prior, -np.inf))
     highest = float(np.max(values[support]))
     if threshold > highest:
         return None

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.errors import NotFound
-from specshield.policy.dqn.policy import Proposer
 from specshield.policy.methods import load_policy
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, make_body
+from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 from specshield.world.geodesic import geodesic_distance
 from specshield.world.map_server import load_map

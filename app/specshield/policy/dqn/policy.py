@@ -4,11 +4,10 @@ unpickled.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,46 +20,8 @@ from specshield.policy.dqn.rollout import propose_all
 from specshield.policy.tensors import read_tensors
 from specshield.robot.dynamics import Body, make_body, motion_count, undoing_motions
 from specshield.rule.progress import Rules, make_rules, pasts, signal_rows
+from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """Continuations to the horizon, one after each first motion; several where a margin may be had in several
-    ways.
-
-    motions [N, T - t]: row m < M begins with motion m; indices into `Robot.motions`. poses [N, T - t, 3]:
-    after each. preferred: the motion pi_phi itself takes at x_t.
-    """
-
-    motions: NDArray[np.int64]
-    poses: NDArray[np.float64]
-    preferred: int
-
-
-def as_one(proposals: Sequence[Proposal]) -> Proposal:
-    """The continuations of all of `proposals`, as the first prefers."""
-    first = proposals[0]
-    if len(proposals) == 1:
-        return first
-    motions, poses = [each.motions for each in proposals], [each.poses for each in proposals]
-    return Proposal(np.concatenate(motions), np.concatenate(poses), first.preferred)
-
-
-class Proposer(Protocol):
-    """A policy as the shield sees it: it proposes, exact simulation certifies."""
-
-    @property
-    def id(self) -> str: ...
-
-    @property
-    def task(self) -> Task: ...
-
-    def propose(
-        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
-    ) -> Proposal:
-        """history [t + 1, 3] with t < T; signals {name: [t + 1]}; margin: robustness to aim above."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +66,8 @@ class Policy:
                 body, rules, sight, self.network, past, history, rows, self.task.robot.wait_motion,
                 self._undoing, self.literal, motions, poses,
             )  # fmt: skip
-            proposals.append(Proposal(motions, poses, preferred))
-        return as_one(proposals)
+            proposals.append(Proposal(motions, preferred))
+        return joined(*proposals)
 
     def weights(self) -> bytes:
         """The safetensors file."""

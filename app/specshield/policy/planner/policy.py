@@ -29,7 +29,6 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
-from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
@@ -44,6 +43,7 @@ from specshield.rule.progress import signal_rows
 from specshield.rule.residual import bounds_after, residuals, still_open
 from specshield.rule.values import initial_signals, places, regions_of
 from specshield.rule.view import look
+from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.stl.program import STACK_SIZE, compile_predicate, pack
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree
@@ -121,7 +121,7 @@ class PlannerPolicy:
             found = any(found for _, found in plans)
             if found:
                 break
-        return as_one([proposal for proposal, _ in plans]), found
+        return joined(*(proposal for proposal, _ in plans)), found
 
     def _asked(
         self, formula: Formula, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
@@ -146,7 +146,7 @@ class PlannerPolicy:
         effort = self.settings.effort * max(1.0, self.task.horizon / USUAL) ** 2
         world = world._replace(literals=literals)
         first, found = plan_all(world, t, history[-1], rows[-1], known, effort, motions, poses)
-        return Proposal(motions, np.ascontiguousarray(poses[:, 1:]), int(first)), bool(found)
+        return Proposal(motions, int(first)), bool(found)
 
     def feasible_start(self, lattice: Lattice) -> float:
         """The share of poses drawn from the lattice (the same each time) that some plan begins at."""

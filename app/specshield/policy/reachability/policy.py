@@ -15,7 +15,6 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
-from specshield.policy.dqn.policy import Proposal, as_one
 from specshield.policy.lattice import heading_count, holds_at, make_lattice
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
@@ -33,6 +32,7 @@ from specshield.rule.progress import (
     pasts,
     signal_rows,
 )
+from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
 
 MAX_ENTRIES = 100_000_000  # 400 MB while the tables are made
@@ -69,8 +69,8 @@ class ReachabilityPolicy:
             motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
             poses = np.empty((*motions.shape, 3))
             preferred = propose_all(guide, self.settings.beam, past, history, rows, motions, poses)
-            proposals.append(Proposal(motions, poses, int(preferred)))
-        return as_one(proposals)
+            proposals.append(Proposal(motions, int(preferred)))
+        return joined(*proposals)
 
     def weights(self) -> bytes:
         """The safetensors file."""

@@ -14,12 +14,12 @@ from typing import Any
 
 from specshield.errors import FormulaError, NotFound, PolicyError, SpecshieldError
 from specshield.policy.card import policy_id
-from specshield.policy.dqn.policy import Proposer
 from specshield.policy.methods import load_policy
 from specshield.robot import robot_from_json
 from specshield.service.library import files
 from specshield.service.library.maps import Maps
 from specshield.service.settings import Settings
+from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 
 KEPT_IN_MEMORY = 64

@@ -70,6 +70,9 @@ class StepResponse(Answer):
     residual: Residual | None = Field(
         description="How far x_t is from where the executed action should have led."
     )
+    warnings: list[str] = Field(
+        description="What did not go as it should, such as a policy whose proposal could not be used."
+    )
     witness: list[int] | None = Field(description="Action indices that follow `action` to the horizon.")
     witnesses: list[list[int] | None] | None = Field(
         None, description="The same for each action, if asked for."

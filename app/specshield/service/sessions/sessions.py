@@ -18,6 +18,7 @@ import numpy as np
 
 from specshield.errors import Conflict, FragmentError, InfeasibleStart, InputError, LimitReached, NotFound
 from specshield.lookahead.lookahead import AHEADS
+from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
 from specshield.service.library import files
@@ -40,11 +41,12 @@ from specshield.service.sessions.session import (
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Change, Record, Store
 from specshield.shield import episode
-from specshield.shield.decision import Carry, Config, Decision, Shield, make_shield
+from specshield.shield.decision import Carry, Config, Decision, Shield, check_preferring, make_shield
+from specshield.shield.preference import Preference
 
 R = TypeVar("R")
 RACES = 10  # writes lost to others before a caller is told so
-CONFIG = ("seed", "threshold", "margin", "slack", "evaluation", "shaping", "max_steps")
+CONFIG = ("seed", "threshold", "margin", "slack", "evaluation", "max_steps")
 
 
 class Sessions:
@@ -54,28 +56,38 @@ class Sessions:
         self._settings, self._store, self._policies = settings, store, policies
         self._shields = files.Recent[Shield](settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
-        self._ahead = files.Recent[Future[None]](AHEADS)
+        self._preferences = files.Recent[Future[Preference]](AHEADS)
         self._preparing = ThreadPoolExecutor(1, "prepare")
-        self._latest: Future[None] | None = None  # asked of it
+        self._latest: Future[Preference] | None = None  # the last one that was asked for
 
     async def create(self, request: SessionRequest) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
         await self._check_room()
-        if request.shaping == "lookahead":
-            await self._foresee(request)
-        config, state, rows = await self._run(self._begin, request)
+        settings = self._checked(request)
+        preference = None
+        if request.shaping != PROJECTION:
+            preference = await self._prepared(request)
+        config, state, rows = await self._run(self._begin, request, settings, preference)
         change = Change(files.to_json(asdict(state)), pack(rows))
         await self._store.create(config["id"], files.to_json(config), change)
         return describe(config, state)
 
-    def _begin(self, request: SessionRequest) -> tuple[dict[str, Any], State, Floats]:
+    def _checked(self, request: SessionRequest) -> Config:
+        """The session's settings. Raises InputError for those that cannot be had."""
         if (request.max_steps or 0) > self._settings.max_steps:
             expected = f"at most {self._settings.max_steps}"
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
-        settings = {name: getattr(request, name) for name in CONFIG}
+        config = Config(**{name: getattr(request, name) for name in CONFIG})
+        if request.shaping != PROJECTION:
+            check_preferring(config)
+        return config
+
+    def _begin(
+        self, request: SessionRequest, settings: Config, preference: Preference | None
+    ) -> tuple[dict[str, Any], State, Floats]:
         records = [self._policies.record(key) for key in request.policies]
         ids = [record.id for record in records]
-        shield = self._shield(ids, Config(**settings))
+        shield = replace(self._shield(ids, settings), preference=preference)
         feasible = True
         try:
             episode.start(shield, request.initial_pose)
@@ -100,7 +112,8 @@ class Sessions:
             "horizon": task.horizon,
             "actions": list(task.robot.action_names),
             "terminal_actions": np.flatnonzero(task.robot.terminal).tolist(),
-            **settings,
+            **{name: getattr(settings, name) for name in CONFIG},
+            "shaping": request.shaping,
             "max_steps": shield.max_steps,
             "created_at": files.now(),
             "nonce": secrets.token_hex(8),
@@ -159,8 +172,8 @@ class Sessions:
         if request.logits is not None:
             logits = [-np.inf if value is None else value for value in request.logits]
         carry = None if session.state.carry is None else Carry.from_json(session.state.carry)
-        if shield.config.shaping == "lookahead" and not self._foreseen(shield, session):
-            shield = replace(shield, config=replace(shield.config, shaping="projection"))
+        if session.config["shaping"] != PROJECTION:
+            shield = replace(shield, preference=self._preference_at_hand(shield, session))
         with _clock(timing, "rollout"):
             decision = episode.decide(
                 shield,
@@ -263,37 +276,43 @@ class Sessions:
 
         return replace(self._shields.get(tuple(policy_ids), make), config=config)
 
-    async def _foresee(self, request: SessionRequest) -> None:
-        """Prepares a task's look-ahead, which takes seconds, and keeps none of the decisions' threads."""
+    async def _prepared(self, request: SessionRequest) -> Preference:
+        """The preference that a session asks for. Preparing it takes seconds, in a thread of its own, so that
+        no decision waits for it.
+        """
 
-        def begin() -> Future[None]:
+        def begin() -> Future[Preference]:
             ids = [self._policies.record(key).id for key in request.policies]
-            return self._prepare(ids, self._shield(ids, Config()), np.array([request.initial_pose]))
+            return self._prepare(request.shaping, ids, self._shield(ids, Config()), request.initial_pose)
 
         try:
-            await asyncio.shield(asyncio.wrap_future(await self._run(begin)))
+            return await asyncio.shield(asyncio.wrap_future(await self._run(begin)))
         except FragmentError as error:
             raise FragmentError(
-                f"look-ahead cannot be had for this formula: {error.message}", path="shaping",
-                got="lookahead", expected="'projection', or a formula that 'reachability' takes",
+                f"{request.shaping!r} cannot be had for this formula: {error.message}", path="shaping",
+                got=request.shaping, expected="'projection', or a formula that 'reachability' takes",
             ) from None  # fmt: skip
 
-    def _prepare(self, policy_ids: Sequence[str], shield: Shield, poses: Floats) -> Future[None]:
-        def begin() -> Future[None]:
-            self._latest = self._preparing.submit(episode.prepare_ahead, shield, poses)
+    def _prepare(
+        self, name: str, policy_ids: Sequence[str], shield: Shield, pose: Sequence[float]
+    ) -> Future[Preference]:
+        def begin() -> Future[Preference]:
+            self._latest = self._preparing.submit(prepare, name, shield.task, shield.proposers, pose)
             return self._latest
 
-        return self._ahead.get(tuple(policy_ids), begin)
+        return self._preferences.get((name, *policy_ids), begin)
 
-    def _foreseen(self, shield: Shield, session: Session) -> bool:
-        """Whether this process has the task's look-ahead. If not it is begun, unless another is under way:
-        with more tasks than are kept they would pile up, and whoever creates a session would wait for all.
+    def _preference_at_hand(self, shield: Shield, session: Session) -> Preference | None:
+        """The session's preference if this process has prepared it; until then the session projects.
+
+        What is missing is begun, unless another is being prepared: with more tasks than are kept they would
+        pile up, and whoever creates a session would wait for them all.
         """
-        ids = tuple(session.config["policy_ids"])
-        found = self._ahead.peek(ids)
+        name, ids = session.config["shaping"], session.config["policy_ids"]
+        found = self._preferences.peek((name, *ids))
         if found is None and (self._latest is None or self._latest.done()):
-            found = self._prepare(ids, shield, session.poses[-1:])
-        return found is not None and found.done() and found.exception() is None
+            found = self._prepare(name, ids, shield, session.poses[-1])
+        return found.result() if found is not None and found.done() and found.exception() is None else None
 
     async def _run(self, function: Callable[..., R], *args: Any) -> R:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)

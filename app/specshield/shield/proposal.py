@@ -1,0 +1,116 @@
+"""What a policy hands to the shield: motions, and nothing that the shield believes.
+
+A proposer is not trusted (docs/architecture.md, "Who is trusted"). The shield takes only the motions out of a
+proposal, checks their number and range, and simulates each of them itself. A proposer that is wrong or lies
+makes the shield stricter than it need be; it cannot get an action certified that has no satisfying future.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel
+from specshield.task import Task
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+MAX_MOTIONS = 1_000_000  # in one proposal, all rows together: 32 MB while they are simulated
+log = logging.getLogger("specshield")
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Futures to the horizon, usually one after each first motion.
+
+    motions [N, T - t]: indices into `Robot.motions`; a row is the future of the motion that it begins with.
+    preferred: the motion that the policy itself would take at x_t.
+    """
+
+    motions: Ints
+    preferred: int
+
+
+class Proposer(Protocol):
+    """A policy as the shield sees it."""
+
+    @property
+    def id(self) -> str: ...
+
+    @property
+    def task(self) -> Task: ...
+
+    def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
+        """history [t + 1, 3] with t < T; signals {name: [t + 1]}; margin: robustness to aim above."""
+        ...
+
+
+def joined(*proposals: Proposal) -> Proposal:
+    """The futures of all of them; what the first prefers is preferred."""
+    if len(proposals) == 1:
+        return proposals[0]
+    return Proposal(np.concatenate([each.motions for each in proposals]), proposals[0].preferred)
+
+
+def ask(
+    proposer: Proposer, history: Floats, signals: Mapping[str, Floats], margin: float, count: int, steps: int
+) -> tuple[Proposal | None, str | None]:
+    """A proposal of `steps` motions a row, all below `count`, and else what was wrong with it, as a sentence.
+
+    The proposer gets copies of the history and the signals, and its motions are copied: nothing that it does
+    later reaches the decision.
+    """
+    try:
+        name = str(proposer.id)[:80]
+        given = proposer.propose(history.copy(), {n: v.copy() for n, v in signals.items()}, margin)
+        motions, preferred = _checked(given, count, steps)
+    except _Refused as refused:
+        return None, f"policy {name!r} was not used at this step: {refused}"
+    except Exception as error:  # whatever a proposer does wrong, the step is still decided
+        log.warning("a policy failed to propose", exc_info=True)
+        return None, f"a policy was not used at this step: it raised {type(error).__name__}"
+    return Proposal(motions, preferred), None
+
+
+class _Refused(Exception):
+    """Its text says what is wrong with a proposal."""
+
+
+def _checked(given: object, count: int, steps: int) -> tuple[Ints, int]:
+    if not isinstance(given, Proposal):
+        raise _Refused(f"it returned {type(given).__name__}; expected a Proposal")
+    motions, preferred = given.motions, given.preferred
+    if not isinstance(motions, np.ndarray) or motions.dtype.kind not in "iu":
+        raise _Refused("its motions are not an array of integers")
+    if motions.ndim != 2 or motions.shape[1] != steps or not 0 < motions.size <= MAX_MOTIONS:
+        most = MAX_MOTIONS // steps
+        raise _Refused(
+            f"its motions have the shape {list(motions.shape)}; expected [N, {steps}], N from 1 to {most}"
+        )
+    own = np.array(motions, np.int64, order="C")
+    wrong = _first_outside(own, count)
+    if wrong is not None:
+        raise _Refused(f"it names motion {wrong}; the robot has motions 0 to {count - 1}")
+    if (
+        isinstance(preferred, bool)
+        or not isinstance(preferred, (int, np.integer))
+        or not 0 <= preferred < count
+    ):
+        raise _Refused(f"it prefers motion {preferred!r:.40}; the robot has motions 0 to {count - 1}")
+    return own, int(preferred)
+
+
+@kernel
+def _first_outside(motions: Ints, count: int) -> int | None:
+    """The first of motions [N, T - t] that is not from 0 to `count` - 1, None where all are."""
+    for row in range(motions.shape[0]):
+        for k in range(motions.shape[1]):
+            if not 0 <= motions[row, k] < count:
+                return int(motions[row, k])
+    return None
