@@ -11,7 +11,7 @@ from specshield.policy.options import option
 
 if TYPE_CHECKING:
     from specshield.policy.card import Card
-    from specshield.policy.dqn.policy import Proposer
+    from specshield.shield.proposal import Proposer
     from specshield.task import Task
 
 
