@@ -22,8 +22,8 @@ from evaluation import runs
 from evaluation.experiment import Experiment, experiments
 from evaluation.runs import Record
 from specshield.lookahead.belief import Belief
+from specshield.lookahead.goals import cell_of
 from specshield.lookahead.lookahead import prepare
-from specshield.lookahead.surrogate import cell_of
 from specshield.sim.learned.model import LearnedModel
 from specshield.sim.robot import SimulatedRobot
 
@@ -78,7 +78,7 @@ def _tell(experiment: Experiment, from_start: bool) -> None:
     setting = experiment.setting
     ahead = prepare(setting.case.task, setting.ours.proposers)
     goals = ahead.goals
-    row, column = cell_of(ahead.body, goals.pitch, *goals.distance.shape[1:], *setting.case.target)
+    row, column = cell_of(ahead.body, goals, *setting.case.target)
     around = goals.distance[
         :, max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4
     ]  # it is on furniture

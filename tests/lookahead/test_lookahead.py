@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from specshield.lookahead.belief import STYLE, Belief
-from specshield.lookahead.desirability import NEVER, desirability, solve
+from specshield.lookahead.desirability import UNKEEPABLE, desirability, solve
 from specshield.lookahead.expansion import expand_all
-from specshield.lookahead.lattice import make_planes
+from specshield.lookahead.goals import make_goals
+from specshield.lookahead.lattice import is_blocked, make_planes
 from specshield.lookahead.lookahead import prepare
 from specshield.lookahead.surrogate import (
     FEATURES,
     WANDER,
+    StandIn,
     end_chance,
     follow,
-    is_blocked,
-    make_goals,
     price_left,
     step_price,
 )
@@ -87,7 +87,7 @@ def solve_cells(r, e, price, left):
     for s, (i, j, h) in enumerate(STATES):
         at = (j + planes.pad) * planes.width + i + planes.pad
         motions[:, h, at], ends[h, at], remaining[at] = np.log(r[s]), e[s], left[s]
-    return planes, solve(WORLD.body, planes, motions, ends, price, remaining)
+    return planes, solve(WORLD.body, planes, StandIn(motions, ends, price, remaining))
 
 
 @pytest.mark.parametrize(("price", "slope"), [(0.0, 0.0), (0.5, 1.5)])
@@ -120,7 +120,7 @@ def test_exact_steps_and_the_lattice_charge_alike(which):
     for s in free:
         pose = WORLD.pose(*STATES[s])
         successors(body, np.array(pose), nexts)
-        blocked = np.array([is_blocked(body, m, *pose, after) for m, after in enumerate(nexts)])
+        blocked = np.array([is_blocked(body, m, *pose, tuple(after)) for m, after in enumerate(nexts)])
         e[s] = follow(body, goals, lead, STYLE, *pose, blocked, scratch, log_r)
         r[s], left[s] = np.exp(log_r), price_left(body, goals, lead, *pose[:2])
     assert np.ptp(left) > 1.0 or lead != len(goals.distance) - 1
@@ -140,7 +140,7 @@ def test_exact_steps_and_the_lattice_charge_alike(which):
             then = settled(mask, after, t + 1)
             best = np.inf if then is None else wanted[t + 1, then][after]
             due = left[after] if then == 3 and mask != 3 else 0.0
-            assert (found[0, m] < NEVER) == np.isfinite(best)
+            assert (found[0, m] < UNKEEPABLE) == np.isfinite(best)
             if np.isfinite(best):
                 assert found[0, m] == pytest.approx(best + due, rel=0.03, abs=0.03)
                 seen += 1
@@ -179,7 +179,7 @@ def test_following_it_costs_what_the_best_path_does():
     def cost(t, mask, s):
         if t == HORIZON:
             return 0.0
-        left, feasible = np.full(MOTIONS, float(NEVER)), np.zeros(MOTIONS, bool)
+        left, feasible = np.full(MOTIONS, float(UNKEEPABLE)), np.zeros(MOTIONS, bool)
         for m in range(MOTIONS):
             after = int(WORLD.table[s, m])
             then = settled(mask, after, t + 1)
@@ -237,7 +237,7 @@ def seeks(goal):
     def speak(t, pose, random):
         nexts, motions = np.empty((len(TASK.robot.motions), 3)), len(TASK.robot.motions)
         successors(ahead.body, pose, nexts)
-        blocked = np.array([is_blocked(ahead.body, m, *pose, after) for m, after in enumerate(nexts)])
+        blocked = np.array([is_blocked(ahead.body, m, *pose, tuple(after)) for m, after in enumerate(nexts)])
         log_r, scratch, style = np.empty(motions), np.empty((motions, FEATURES)), np.array(SHARP_STYLE)
         end = follow(ahead.body, ahead.goals, goal, style, *pose, blocked, scratch, log_r)
         of = TASK.robot.motion_of

@@ -1,7 +1,10 @@
-"""What a session has learned of its model: where it goes, if anywhere, how sharply, how far to trust that.
+"""What a session has learned of its model: where the model goes, if anywhere, how sharply, and how far the
+stand-ins can be trusted to say what it will do.
 
-Each goal, and wandering, is charged the KL of what the model said from what the surrogate (surrogate.py)
-would have said. Where the model's own habits predict it far better than those do, look-ahead vanishes.
+At each step every goal, and wandering, is charged the KL of what the model said from what the stand-in
+(surrogate.py) would have said. What has been charged least is the likeliest. The model's habits, a running
+average of what it said, predict it too. Where they predict it far better than the stand-ins do, the trust
+falls to nothing, and look-ahead with it.
 """
 
 from __future__ import annotations
@@ -13,30 +16,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel
-from specshield.lookahead.surrogate import FEATURES, WANDER, Goals, cell_of, describe, follow
+from specshield.lookahead.goals import Goals, cell_of
+from specshield.lookahead.surrogate import FEATURES, WANDER, describe, follow
 from specshield.robot.dynamics import Body, displacements
 
 Floats = NDArray[np.float64]
 
+# Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
 STYLE = np.array([2.0, 2.0, -2.0, -1.0])  # of an unknown model: the logit of each feature
 SURE = 3.0  # observations that STYLE counts for
 KEEP = 0.97  # of the charges from one step to the next: models change their minds
-TRACK = 0.95  # of the record of predictions, likewise
-HABITS = 0.1  # how fast the running average of the model's motions follows
-DOUBT = 6.0  # [nats] by which habits may predict better, over the last 1 / (1 - TRACK) steps
-WARY = 6.0  # of them before anything is seen: a model that ends soon by itself is best left alone
+TRACK = 0.95  # of the record of predictions from one step to the next
+HABITS = 0.1  # of the running average that a new observation makes up
+DOUBT = 6.0  # [nats] by which habits predict better, over the last 1 / (1 - TRACK) steps, at trust 0.5
+WARY = 6.0  # [nats] of that before anything is seen: a model that ends soon by itself is best left alone
 SHARP = 20.0  # a KL is charged for a whole distribution, which tells more than one draw from it would
-POSSIBLE = 0.03  # of the leading goal's probability: goals below that are left out
-FLOOR = 0.03  # of the surrogate's mass is spread over all motions: no observation rules a goal out
-LEAST = 1e-6  # of a motion's probability
-FLATTEST, STEEPEST = 0.5, 4.0  # logits a feature
+POSSIBLE = 0.03  # of the likeliest goal's probability: goals below that are left out
+FLOOR = 0.03  # of a stand-in's mass is spread over all motions: no observation rules a goal out
+LEAST_SAID = 1e-6  # the probability of a motion that the model rules out, for its logarithm
+FLATTEST, STEEPEST = 0.5, 4.0  # logits a feature that are believed of a model
 
 
 @dataclass(frozen=True)
 class Belief:
-    """cost [G + 1]: charges [nats] of each goal and, last, of wandering. normal [F, F], moment [F]: of the
-    least squares that fit the model's style. habit [M]: running average of the probabilities of its motions.
-    excess: running sum of what the surrogate was charged above what the habit was [nats].
+    """cost [G + 1]: what each goal and, last, wandering have been charged [nats]. normal [F, F], moment [F]:
+    the normal equations of the least squares that fit the model's style. habit [M]: the running average of
+    the probabilities of its motions. excess: the running sum of what the likely stand-ins were charged above
+    what the habit was [nats].
     """
 
     cost: Floats
@@ -47,7 +53,7 @@ class Belief:
 
     @property
     def trust(self) -> float:
-        """How far the surrogate can be trusted, 0 to 1."""
+        """How far the stand-ins can be trusted, 0 to 1."""
         return 0.5 * (1.0 + math.tanh(0.5 * (DOUBT - self.excess)))
 
     @property
@@ -58,7 +64,7 @@ class Belief:
         return np.array([sharp, sharp, -sharp, fitted[3]])
 
     def probabilities(self) -> Floats:
-        """Of each goal, 0 for those that hardly can be it, and of wandering. Shape (G + 1,)."""
+        """That the model goes to each goal, 0 for those hardly possible, and that it wanders, (G + 1,)."""
         goals, wander = self.cost[:-1], self.cost[-1]
         odds = np.exp(SHARP * (goals.min() - goals))
         odds[odds < POSSIBLE] = 0.0
@@ -95,25 +101,24 @@ def observe(
     said: Floats,
     end: float,
 ) -> Belief:
-    """After what the model said at x_t (3,).
+    """The belief after what the model said at x_t (3,).
 
-    blocked [M]: motions that something would stop short. said [M]: the motions' probabilities, given that it
-    does not end; end: the probability that it does.
+    blocked [M]: the motions that an obstacle stops short. said [M]: the motions' probabilities, given that
+    the model does not end; end: the probability that it does.
     """
-    said = np.maximum(said, LEAST) / np.maximum(said, LEAST).sum()
+    said = np.maximum(said, LEAST_SAID) / np.maximum(said, LEAST_SAID).sum()
     log_said = np.log(said)
     charges = np.empty(len(belief.cost))
     x, y, theta = (float(v) for v in pose)
     _charge(body, goals, belief.style, x, y, theta, blocked, said, log_said, end, charges)
     usual = float(said @ (log_said - np.log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
-    sided = _sided(body, said)  # one that wanders turns to either side, and which is no error
+    sided = _sided(body, said)  # one that wanders turns to either side: to which is no error of the stand-in
     excess = TRACK * belief.excess + float(belief.probabilities() @ charges) - usual
     excess -= float(belief.probabilities()[-1]) * sided
     cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
     lead, features = int(np.argmin(cost[:-1])), np.empty((len(said), FEATURES))
-    row, column = cell_of(body, goals.pitch, goals.distance.shape[1], goals.distance.shape[2], x, y)
-    wu, wv = (float(w) for w in goals.way[lead, row, column])
-    describe(body, wu, wv, theta, blocked, features)
+    row, column = cell_of(body, goals, x, y)
+    describe(body, goals.way[lead, row, column], theta, blocked, features)
     weight = 0.5 * said + 0.5 / len(said)
     features -= weight @ features
     wanted = np.maximum(log_said, log_said.max() - 10.0)
@@ -128,10 +133,9 @@ def observe(
 
 
 def _sided(body: Body, said: Floats) -> float:
-    """The KL of the motions said from the same with no side preferred to the other [nats]."""
+    """The KL of what was said from the same with left and right made alike [nats]."""
     moves, turns = displacements(body)
-    alike = moves[:, None] == moves
-    mirrored = alike & (np.abs(turns[:, None] + turns) < 1e-9)
+    mirrored = (moves[:, None] == moves) & (np.abs(turns[:, None] + turns) < 1e-9)
     even = np.where(mirrored.any(axis=0), 0.5 * (said + mirrored @ said), said)
     return float(said @ np.log(said / even))
 
@@ -150,7 +154,9 @@ def _charge(
     end: float,
     charges: Floats,
 ) -> None:
-    """The KL of the motions said from each goal's, and from wandering, and the log loss of the end."""
+    """Of each goal and of wandering: the KL of the motions said from the stand-in's, and the log loss of the
+    end, into charges [G + 1].
+    """
     motions, wander = said.shape[0], charges.shape[0] - 1
     features, log_r = np.empty((motions, FEATURES)), np.empty(motions)
     for g in range(charges.shape[0]):

@@ -1,4 +1,7 @@
-"""D at the next poses, by exact steps of the surrogates first: beside a wall the lattice knows little."""
+"""D at the next poses, by a few exact steps of the stand-ins before the lattice is asked.
+
+Beside a wall the coarse lattice knows little of what f does; an exact step does.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf
-from specshield.lookahead.desirability import NEVER, desirability
-from specshield.lookahead.lattice import Planes
-from specshield.lookahead.surrogate import FEATURES, Goals, follow, is_blocked, price_left, step_price
+from specshield.lookahead.desirability import UNKEEPABLE, desirability
+from specshield.lookahead.goals import Goals
+from specshield.lookahead.lattice import Planes, is_blocked
+from specshield.lookahead.surrogate import FEATURES, follow, price_left, step_price
 from specshield.robot.dynamics import Body, step
 from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
 
 Floats = NDArray[np.float64]
 
-DEPTH = 2  # exact steps before the lattice is asked
+DEPTH = 2  # exact steps before the lattice is asked; chosen by hand, nothing measured
 
 
 @kernel
@@ -34,11 +38,12 @@ def expand_all(
     pose_t: Floats,
     out: Floats,
 ) -> None:
-    """D after each motion from x_t, out (K, M), for the K tables asked for.
+    """D after each motion from x_t, into out (K, M), for the K tables asked for.
 
-    tables [B, kept, H, rows], leads [B]: the goal that each is for, or WANDER. mask: the goals of the
-    formula settled at t. A tree of poses: level d holds the M^d poses at t + d, the children of its node n
-    being nodes M n to M n + M - 1 of the next.
+    tables [B, kept, H, rows]: codes of D; leads [B]: the goal of the stand-in that each is for, or WANDER;
+    asked (K,): which tables. style (FEATURES,): of the stand-ins. mask: the goals of the formula settled at
+    t. The poses form a tree: level d holds the M^d poses at t + d, and the children of its node n are nodes
+    M n to M n + M - 1 of the next level.
     """
     motions, horizon = out.shape[1], planes.slot.shape[0] - 2
     levels = min(DEPTH + 1, horizon - t)
@@ -56,9 +61,10 @@ def expand_all(
             u, v, w = pose[n]
             for m in range(motions):
                 child = start[d + 1] + (n - start[d]) * motions + m
-                pose[child, 0], pose[child, 1], pose[child, 2] = step(body, u, v, w, m)
-                blocked[n, m] = is_blocked(body, m, u, v, w, pose[child])
-                read_predicates(rules, pose[child, 0], pose[child, 1], pose[child, 2], values, stack, read)
+                x, y, theta = step(body, u, v, w, m)
+                blocked[n, m] = is_blocked(body, m, u, v, w, (x, y, theta))
+                pose[child, 0], pose[child, 1], pose[child, 2] = x, y, theta
+                read_predicates(rules, x, y, theta, values, stack, read)
                 settled[child] = _settle(rules, planes, t + d + 1, settled[n], read)
     cost, log_r, features = np.empty(start[-1]), np.empty(motions), np.empty((motions, FEATURES))
     full = planes.slot.shape[1] - 1
@@ -66,7 +72,7 @@ def expand_all(
         lead = leads[asked[k]]
         for d in range(levels, 0, -1):
             for n in range(start[d], start[d + 1]):
-                cost[n] = float(NEVER)
+                cost[n] = float(UNKEEPABLE)
                 if settled[n] < 0:
                     continue
                 u, v, w = pose[n]
@@ -76,26 +82,26 @@ def expand_all(
                     ends = follow(body, goals, lead, style, u, v, w, blocked[n], features, log_r)
                     first = start[d + 1] + (n - start[d]) * motions
                     total = _log_sum(log_r, cost[first : first + motions])
-                    if total > -float(NEVER):
+                    if total > -float(UNKEEPABLE):
                         due = step_price(lead) if settled[n] != full else 0.0
                         cost[n] = due - (1.0 - ends) * total
                 before = start[d - 1] + (n - start[d]) // motions
-                if cost[n] < NEVER and settled[n] == full and settled[before] != full:
+                if cost[n] < UNKEEPABLE and settled[n] == full and settled[before] != full:
                     cost[n] += price_left(body, goals, lead, u, v)
         out[k] = cost[start[1] : start[2]]
 
 
 @leaf
 def _log_sum(log_r: Floats, cost: Floats) -> float:
-    """log sum_m r_m exp(-cost_m) over the motions that have a cost; -NEVER where none has."""
-    least, total = float(NEVER), 0.0
+    """log sum_m r_m exp(-cost_m) over the motions that have a cost; -UNKEEPABLE where none has."""
+    least, total = float(UNKEEPABLE), 0.0
     for m in range(cost.shape[0]):
-        if cost[m] < NEVER:
+        if cost[m] < UNKEEPABLE:
             least = min(least, cost[m] - log_r[m])
     for m in range(cost.shape[0]):
-        if cost[m] < NEVER:
+        if cost[m] < UNKEEPABLE:
             total += math.exp(least - cost[m] + log_r[m])
-    return math.log(total) - least if total > 0.0 else -float(NEVER)
+    return math.log(total) - least if total > 0.0 else -float(UNKEEPABLE)
 
 
 @leaf

@@ -8,12 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel
+from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.lookahead.surrogate import is_blocked
 from specshield.policy.lattice import heading_count, pose_of
 from specshield.policy.reachability.tables import Tables, slack
-from specshield.robot.dynamics import Body, in_collision, longest_motions, motion_count, step
+from specshield.robot.dynamics import (
+    Body,
+    displacement,
+    in_collision,
+    longest_motions,
+    motion_count,
+    step,
+)
 from specshield.rule.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -25,23 +31,30 @@ from specshield.rule.progress import (
     value_count,
 )
 
-PITCH = 0.4  # [m]: as fine as the stand-ins deserve
-MAX_HEADINGS = 24
-MAX_ENTRIES = 40_000_000  # poses times steps and sets of settled goals
-KEPT = 500_000  # of them, in a table of D
+COARSE_PITCH = 0.4  # [m] as fine as the stand-ins deserve; chosen by hand, nothing measured
+MOST_HEADINGS = 24  # one for each 15 degrees; chosen by hand, nothing measured
+MAX_ENTRIES = 40_000_000  # poses times steps and sets of settled goals: what solving one stand-in costs
+KEPT_ENTRIES = 500_000  # of them that a table of D keeps, 1 MB
+
+Ints = NDArray[np.int64]
 
 
 class Planes(NamedTuple):
     """The lattice and the formula's windows. Poses [H, N]: a padded plane of cells for each heading.
 
-    pad, width: of a plane, in cells. free [M, H, N]: 1 where a motion is not stopped short. holds, keeps [H,
-    N]: bit g where goal g's, bit k where obligation k's predicate is true. goal [G]: the obligations that are
-    goals; first, last [G]: the steps at which a visit settles them (of a dwell, its beginning). due, open [T
-    + 2]: bits of the always that hold at a step, of the goals that can be settled. slot [T + 2, 2^G]: numbers
-    each step and set of settled goals that can be had, -1 for others. kept [T + 2, 2^G]: where a table of D
-    has them, a few steps sharing what holds at the last of them; row [N]: where it has a cell, -1 where no
-    pose is free. possible [slots, H, N]: 1 where the rule can still be kept, as a policy's tables say; of no
-    slots where there are none to say so.
+    The lattice. pitch [m]; pad, width: of a plane, in cells. valid [H, N]: 1 where a pose is free; free [M,
+    H, N]: 1 where a motion is not stopped short; row [N]: the place of a cell in a table of D, -1 where no
+    pose is free.
+
+    The formula. holds, keeps [H, N]: bit g is set where the predicate of goal g holds, bit k where that of
+    obligation k does. goal [G]: the obligations that are goals; first, last [G]: the steps between which a
+    visit settles them (of a dwell, the visit's beginning). due, open [T + 2]: bits of the `always` that have
+    to hold at a step, and of the goals that can be settled at it.
+
+    The sets of settled goals at each step. slot [T + 2, 2^G]: numbers those that can be had, -1 for the
+    others. kept [T + 2, 2^G]: their places in a table of D; a few steps share the place of the last of them.
+    possible [slots, H, N]: 1 where the tables of a policy say that the rule can still be kept; it has no
+    slots where there are no tables.
     """
 
     pitch: float
@@ -51,23 +64,23 @@ class Planes(NamedTuple):
     free: NDArray[np.float32]
     holds: NDArray[np.int32]
     keeps: NDArray[np.int32]
-    goal: NDArray[np.int64]
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
+    goal: Ints
+    first: Ints
+    last: Ints
     due: NDArray[np.int32]
     open: NDArray[np.int32]
-    slot: NDArray[np.int64]
-    kept: NDArray[np.int64]
-    row: NDArray[np.int64]
+    slot: Ints
+    kept: Ints
+    row: Ints
     possible: NDArray[np.uint8]
 
 
 def make_planes(
-    body: Body, rules: Rules, horizon: int, tables: Tables | None = None, pitch: float = PITCH
+    body: Body, rules: Rules, horizon: int, tables: Tables | None = None, pitch: float = COARSE_PITCH
 ) -> Planes:
     """Raises Unsupported where the tables would be too large."""
     longest, largest = longest_motions(body)
-    headings = min(heading_count([largest] if largest else []), MAX_HEADINGS)
+    headings = min(heading_count([largest] if largest else []), MOST_HEADINGS)
     rows, columns = (math.ceil(n * body.resolution / pitch - 1e-9) for n in body.occupied.shape)
     pad = math.ceil(longest / pitch - 1e-9) + 1
     width, cells = columns + 2 * pad, (rows + 2 * pad) * (columns + 2 * pad)
@@ -76,41 +89,43 @@ def make_planes(
     first = rules.a[goal] + np.where(dwell, rules.c2[goal], 0)
     last = np.where(dwell, rules.c1[goal] + rules.c2[goal], rules.b[goal])
     slot = _slots(first, last, horizon, 1)
-    if (slot.max() + 1) * headings * cells > MAX_ENTRIES:
+    slots, shape = slot.max() + 1, (headings, cells)
+    if slots * headings * cells > MAX_ENTRIES:
         raise Unsupported(
             "the task is too large for look-ahead", path="shaping",
-            got=f"{slot.max() + 1} times {headings} x {cells} poses",
-            expected=f"at most {MAX_ENTRIES} entries; or shaping 'projection'",
+            got=f"{slots} steps and sets of settled goals times {headings} x {cells} poses",
+            expected=f"at most {MAX_ENTRIES} in all; or shaping 'projection'",
         )  # fmt: skip
-    times = np.arange(horizon + 2)
     steady = np.flatnonzero(rules.kind == ALWAYS)
-    due = sum((((rules.a[k] <= times) & (times <= rules.b[k])) << k for k in steady), np.zeros_like(times))
-    opened = sum(
-        (((first[g] <= times) & (times <= last[g])) << g for g in range(len(goal))), np.zeros_like(times)
-    )
-    shape = (headings, cells)
+    due = _bits(rules.a[steady], rules.b[steady], steady, horizon)
+    opened = _bits(first, last, np.arange(len(goal)), horizon)
     planes = Planes(
         pitch, pad, width, np.zeros(shape, np.uint8), np.zeros((motion_count(body), *shape), np.float32),
-        np.zeros(shape, np.int32), np.zeros(shape, np.int32), goal, first, last,
-        due.astype(np.int32), opened.astype(np.int32), slot, slot, np.full(cells, -1),
-        np.zeros((0, *shape), np.uint8),
+        np.zeros(shape, np.int32), np.zeros(shape, np.int32), goal, first, last, due, opened, slot, slot,
+        np.full(cells, -1), np.zeros((0, *shape), np.uint8),
     )  # fmt: skip
     _survey(body, rules, planes)
     rooms = planes.valid.any(axis=0)
     planes.row[rooms] = np.arange(rooms.sum())
-    kept = (slot.max() + 1) * headings * max(int(rooms.sum()), 1)
-    planes = planes._replace(kept=_slots(first, last, horizon, math.ceil(kept / KEPT)))
+    entries = slots * headings * max(int(rooms.sum()), 1)
+    planes = planes._replace(kept=_slots(first, last, horizon, math.ceil(entries / KEPT_ENTRIES)))
     if tables is None:
         return planes
-    possible = np.zeros((planes.slot.max() + 1, *shape), np.uint8)
-    _foresee(body, rules, tables, planes, possible)
-    return planes._replace(possible=possible)
+    planes = planes._replace(possible=np.zeros((slots, *shape), np.uint8))
+    _rule_out(body, rules, tables, planes)
+    return planes
 
 
-def _slots(first: NDArray[np.int64], last: NDArray[np.int64], horizon: int, every: int) -> NDArray[np.int64]:
-    """The sets of settled goals that can be had at each step, numbered; `every` steps share a number.
+def _bits(first: Ints, last: Ints, bit: Ints, horizon: int) -> NDArray[np.int32]:
+    """The bits of the windows from `first` to `last` that each step from 0 to T + 1 is in, [T + 2]."""
+    times = np.arange(horizon + 2)[:, None]
+    inside = ((first <= times) & (times <= last)).astype(np.int32)
+    return inside @ (1 << bit).astype(np.int32)
 
-    But for the first of a set: what comes before a window opens is paid there.
+
+def _slots(first: Ints, last: Ints, horizon: int, every: int) -> Ints:
+    """Numbers the sets of settled goals that can be had at each step, [T + 2, 2^G]; `every` steps share a
+    number. The first step of a set has one of its own, since what comes before a window opens is paid there.
     """
     settled = np.arange(1 << len(first))[:, None] >> np.arange(len(first)) & 1 == 1
     slot, n = np.full((horizon + 2, len(settled)), -1), 0
@@ -121,16 +136,31 @@ def _slots(first: NDArray[np.int64], last: NDArray[np.int64], horizon: int, ever
     return slot
 
 
+@inlined
+def pose_at(body: Body, planes: Planes, h: int, c: int) -> tuple[float, float, float]:
+    """The map-frame pose of cell c of the plane of heading h."""
+    j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
+    return pose_of(body, planes.pitch, planes.valid.shape[0], j, i, h)
+
+
+@leaf
+def is_blocked(
+    body: Body, motion: int, x: float, y: float, theta: float, after: tuple[float, float, float]
+) -> bool:
+    """Whether f stopped the motion from (x, y, theta) short; after: where it led."""
+    moved = math.hypot(after[0] - x, after[1] - y)
+    move, rotation = displacement(body, motion)
+    return moved < 0.5 * abs(move) or not (rotation == 0.0 or after[2] != theta)
+
+
 @kernel
 def _survey(body: Body, rules: Rules, planes: Planes) -> None:
     """Where poses are free, which motions are, and which predicates hold."""
     headings, cells = planes.valid.shape
     values, stack, read = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
-    after = np.empty(3)
     for h in range(headings):
         for c in range(cells):
-            j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
-            x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
+            x, y, theta = pose_at(body, planes, h, c)
             if in_collision(body, x, y, theta):
                 continue
             planes.valid[h, c] = 1
@@ -140,13 +170,13 @@ def _survey(body: Body, rules: Rules, planes: Planes) -> None:
             for k in range(read.shape[0]):
                 planes.keeps[h, c] |= np.int32(read[k] > rules.margin) << k
             for m in range(planes.free.shape[0]):
-                after[0], after[1], after[2] = step(body, x, y, theta, m)
+                after = step(body, x, y, theta, m)
                 planes.free[m, h, c] = not is_blocked(body, m, x, y, theta, after)
 
 
 @kernel
-def _foresee(body: Body, rules: Rules, tables: Tables, planes: Planes, possible: NDArray[np.uint8]) -> None:
-    """Where the tables leave any slack, with each set of settled goals at each step."""
+def _rule_out(body: Body, rules: Rules, tables: Tables, planes: Planes) -> None:
+    """Leaves `possible` 0 where the tables leave no slack, for each set of settled goals at each step."""
     headings, cells = planes.valid.shape
     status, run = np.zeros(rules.kind.shape[0], np.int8), np.zeros(rules.kind.shape[0], np.int64)
     for t in range(planes.slot.shape[0] - 1):
@@ -159,7 +189,6 @@ def _foresee(body: Body, rules: Rules, tables: Tables, planes: Planes, possible:
             for h in range(headings):
                 for c in range(cells):
                     if planes.valid[h, c]:
-                        j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
-                        x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
+                        x, y, theta = pose_at(body, planes, h, c)
                         spare = slack(body, rules, tables, x, y, theta, t, status, run)
-                        possible[slot, h, c] = spare >= 0.0
+                        planes.possible[slot, h, c] = spare >= 0.0

@@ -17,24 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from specshield.compiled import kernel
 from specshield.errors import Unsupported
 from specshield.lookahead import belief as beliefs
 from specshield.lookahead.belief import STYLE, Belief
-from specshield.lookahead.desirability import NEVER, solve
+from specshield.lookahead.desirability import UNKEEPABLE, solve
 from specshield.lookahead.expansion import expand_all
-from specshield.lookahead.lattice import Planes, make_planes
-from specshield.lookahead.surrogate import (
-    FEATURES,
-    WANDER,
-    Goals,
-    follow,
-    is_blocked,
-    make_goals,
-    price_left,
-    step_price,
-)
-from specshield.policy.lattice import pose_of
+from specshield.lookahead.goals import Goals, make_goals
+from specshield.lookahead.lattice import Planes, is_blocked, make_planes
+from specshield.lookahead.surrogate import WANDER, stand_in_for
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body, successors
 from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
@@ -99,7 +89,9 @@ class LookAhead:
         if going_on.sum() <= 0.0:  # the model ends for certain: it says nothing of where it would go
             return belief, np.zeros(len(prior))
         said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(nexts)) / going_on.sum()
-        blocked = np.array([is_blocked(self.body, m, x, y, theta, after) for m, after in enumerate(nexts)])
+        blocked = np.array(
+            [is_blocked(self.body, m, x, y, theta, tuple(after)) for m, after in enumerate(nexts)]
+        )
         end = float(prior[robot.terminal].sum())
         belief = beliefs.observe(belief, self.body, self.goals, pose, blocked, said, end)
         if belief.trust < NEGLIGIBLE:
@@ -122,7 +114,7 @@ class LookAhead:
             self.body, rules, self.goals, self.planes, self.tables, self.leads, asked, STYLE, t, mask,
             history[-1], costs,
         )  # fmt: skip
-        known = np.all(costs < NEVER, axis=0)
+        known = np.all(costs < UNKEEPABLE, axis=0)
         if not known.any():
             return np.zeros(costs.shape[1])
         # a model twice as sharp costs twice as much to bend, which is most of D
@@ -157,12 +149,8 @@ def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     leads = np.append(places, WANDER)
     shape = (len(leads), int(planes.kept.max()) + 1, len(planes.valid), int(planes.row.max()) + 1)
     tables = np.empty(shape, np.uint16)
-    motions = np.zeros((len(task.robot.motions), *planes.valid.shape), np.float32)
-    ends = np.zeros(planes.valid.shape, np.float32)
-    remaining = np.zeros(planes.valid.shape[1], np.float32)
     for table, lead in zip(tables, leads, strict=True):
-        _react_everywhere(body, goals, planes, int(lead), STYLE, motions, ends, remaining)
-        table[:] = solve(body, planes, motions, ends, step_price(int(lead)), remaining)
+        table[:] = solve(body, planes, stand_in_for(body, goals, planes, int(lead), STYLE))
     return LookAhead(task, body, rules, goals, planes, leads, block_diag(shares, 1.0), tables)
 
 
@@ -181,32 +169,3 @@ def _leads(goals: Goals, most: int) -> tuple[Integers, Floats]:
             near = np.exp(-further.T / REACH)
             return np.array(chosen), near / near.sum(axis=1, keepdims=True)
         gap *= 1.1
-
-
-@kernel
-def _react_everywhere(
-    body: Body,
-    goals: Goals,
-    planes: Planes,
-    goal: int,
-    style: Floats,
-    motions: NDArray[np.float32],
-    ends: NDArray[np.float32],
-    remaining: NDArray[np.float32],
-) -> None:
-    """The surrogate at each pose of the lattice: motions [M, H, N], ends [H, N], remaining [N]."""
-    headings, cells = planes.valid.shape
-    features, log_r = np.empty((motions.shape[0], FEATURES)), np.empty(motions.shape[0])
-    blocked = np.empty(motions.shape[0], np.bool_)
-    for h in range(headings):
-        for c in range(cells):
-            if not planes.valid[h, c]:
-                continue
-            j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
-            x, y, theta = pose_of(body, planes.pitch, headings, j, i, h)
-            remaining[c] = price_left(body, goals, goal, x, y)
-            for m in range(motions.shape[0]):
-                blocked[m] = planes.free[m, h, c] == 0.0
-            ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, features, log_r)
-            for m in range(motions.shape[0]):
-                motions[m, h, c] = log_r[m]

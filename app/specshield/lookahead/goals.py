@@ -1,0 +1,123 @@
+"""The places that a model may be going to, spread over the free space, and the way to each of them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from specshield.compiled import kernel, leaf
+from specshield.robot.dynamics import Body, swing_radius
+from specshield.world.geodesic import geodesic_distance
+from specshield.world.occupancy import OccupancyGrid
+
+MAX_GOALS = 300  # keeps a decision short: each goal is compared with what the model says at every step
+GAP = 0.5  # [m] between goals, where that makes no more than MAX_GOALS
+WAY_PITCH = 0.1  # [m] of the grid that ways are kept on, where that makes no more than MAX_CELLS
+MAX_CELLS = 20_000  # keeps memory small: MAX_GOALS fields of so many cells and 4 bytes are 24 MB
+STEER = 5  # [cells] how far along the way the point lies that the robot steers for
+UNIT = 127  # of a direction's components, as stored in a byte
+NO_PATH = 65535  # [cm] the distance from where no path leads to a goal
+
+Floats = NDArray[np.float64]
+
+
+class Goals(NamedTuple):
+    """G goals and the way to each, on a grid of h x w cells of `pitch` [m] in the grid frame.
+
+    distance [G, h, w] [cm]: along space in which the robot can turn; from beside an obstacle to that space;
+    and through doors too narrow to turn in where there is no other way. NO_PATH where there is none at all.
+    way [G, h, w, 2]: the direction (u, v) to go, times UNIT; zero at the goal.
+    """
+
+    pitch: float
+    distance: NDArray[np.uint16]
+    way: NDArray[np.int8]
+
+
+def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
+    """Goals all over the space in which the robot can turn freely."""
+    height, width = grid.occupied.shape
+    cells = max(round(WAY_PITCH / grid.resolution), math.ceil(math.sqrt(height * width / MAX_CELLS)), 1)
+    pitch = cells * grid.resolution
+    middles = [np.arange(n // cells) * cells + cells // 2 for n in (height, width)]
+    clearance = body.clearance[np.ix_(*middles)]
+    free = clearance > 0.0
+    roomy = clearance > swing_radius(body)
+    places = _places(roomy, max(round(GAP / pitch), 1))
+    beside, nearest = distance_transform_edt(~roomy, sampling=pitch, return_indices=True)
+    distance = np.empty((len(places), *free.shape), np.uint16)
+    way = np.empty((len(places), *free.shape, 2), np.int8)
+    for g, (row, column) in enumerate(places):
+        goal = np.zeros_like(free)
+        goal[row, column] = True
+        onward = geodesic_distance(roomy, goal, pitch)
+        to_go = onward[tuple(nearest)] + beside
+        if np.any(free & np.isinf(to_go)):  # through a door too narrow to turn in
+            to_go = np.where(np.isinf(to_go), geodesic_distance(free, goal, pitch), to_go)
+        distance[g] = np.where(np.isfinite(to_go), np.minimum(100.0 * to_go, NO_PATH - 1), NO_PATH)
+        _steer(_falling(free, onward, pitch), way[g])
+    return Goals(pitch, distance, way)
+
+
+def _places(roomy: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
+    """One roomy cell in each square of `gap` cells, the middlemost. The squares grow until there are at most
+    MAX_GOALS.
+    """
+    places: list[tuple[int, int]] = []
+    for row in range(0, roomy.shape[0], gap):
+        for column in range(0, roomy.shape[1], gap):
+            found = np.argwhere(roomy[row : row + gap, column : column + gap])
+            if len(found):
+                r, c = found[int(np.argmin(np.sum((found - (gap - 1) / 2) ** 2, axis=1)))]
+                places.append((row + int(r), column + int(c)))
+    return places if len(places) <= MAX_GOALS else _places(roomy, gap + 1)
+
+
+def _falling(free: NDArray[np.bool_], onward: Floats, pitch: float) -> Floats:
+    """A height [h, w] that falls along the way to a goal: in roomy space the distance `onward` to the goal;
+    beside an obstacle, where the robot cannot turn, higher, so that the way first leads off it.
+    """
+    reached = np.isfinite(onward)
+    off = geodesic_distance(free, reached, pitch)
+    return np.where(reached, onward, onward[reached].max(initial=0.0) + pitch + off)
+
+
+@kernel
+def _steer(height: Floats, way: NDArray[np.int8]) -> None:
+    """The direction from each cell to the one STEER cells down the steepest way."""
+    rows, columns = height.shape
+    after = np.empty(rows * columns, np.int64)
+    for j in range(rows):
+        for i in range(columns):
+            best, at = 0.0, j * columns + i
+            for dj in range(-1, 2):
+                for di in range(-1, 2):
+                    row, column = j + dj, i + di
+                    inside = 0 <= row < rows and 0 <= column < columns
+                    if (dj != 0 or di != 0) and inside and height[row, column] < np.inf:
+                        fall = (height[j, i] - height[row, column]) / math.hypot(dj, di)
+                        if fall > best:
+                            best, at = fall, row * columns + column
+            after[j * columns + i] = at
+    for start in range(rows * columns):
+        at = start
+        for _ in range(STEER):
+            at = after[at]
+        dv, du = at // columns - start // columns, at % columns - start % columns
+        length = max(math.hypot(du, dv), 1e-9)
+        way[start // columns, start % columns, 0] = round(UNIT * du / length)
+        way[start // columns, start % columns, 1] = round(UNIT * dv / length)
+
+
+@leaf
+def cell_of(body: Body, goals: Goals, x: float, y: float) -> tuple[int, int]:
+    """Row and column of the goals' grid at a point of the map frame; the nearest cell for one outside."""
+    dx, dy = x - body.origin_x, y - body.origin_y
+    u = (body.cos_yaw * dx + body.sin_yaw * dy) / goals.pitch
+    v = (body.cos_yaw * dy - body.sin_yaw * dx) / goals.pitch
+    height, width = goals.distance.shape[1], goals.distance.shape[2]
+    return min(max(int(v), 0), height - 1), min(max(int(u), 0), width - 1)
