@@ -15,7 +15,6 @@ from specshield.lookahead.goals import make_goals
 from specshield.lookahead.lattice import is_blocked, make_planes
 from specshield.lookahead.lookahead import prepare
 from specshield.lookahead.surrogate import (
-    FEATURES,
     WANDER,
     StandIn,
     end_chance,
@@ -114,14 +113,14 @@ def test_exact_steps_and_the_lattice_charge_alike(which):
     """A stand-in's D after each motion, two exact steps before the lattice, on the cells that are exact."""
     body, rules, goals = WORLD.body, make_rules(WORLD.task), make_goals(WORLD.body, WORLD.task.grid)
     lead = WANDER if which is None else range(len(goals.distance))[which]
-    nexts, scratch, log_r = np.empty((MOTIONS, 3)), np.empty((MOTIONS, FEATURES)), np.empty(MOTIONS)
+    nexts, log_r = np.empty((MOTIONS, 3)), np.empty(MOTIONS)
     r, e, left = np.full((len(STATES), MOTIONS), 1 / MOTIONS), np.zeros(len(STATES)), np.zeros(len(STATES))
     free = [s for s, (i, j, _) in enumerate(STATES) if not body.occupied[j, i]]
     for s in free:
         pose = WORLD.pose(*STATES[s])
         successors(body, np.array(pose), nexts)
         blocked = np.array([is_blocked(body, m, *pose, tuple(after)) for m, after in enumerate(nexts)])
-        e[s] = follow(body, goals, lead, STYLE, *pose, blocked, scratch, log_r)
+        e[s] = follow(body, goals, lead, STYLE, *pose, blocked, log_r)
         r[s], left[s] = np.exp(log_r), price_left(body, goals, lead, *pose[:2])
     assert np.ptp(left) > 1.0 or lead != len(goals.distance) - 1
     planes, table = solve_cells(r, e, step_price(lead), left)
@@ -238,8 +237,8 @@ def seeks(goal):
         nexts, motions = np.empty((len(TASK.robot.motions), 3)), len(TASK.robot.motions)
         successors(ahead.body, pose, nexts)
         blocked = np.array([is_blocked(ahead.body, m, *pose, tuple(after)) for m, after in enumerate(nexts)])
-        log_r, scratch, style = np.empty(motions), np.empty((motions, FEATURES)), np.array(SHARP_STYLE)
-        end = follow(ahead.body, ahead.goals, goal, style, *pose, blocked, scratch, log_r)
+        log_r, style = np.empty(motions), np.array(SHARP_STYLE)
+        end = follow(ahead.body, ahead.goals, goal, style, *pose, blocked, log_r)
         of = TASK.robot.motion_of
         shares = np.bincount(of[~TASK.robot.terminal])
         return np.where(TASK.robot.terminal, np.log(max(end, 1e-4)), log_r[of] - np.log(shares[of]))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from specshield.compiled import kernel
 from specshield.lookahead.goals import Goals, cell_of
-from specshield.lookahead.surrogate import FEATURES, WANDER, describe, follow
+from specshield.lookahead.surrogate import FEATURES, WANDER, bearing_of, features_of, follow
 from specshield.robot.dynamics import Body, displacements
 
 Floats = NDArray[np.float64]
@@ -116,9 +116,9 @@ def observe(
     excess = TRACK * belief.excess + float(belief.probabilities() @ charges) - usual
     excess -= float(belief.probabilities()[-1]) * sided
     cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
-    lead, features = int(np.argmin(cost[:-1])), np.empty((len(said), FEATURES))
     row, column = cell_of(body, goals, x, y)
-    describe(body, goals.way[lead, row, column], theta, blocked, features)
+    bearing = bearing_of(body, goals, int(np.argmin(cost[:-1])), row, column, theta)
+    features = np.array([features_of(body, bearing, m, blocked[m]) for m in range(len(said))])
     weight = 0.5 * said + 0.5 / len(said)
     features -= weight @ features
     wanted = np.maximum(log_said, log_said.max() - 10.0)
@@ -158,9 +158,9 @@ def _charge(
     end, into charges [G + 1].
     """
     motions, wander = said.shape[0], charges.shape[0] - 1
-    features, log_r = np.empty((motions, FEATURES)), np.empty(motions)
+    log_r = np.empty(motions)
     for g in range(charges.shape[0]):
-        ends = follow(body, goals, g if g < wander else WANDER, style, x, y, theta, blocked, features, log_r)
+        ends = follow(body, goals, g if g < wander else WANDER, style, x, y, theta, blocked, log_r)
         chance = 0.98 * ends + 0.005
         charges[g] = -(end * math.log(chance) + (1.0 - end) * math.log(1.0 - chance))
         for m in range(motions):

@@ -14,7 +14,7 @@ from specshield.compiled import kernel, leaf
 from specshield.lookahead.desirability import UNKEEPABLE, desirability
 from specshield.lookahead.goals import Goals
 from specshield.lookahead.lattice import Planes, is_blocked
-from specshield.lookahead.surrogate import FEATURES, follow, price_left, step_price
+from specshield.lookahead.surrogate import follow, price_left, step_price
 from specshield.robot.dynamics import Body, step
 from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
 
@@ -66,7 +66,7 @@ def expand_all(
                 pose[child, 0], pose[child, 1], pose[child, 2] = x, y, theta
                 read_predicates(rules, x, y, theta, values, stack, read)
                 settled[child] = _settle(rules, planes, t + d + 1, settled[n], read)
-    cost, log_r, features = np.empty(start[-1]), np.empty(motions), np.empty((motions, FEATURES))
+    cost, log_r = np.empty(start[-1]), np.empty(motions)
     full = planes.slot.shape[1] - 1
     for k in range(asked.shape[0]):
         lead = leads[asked[k]]
@@ -79,7 +79,7 @@ def expand_all(
                 if d == levels:
                     cost[n] = desirability(body, planes, tables[asked[k]], t + d, settled[n], u, v, w)
                 else:
-                    ends = follow(body, goals, lead, style, u, v, w, blocked[n], features, log_r)
+                    ends = follow(body, goals, lead, style, u, v, w, blocked[n], log_r)
                     first = start[d + 1] + (n - start[d]) * motions
                     total = _log_sum(log_r, cost[first : first + motions])
                     if total > -float(UNKEEPABLE):

@@ -22,9 +22,9 @@ from specshield.robot.dynamics import Body, displacement, longest_motions
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Bools = NDArray[np.bool_]
 
-PROGRESS, TURNING, BLOCKED, IDLE = range(4)  # the features of a motion
-FEATURES = 4
+FEATURES = 4  # of a motion, see `features_of`
 WANDER = -1  # in place of a goal: the stand-in that wanders
 # The values below were chosen by hand; what the whole is worth is measured by `specshield evaluate`.
 END_WITHIN = 1.0  # [m] from its goal, the model may end
@@ -46,24 +46,22 @@ def follow(
     x: float,
     y: float,
     theta: float,
-    blocked: NDArray[np.bool_],
-    features: Floats,
+    blocked: Bools,
     out: Floats,
 ) -> float:
     """log r of each motion at a pose, into out (M,); returns the chance that the stand-in ends there.
 
     goal: or WANDER. style (FEATURES,): the logit of each feature. blocked (M,): the motions that an obstacle
-    stops short. features (M, FEATURES): scratch.
+    stops short.
     """
     if goal == WANDER:
         _wander(body, blocked, out)
         return WANDER_END
     row, column = cell_of(body, goals, x, y)
-    describe(body, goals.way[goal, row, column], theta, blocked, features)
+    bearing = bearing_of(body, goals, goal, row, column, theta)
     for m in range(out.shape[0]):
-        out[m] = 0.0
-        for k in range(FEATURES):
-            out[m] += style[k] * features[m, k]
+        progress, turning, stopped, idle = features_of(body, bearing, m, blocked[m])
+        out[m] = style[0] * progress + style[1] * turning + style[2] * stopped + style[3] * idle
     _normalise(out)
     return end_chance(goals.distance[goal, row, column])
 
@@ -75,33 +73,35 @@ def end_chance(distance: int) -> float:
 
 
 @leaf
-def describe(
-    body: Body, way: NDArray[np.int8], theta: float, blocked: NDArray[np.bool_], out: Floats
-) -> None:
-    """The features of each motion, into out (M, FEATURES). way (2,): the direction to go in the grid frame,
-    zero at the goal; theta [rad] in the map frame; blocked (M,): the motions stopped short.
-    """
-    wu, wv = float(way[0]), float(way[1])
-    here = wu == 0.0 and wv == 0.0
+def bearing_of(body: Body, goals: Goals, goal: int, row: int, column: int, theta: float) -> float:
+    """The turn [rad] from the heading theta [rad] to the way in a cell of the grid; NaN at the goal."""
+    wu, wv = float(goals.way[goal, row, column, 0]), float(goals.way[goal, row, column, 1])
+    if wu == 0.0 and wv == 0.0:
+        return math.nan
     bearing = math.atan2(wv, wu) + math.atan2(body.sin_yaw, body.cos_yaw) - theta
-    bearing = (bearing + math.pi) % (2.0 * math.pi) - math.pi
-    stride, turn = _largest(body)
-    for m in range(out.shape[0]):
-        for k in range(FEATURES):
-            out[m, k] = 0.0
-        move, rotation = displacement(body, m)
-        if move == 0.0 and rotation == 0.0:
-            out[m, IDLE] = 1.0
-        elif blocked[m]:
-            out[m, BLOCKED] = 1.0
-        elif not here:
-            out[m, PROGRESS] = move / stride * math.cos(bearing)
-            after = abs((bearing - rotation + math.pi) % (2.0 * math.pi) - math.pi)
-            out[m, TURNING] = (abs(bearing) - after) / turn if rotation != 0.0 else 0.0
+    return (bearing + math.pi) % (2.0 * math.pi) - math.pi
 
 
 @leaf
-def _wander(body: Body, blocked: NDArray[np.bool_], out: Floats) -> None:
+def features_of(body: Body, bearing: float, motion: int, blocked: bool) -> tuple[float, float, float, float]:
+    """The features of a motion: progress along the way and turning towards it, each as a share of what the
+    robot's largest motion can do; whether an obstacle stops it short; whether it stands still.
+    """
+    move, rotation = displacement(body, motion)
+    if move == 0.0 and rotation == 0.0:
+        return 0.0, 0.0, 0.0, 1.0
+    if blocked:
+        return 0.0, 0.0, 1.0, 0.0
+    if math.isnan(bearing):
+        return 0.0, 0.0, 0.0, 0.0
+    stride, turn = _largest(body)
+    after = abs((bearing - rotation + math.pi) % (2.0 * math.pi) - math.pi)
+    turning = (abs(bearing) - after) / turn if rotation != 0.0 else 0.0
+    return move / stride * math.cos(bearing), turning, 0.0, 0.0
+
+
+@leaf
+def _wander(body: Body, blocked: Bools, out: Floats) -> None:
     stride, turn = _largest(body)
     for m in range(out.shape[0]):
         move, rotation = displacement(body, m)
@@ -166,7 +166,7 @@ def stand_in_for(body: Body, goals: Goals, planes: Planes, goal: int, style: Flo
     (headings, cells), count = planes.valid.shape, planes.free.shape[0]
     motions = np.zeros((count, headings, cells), np.float32)
     ends, left = np.zeros((headings, cells), np.float32), np.zeros(cells, np.float32)
-    features, log_r, blocked = np.empty((count, FEATURES)), np.empty(count), np.empty(count, np.bool_)
+    log_r, blocked = np.empty(count), np.empty(count, np.bool_)
     for h in range(headings):
         for c in range(cells):
             if not planes.valid[h, c]:
@@ -175,7 +175,7 @@ def stand_in_for(body: Body, goals: Goals, planes: Planes, goal: int, style: Flo
             left[c] = price_left(body, goals, goal, x, y)
             for m in range(count):
                 blocked[m] = planes.free[m, h, c] == 0.0
-            ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, features, log_r)
+            ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, log_r)
             for m in range(count):
                 motions[m, h, c] = log_r[m]
     return StandIn(motions, ends, step_price(goal), left)

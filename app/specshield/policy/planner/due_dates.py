@@ -150,27 +150,18 @@ def due_date(literals: PackedLiterals, k: int, s: int, guess: int, bounds: Bound
 
 
 @leaf
-def needed_until(literals: PackedLiterals, k: int, s: int, begin: int, bounds: Bounds) -> int:
-    """The last step of those from `begin` on at each of which literal k has to hold; begin - 1 for none."""
-    low, high, tried = begin - 1, literals.literal[k, LAST] + 1, begin
-    while high - low > 1:
-        if is_open_if(literals, k, s, s, tried, tried, bounds):
-            high = tried
-        else:
-            low = tried
-        tried = (low + high) // 2
-    return low
-
-
-@leaf
-def needed_until_goal(literals: PackedLiterals, k: int, goal: int, s: int, stop: int, bounds: Bounds) -> int:
-    """The last step of those from s + 1 to stop - 1 at each of which literal k has to hold as long as the
-    literal `goal` has not held since s, as the left side of an `until` has to; s for none.
+def needed_until(
+    literals: PackedLiterals, k: int, s: int, begin: int, stop: int, goal: int, bounds: Bounds
+) -> int:
+    """The last step of those from `begin` to stop - 1 at each of which literal k has to hold; begin - 1 for
+    none. goal: -1, or a literal as long as which has not held since step s literal k has to hold, as the left
+    side of an `until` has to.
     """
-    low, high, tried = s, min(literals.literal[k, LAST] + 1, stop), s + 1
+    low, high, tried = begin - 1, min(literals.literal[k, LAST] + 1, stop), begin
     while high - low > 1:
         _reset(bounds)
-        _suppose(literals, goal, s, s, s + 1, tried, bounds)
+        if goal >= 0:
+            _suppose(literals, goal, s, s, s + 1, tried, bounds)
         _suppose(literals, k, s, s, tried, tried, bounds)
         if _is_open_on_trial(literals, bounds):
             high = tried

@@ -23,7 +23,7 @@ Ints = NDArray[np.int64]
 
 
 @kernel
-def _make_way(world: World, t: int, steps: int, signals: Floats) -> Way:
+def make_way(world: World, t: int, steps: int, signals: Floats) -> Way:
     """Room for a way of so many steps from x_t, with the signals (S,) at what they are held at."""
     literals, size = world.literals, world.literals.formula.tree.size
     values = np.zeros(REGIONS + region_count(literals.formula.regions) + signals.shape[0])
@@ -39,7 +39,7 @@ def _make_way(world: World, t: int, steps: int, signals: Floats) -> Way:
 
 
 @kernel
-def _make_nodes(literals: int, motions: int) -> Nodes:
+def make_nodes(literals: int, motions: int) -> Nodes:
     return Nodes(
         np.empty((MAX_DEPTH, 5), np.int64), np.empty((MAX_DEPTH, literals, 4), np.int64),
         np.empty((MAX_DEPTH, 6 * literals + motions, 5), np.int64),
@@ -74,8 +74,8 @@ def plan_all(
     comes too late are planned for by themselves.
     """
     count, steps = motions.shape
-    way = _make_way(world, t, steps, signals)
-    nodes = _make_nodes(world.literals.literal.shape[0], count)
+    way = make_way(world, t, steps, signals)
+    nodes = make_nodes(world.literals.literal.shape[0], count)
     base = -1
     # First x_t itself (-2); then staying (-1), which others can fall back on; then every other motion.
     for root in range(-2, count):

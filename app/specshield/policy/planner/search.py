@@ -27,7 +27,6 @@ from specshield.policy.planner.due_dates import (
     foresee,
     is_open,
     needed_until,
-    needed_until_goal,
     stay_for,
 )
 from specshield.policy.planner.fields import to_go_at
@@ -118,7 +117,7 @@ def _guard(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> boo
         throughout = need[g, BEGIN] <= s + 1 and need[g, UNTIL] >= stop
         if literals.literal[g, GUARDS] == 1 and g != k and not throughout:
             way.spent[0] += 2.0 * world.cost
-            until = needed_until_goal(literals, g, k, s, stop, way.bounds)
+            until = needed_until(literals, g, s, s + 1, stop, k, way.bounds)
             if until > s:
                 need[g, UNTIL_GOAL] = until
         guarding = guarding or need[g, UNTIL] >= 0 or need[g, UNTIL_GOAL] >= 0
@@ -145,7 +144,7 @@ def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> 
         need[k, DUE], need[k, BEGIN], need[k, UNTIL], need[k, UNTIL_GOAL] = by, NO_DATE, -1, -1
         if by != NO_DATE and literals.literal[k, GUARDS] == 1:
             way.spent[0] += bits * world.cost
-            until = needed_until(literals, k, s, by, way.bounds)
+            until = needed_until(literals, k, s, by, NO_DATE, -1, way.bounds)
             if until >= by:
                 need[k, BEGIN], need[k, UNTIL] = by, until
     dwelling, dwell = -1, 0
