@@ -1,4 +1,4 @@
-"""What the planner's parts are tried on: the robot on whole cells, with no more around it than a part needs."""
+"""What the planner's parts are tried on: the robot on whole cells, and no more than a part needs."""
 
 from __future__ import annotations
 
