@@ -39,9 +39,8 @@ def test_steps_to_go_are_those_of_a_search_of_every_state(leading):
 def test_a_field_goes_round_the_corner(leading):
     """From the cell beside the wall, facing it: back, round its end and up, with three turns."""
     cells, world, f = leading
-    assert (
-        to_go_at(cells.body, world.fields, f, *cells.pose(0, 0, EAST)) == 4.0
-    )  # two ahead, a turn, one ahead
+    # Two cells ahead, a turn, one cell ahead.
+    assert to_go_at(cells.body, world.fields, f, *cells.pose(0, 0, EAST)) == 4.0
     assert to_go_at(cells.body, world.fields, f, *cells.pose(0, 1, EAST)) == 7.0
 
 

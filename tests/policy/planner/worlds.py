@@ -7,7 +7,8 @@ import numpy as np
 from specshield.policy.planner.due_dates import NO_DATE, foresee, make_bounds, note
 from specshield.policy.planner.first_motions import make_nodes, make_way
 from specshield.policy.planner.literals import literals_of
-from specshield.policy.planner.policy import Settings, synthesise
+from specshield.policy.planner.method import Settings
+from specshield.policy.planner.policy import synthesise
 from specshield.policy.planner.way import BEGIN, DUE, UNTIL, UNTIL_GOAL, read_at
 from specshield.rule.values import initial_signals
 from tests.oracles.cells import MOTIONS, Cells
