@@ -12,7 +12,7 @@ from specshield.client import ShieldClient
 from specshield.policy.dqn.environment import free_poses
 from specshield.sim.cases import MAPS, Case, load_case
 from specshield.sim.episodes import with_shield
-from specshield.sim.model import make_model
+from specshield.sim.learned.model import load_learned
 from specshield.sim.service import own_server
 
 ASKED_EVERY = 0.02  # [s] whether a policy is ready
@@ -35,7 +35,7 @@ def _case(client: ShieldClient, case: Case, repeats: int, episodes: int, seed: i
         client.policies.wait(made.id, timeout=300.0, interval=ASKED_EVERY)
         ready.append(time.perf_counter() - began)
     waited, served = list[float](), list[float]()
-    model = make_model("learned", case)
+    model = load_learned(case.instruction)
     starts = free_poses(case.task, case.body, episodes, np.random.default_rng([seed, 30]))
     for i, (x, y, theta) in enumerate(starts.tolist()):
         session = client.sessions.create(

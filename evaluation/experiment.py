@@ -1,4 +1,4 @@
-"""An experiment: a case, a model, a disturbance and a seed; and what every process prepares for it once."""
+"""An experiment: a case, a model, a disturbance and a seed; its setting: what each process prepares once."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from evaluation.decoding import HardDecoding, RobustDecoding
 from evaluation.disturbance import believed, check
 from evaluation.houses import load_house_case
 from evaluation.methods import Decoding, Method, Shielded, Simplex
+from evaluation.models import named
 from specshield import __version__
 from specshield.errors import InputError, NotFound
 from specshield.lookahead.lookahead import prepare
@@ -23,7 +24,7 @@ from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
 from specshield.sim.cases import MODELS, Case, case_name, load_case, shipped
 from specshield.sim.learned.model import FOLDER, WEIGHTS, read
-from specshield.sim.model import FoundationModel, check_model, make_model
+from specshield.sim.model import FoundationModel
 from specshield.task import Task
 
 METHODS = ("unmodified", "hcd", "rcd", "simplex", "paper", "ours", "lookahead")
@@ -33,7 +34,11 @@ CAREFUL = ("simplex", "ours", "lookahead")  # NAME@M/K asks for a margin of M me
 
 @dataclass(frozen=True)
 class Experiment:
-    """house: where `case` is "house", which one (sim/houses.py). noise: of sim/disturbance.py."""
+    """One campaign's conditions; with the number of a run they decide everything that is random in it.
+
+    case: a name of sim/cases.py, or "house"; house: then which one, as evaluation/houses.py takes it.
+    model: a name of evaluation/models.py. noise: a name of evaluation/disturbance.py.
+    """
 
     case: str
     house: str | None = None
@@ -43,11 +48,11 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check(self.noise)
-        check_model(self.model)
+        named(self.model)
         if (self.case == "house") != (self.house is not None):
             raise InputError(
-                "the case 'house' needs a house, and no other has one", path="house", got=self.house,
-                expected="a house's name or path, with case 'house'",
+                "the case 'house' needs a house, and the other cases take none", path="house", got=self.house,
+                expected="--house drawn_0 with --case house, and no --house with any other case",
             )  # fmt: skip
 
     def to_json(self) -> dict[str, Any]:
@@ -64,7 +69,10 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What an experiment needs, prepared when it is first asked for. task, body: as the shield is told."""
+    """What an experiment needs; each part is prepared when it is first asked for.
+
+    case: as the experiment names it. task, body: what the shield is told, which a disturbance may make wrong.
+    """
 
     experiment: Experiment
     case: Case
@@ -73,11 +81,11 @@ class Setting:
 
     @cached_property
     def model(self) -> FoundationModel:
-        return make_model(self.experiment.model, self.case)
+        return named(self.experiment.model).make(self.case)
 
     @cached_property
     def learned(self) -> Policy | None:
-        """The DQN that came for the case; None where there is none."""
+        """The DQN that was trained for the case; None where there is none."""
         try:
             policy = shipped(self.case, "dqn")
         except NotFound:
@@ -106,13 +114,14 @@ class Setting:
 
     @cached_property
     def made_from(self) -> dict[str, Any]:
-        """What records depend on beside the experiment's own fields, as JSON: what is long as its sha256."""
+        """What the records depend on besides the experiment's own fields, as JSON; files by their sha256."""
         case = self.case
         made_from = {
             "specshield": __version__,
             "task": case.task.content_hash,
             "instruction": case.instruction,
             "target": list(case.target),
+            "code of the model": named(self.experiment.model).code_hash,
         }
         for policy in self.policies:
             made_from[f"policy {policy.card['method']}"] = _hash(policy.weights())
@@ -122,9 +131,9 @@ class Setting:
         return made_from
 
     def method(self, name: str) -> Method:
-        """A method by its name, NAME@M/K with a margin of M metres and K steps of slack.
+        """A method by its name; NAME@M/K is one with a margin of M metres and K steps of slack.
 
-        Raises NotFound, InputError.
+        Raises NotFound for a name that there is not, InputError for a margin that cannot be.
         """
         kind, margin, slack = split(name)
         careful = Config(margin=margin, slack=slack)
@@ -143,12 +152,15 @@ class Setting:
 
 
 def experiments(case: str, house: str | None, model: str, noise: str, seed: int) -> list[Experiment]:
-    """One a noise, of those that `noise` joins by commas. case: a case's name, or its number."""
+    """One experiment for each of the names that `noise` holds, separated by commas.
+
+    case: a case's name, or its number.
+    """
     return [Experiment(case_name(case), house, model, each, seed) for each in noise.split(",")]
 
 
 def available(case: str) -> list[str]:
-    """The methods that can be had for a case without options."""
+    """The methods that a case has what they need for: `paper` needs a DQN, and houses have none."""
     return [name for name in METHODS if name != "paper" or case != "house"]
 
 

@@ -1,42 +1,97 @@
-"""ProcTHOR houses as cases: a rule over named rooms, and something to find in another room."""
+"""Houses as cases: a rule over rooms by their names, and something to find in another room.
+
+`drawn_N` is a floor plan of our own making, drawn with the seed N (model/floor_plans.py). Real ones are
+ProcTHOR houses in a folder of the user's: each house a JSON file, and beside them asset-sizes.json, which
+maps each assetId to {"size": [x, y, z]}, its full extents in metres. Both are public: the houses are in
+ProcTHOR-10K, the extents in procthor/databases/asset-database.json of github.com/allenai/procthor.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import label
 
+from evaluation.model.floor_plans import House, random_house
 from specshield.errors import NotFound
 from specshield.robot import STRETCH
-from specshield.sim.cases import REPOSITORY, Case
+from specshield.sim.cases import Case
+from specshield.sim.robot import COMFORT
 from specshield.task import make_task
 from specshield.world.procthor import load_house
-from specshield.world.regions import signed_distance
+from specshield.world.regions import Polygon, Region, Union, signed_distance
 
-HOUSES = REPOSITORY.parent / "shared" / "data" / "houses"
 RULE = "F[0,80] Kitchen and F[80,160] Bedroom and G[0,160] not Bathroom"
-INSTRUCTION = "find a bowl"
-RESOLUTION = 0.05  # [m]
+SPEC = {"formula": RULE, "regions": {}}
+NAMED = {"Kitchen", "Bedroom", "Bathroom"}  # by the rule
+DRAWN = re.compile(r"drawn_(\d+)")
+RESOLUTION = 0.05  # [m] of a ProcTHOR house's map
+OTHERS = (
+    2**31 + 1
+)  # beside the seed: the draws of training begin with a small number alone, and share no house
+TO_FIND = "remote"  # in a drawn house: it lies beside a sofa, in none of NAMED
 
 
-def load_house_case(house: str, rule: str = RULE) -> Case:
-    """The case of a house: a path to its JSON, with asset-sizes.json beside it, or a name in HOUSES.
+def located(house: str | None, folder: Path | None) -> str | None:
+    """A house as experiments name it: drawn_N, or the path of its JSON file in `folder`."""
+    return house if house is None or folder is None else str(folder / f"{house}.json")
 
-    The target stands where there is most room outside the rooms that the rule names. Raises NotFound,
-    FormulaError.
-    """
-    path = Path(house) if house.endswith(".json") else HOUSES / f"{house}.json"
+
+def load_house_case(house: str) -> Case:
+    """The case of a house: drawn_N, or the path of a ProcTHOR house's JSON. Raises NotFound, FormulaError."""
+    drawn = DRAWN.fullmatch(house)
+    if drawn:
+        return _drawn_case(house, int(drawn[1]))
+    path = Path(house)
     sizes = path.with_name("asset-sizes.json")
-    if not (path.is_file() and sizes.is_file()):
+    if not (path.suffix == ".json" and path.is_file() and sizes.is_file()):
         raise NotFound(
-            "there is no such house", path="house", got=str(house),
-            expected="a path to a ProcTHOR house's JSON, with asset-sizes.json beside it, or the name of one "
-            "in ../shared/data/houses",
+            f"there is no house {house!r}", path="house", got=house,
+            expected="drawn_0, drawn_1, ...; or, for a ProcTHOR house, --houses FOLDER and the name of a "
+            "JSON file in it, with asset-sizes.json beside it. ProcTHOR-10K has such houses: pip install "
+            'prior, then prior.load_dataset("procthor-10k"); evaluation/houses.py says what the sizes are',
         )  # fmt: skip
     grid, rooms = load_house(json.loads(path.read_text()), json.loads(sizes.read_text()), RESOLUTION)
-    task = make_task(grid, STRETCH, rule, rooms=rooms)
+    task = make_task(grid, STRETCH, RULE, rooms=rooms)
     outside = [-signed_distance(room, grid.centres) for room in task.regions.values()]
-    roomy = np.min([grid.clearance, *outside], axis=0)
+    roomy = np.min([grid.clearance, *outside], axis=0)  # the file does not say where a bowl is
     x, y = grid.centres[np.unravel_index(np.argmax(roomy), roomy.shape)].tolist()
-    return Case(path.stem, task, rooms, {"formula": rule, "regions": {}}, INSTRUCTION, (x, y))
+    return Case(path.stem, task, rooms, SPEC, "find a bowl", (x, y))
+
+
+def _drawn_case(name: str, seed: int) -> Case:
+    """The first house drawn with this seed in which the rule and the task can both be done."""
+    random = np.random.default_rng([OTHERS, seed])
+    while True:
+        house = random_house(random)
+        if TO_FIND in house.targets and set(house.kinds) >= NAMED:
+            rooms = _rooms(house)
+            task = make_task(house.grid, STRETCH, RULE, rooms=rooms)
+            case = Case(name, task, rooms, SPEC, f"find a {TO_FIND}", house.targets[TO_FIND])
+            if _can_be_kept(case):
+                return case
+
+
+def _rooms(house: House) -> dict[str, Region]:
+    """The rooms by what they are; those of one kind are one region."""
+    rooms: dict[str, Region] = {}
+    for kind in dict.fromkeys(house.kinds):
+        outlines = tuple(
+            Polygon(((x0, y0), (x1, y0), (x1, y1), (x0, y1)))
+            for (x0, y0, x1, y1), own in zip(house.rooms, house.kinds, strict=True)
+            if own == kind
+        )
+        rooms[kind] = outlines[0] if len(outlines) == 1 else Union(outlines)
+    return rooms
+
+
+def _can_be_kept(case: Case) -> bool:
+    """Whether kitchen, bedroom and target are joined by free space outside the bathroom."""
+    grid = case.task.grid
+    inside = {name: signed_distance(case.rooms[name], grid.centres) > 0.0 for name in NAMED}
+    pieces, _ = label((grid.clearance > COMFORT) & ~inside["Bathroom"])
+    piece = pieces == pieces[case.cell(case.target)]
+    return bool((piece & inside["Kitchen"]).any() and (piece & inside["Bedroom"]).any())

@@ -84,6 +84,7 @@ def write_up(folder: Path, page: Path) -> None:
         for kept, results in found.items()
         if results["experiment"]["noise"] == "none"
     }
+    page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text("\n\n".join(_sections(folder, found, drawn, page)) + "\n")
 
 

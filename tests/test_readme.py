@@ -8,11 +8,13 @@ from pathlib import Path
 import pytest
 
 from specshield.sim import report
+from specshield.sim.campaign import Campaign
+from specshield.sim.cases import load_case
+from specshield.sim.episodes import Episode
 from tests.serving import serving
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "http.md")
-TIMES = {"p50": 0.0, "p99": 0.0}
 ADDRESS = "http://127.0.0.1:8000"
 
 
@@ -56,16 +58,8 @@ def test_bring_your_own(tmp_path):
 
 def test_the_table_is_what_the_demo_prints():
     (printed,) = blocks("text")
-    figures = {
-        **dict.fromkeys(("satisfied", "main_done", "kl_per_decision", "kl_per_episode", "extra_steps"), 0),
-        "modes": {},
-        "spread": 1.0,
-        "round_trip_ms": TIMES,
-        "server_ms": TIMES,
-    }
-    table = report.table(
-        [{"case": "", "runs": 20, "refused_starts": 0, "without_shield": figures, "with_shield": figures}]
-    )
+    episode = Episode("case1", 0, True, (0.0, 0.0, 0.0), round_trip_ms=[0.0], server_ms=[0.0])
+    table = report.table([Campaign(load_case("case1"), 0, [episode], [episode], 0)])
     rows = [line[:26].rstrip() for line in table.splitlines()[2:]]
     assert [line[:26].rstrip() for line in printed.splitlines()[-len(rows) :]] == rows
     (kept,) = re.findall("^rule satisfied.*$", printed, re.MULTILINE)

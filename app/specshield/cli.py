@@ -6,6 +6,8 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,45 +25,46 @@ NEEDS_SERVER = "This command needs the server's parts: pip install 'specshield[s
 
 NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
 
-NEEDS_FIGURES = "This command needs matplotlib: pip install 'specshield[figures]'"
+SERVER_PARTS = (
+    "fastapi", "fastapi_offline", "uvicorn", "numba", "pydantic", "pydantic_settings", "redis", "rq",
+)  # fmt: skip
 
 
 def main() -> None:
     """The console script."""
+    run(_commands())
+
+
+def run(commands: Iterable[Callable[..., None]]) -> None:
+    """A command line with these commands. What can be expected to go wrong is told in one line."""
     if typer is None:
         sys.exit(NEEDS_SERVER)
+    app = typer.Typer(
+        help="Keeps robot foundation models inside their operating rules.",
+        epilog="The commands evaluate and report come with evaluation/, from a checkout: make install.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+    )
     try:
-        _commands()()
+        for command in commands:
+            app.command()(command)
+        app()
     except SpecshieldError as error:
         sys.exit(f"{error}; expected {error.expected}" if error.expected else str(error))
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in ("torch",):
+        missing = (error.name or "").split(".")[0]
+        if missing == "torch":
             sys.exit(NEEDS_TORCH)
-        if (error.name or "").split(".")[0] == "matplotlib":
-            sys.exit(NEEDS_FIGURES)
-        if (error.name or "").split(".")[0] in (
-            "fastapi",
-            "fastapi_offline",
-            "uvicorn",
-            "numba",
-            "pydantic",
-            "pydantic_settings",
-            "redis",
-            "rq",
-        ):
+        if missing in SERVER_PARTS:
             sys.exit(NEEDS_SERVER)
         raise
 
 
-def _commands() -> Any:
-    app = typer.Typer(
-        help="Keeps robot foundation models inside their operating rules.",
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-    )
-    for command in (serve, demo, train, evaluate, report, worker, openapi):
-        app.command()(command)
-    return app
+def _commands() -> Iterator[Callable[..., None]]:
+    """The commands below, and those that other packages register as entry points."""
+    yield from (serve, demo, train, worker, openapi)
+    for registered in entry_points(group="specshield.commands"):
+        yield registered.load()
 
 
 def serve(
@@ -97,11 +100,14 @@ def serve(
 def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
 ) -> None:
-    """Make the policies and do the runs that are asked for, until stopped; policies that learn need torch."""
-    from evaluation.jobs import QUEUE
+    """Make the policies that are asked for, until stopped; policies that learn need torch.
+
+    Other packages may have jobs of their own: each entry point of the group specshield.queues is named like
+    the queue that its jobs wait in.
+    """
     from specshield.service.training.worker import serve as work
 
-    work(_settings(), until_eof, [QUEUE])
+    work(_settings(), until_eof, [queue.name for queue in entry_points(group="specshield.queues")])
 
 
 def openapi() -> None:
@@ -118,60 +124,9 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
 ) -> None:
     """The paper's two cases with and without the shield: a table, and a picture of each."""
-    from specshield.sim import commands
+    from specshield.sim.demo import run_demo
 
-    raise typer.Exit(commands.demo(runs, seed, out))
-
-
-def evaluate(
-    case: Annotated[str, typer.Option(help="A case of maps/, as 1 or case1; or house.")],
-    runs: Annotated[int, typer.Option(help="Runs, each by every method.", min=1)] = 100,
-    seed: Annotated[int, typer.Option(help="Decides starts, model, draws and noise.", min=0)] = 0,
-    methods: Annotated[
-        str, typer.Option(help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps.")
-    ] = "",
-    noise: Annotated[
-        str, typer.Option(help="none, gaussian, slip, obstacle, shift, collider; or some.")
-    ] = "none",
-    model: Annotated[str, typer.Option(help="The model that is to be kept to the rule.")] = "learned",
-    house: Annotated[str | None, typer.Option(help="A ProcTHOR house, for the case house.")] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder to keep results in and to take them up from.")
-    ] = None,
-    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
-    redis: Annotated[
-        str | None,
-        typer.Option(help="Let the workers of this Redis do the runs instead.", envvar="REDIS_URL"),
-    ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print figures and records as JSON.")] = False,
-) -> None:
-    """Methods side by side on one case, over any number of runs."""
-    from evaluation.experiment import available, experiments
-    from specshield.sim import commands
-
-    raise typer.Exit(
-        commands.evaluate(
-            experiments(case, house, model, noise, seed),
-            runs,
-            methods.split(",") if methods else available(case),
-            out,
-            processes or os.cpu_count() or 1,
-            redis,
-            json,
-        )
-    )
-
-
-def report(
-    results: Annotated[Path, typer.Argument(help="Folder that evaluate has kept results in.")],
-    out: Annotated[Path, typer.Option(help="The page to write; figures go into a folder beside it.")] = Path(
-        "docs/results.md"
-    ),
-) -> None:
-    """Write up what evaluate has measured. Needs matplotlib."""
-    from evaluation import writeup
-
-    writeup.write_up(results, out)
+    raise typer.Exit(run_demo(runs, seed, out))
 
 
 def train(

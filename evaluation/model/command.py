@@ -61,6 +61,7 @@ def train_model(
         House(
             case.task.grid,
             tuple(APARTMENTS[case.name].rooms.values()),
+            tuple(APARTMENTS[case.name].rooms),
             {target_of(case.instruction): case.target},
         )
         for case in cases

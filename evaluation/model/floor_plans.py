@@ -64,10 +64,11 @@ STRAY = (0.4, 0.2)  # the chances of a chair or two anywhere: they leave niches 
 
 @dataclass(frozen=True)
 class House:
-    """A floor plan, its rooms, and where in it each kind of target is, (x, y) [m]."""
+    """A floor plan. kinds: what each of its rooms is. targets: where each thing to find is, (x, y) [m]."""
 
     grid: OccupancyGrid
     rooms: tuple[Box, ...]
+    kinds: tuple[str, ...]
     targets: dict[str, tuple[float, float]]
 
 
@@ -116,7 +117,7 @@ def _furnished(random: np.random.Generator) -> House | None:
             if point is None:
                 return None
             targets[name] = point
-    return House(grid, tuple(boxes), targets) if "bowl" in targets else None
+    return House(grid, tuple(boxes), tuple(kinds), targets) if "bowl" in targets else None
 
 
 def _cells(length: float) -> int:

@@ -18,16 +18,17 @@ from redis import Redis
 from rq import Queue, Worker
 from rq.serializers import JSONSerializer
 
-from evaluation import calibration, experiment, results
+from evaluation import calibration, campaigns, experiment, results
 from evaluation.evaluation import evaluate, read
 from evaluation.experiment import Experiment
-from evaluation.houses import HOUSES, RULE
+from evaluation.houses import RULE, load_house_case, located
 from evaluation.jobs import QUEUE
 from evaluation.runs import run
 from specshield.errors import InputError, NotFound, SpecshieldError, StoreError
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.sim import cases, commands
+from specshield.sim import cases
 from specshield.sim.cases import load_case
+from specshield.world.regions import signed_distance
 from tests.oracles.judge import margin
 from tests.serving import wait_for
 
@@ -106,14 +107,14 @@ def test_a_folder_of_other_records_is_refused_before_anything_is_done(tmp_path):
     kept.mkdir(parents=True)
     (kept / "experiment.json").write_text(json.dumps(replace(asked[1], seed=6).to_json()))
     with pytest.raises(InputError, match="another experiment"):
-        commands.evaluate(asked, 1, ["ours@conformal/4"], tmp_path, 1, None, False)
+        campaigns.evaluate(asked, 1, ["ours@conformal/4"], tmp_path, 1, None, False)
     assert [path.name for path in tmp_path.rglob("*.json*")] == ["experiment.json"]
 
 
 @pytest.mark.parametrize("name", ["magic", "magic@conformal", "hcd@conformal/4", "ours@much"])
 def test_a_method_that_is_not_is_told_before_anything_is_done(tmp_path, name):
     with pytest.raises((InputError, NotFound)) as caught:
-        commands.evaluate([Experiment("case1")], 1, ["ours@conformal", name], tmp_path, 1, None, False)
+        campaigns.evaluate([Experiment("case1")], 1, ["ours@conformal", name], tmp_path, 1, None, False)
     assert caught.value.path == "methods"
     assert not list(tmp_path.iterdir())
 
@@ -251,20 +252,39 @@ def test_runs_that_the_store_forgets_are_given_out_again_but_not_for_ever(serial
         process.wait(15.0)
 
 
-@pytest.mark.skipif(not HOUSES.is_dir(), reason=f"no houses in {HOUSES}")
-def test_a_house_is_a_case_like_another():
-    (record,) = run(Experiment("house", "house_14", seed=1), 0, ["ours"])
+def test_a_drawn_house_is_a_case_like_another():
+    """It is the same in every process, and the rule can be kept in it."""
+    (record,) = run(Experiment("house", "drawn_0", seed=1), 0, ["ours"])
     assert (record.satisfied, record.main_done) == (True, True)
-    case = Experiment("house", str(HOUSES / "house_14.json")).setting.case
-    assert (case.name, str(case.task.formula)) == ("house_14", RULE)
-    assert not case.task.grid.occupied[case.cell(case.target)]
+    case = Experiment("house", "drawn_0").setting.case
+    assert (case.name, str(case.task.formula)) == ("drawn_0", RULE)
+    again, other = load_house_case("drawn_0"), load_house_case("drawn_1")
+    assert again.task.content_hash == case.task.content_hash != other.task.content_hash
+    for house in (case, other):
+        assert not house.task.grid.occupied[house.cell(house.target)]
+        assert all(signed_distance(region, house.target) < 0.0 for region in house.task.regions.values())
+
+
+def test_a_procthor_house_comes_from_a_folder_of_the_users(tmp_path):
+    corners = [(0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (0.0, 4.0)]
+    rooms = [
+        {"roomType": kind, "floorPolygon": [{"x": x + 6.0 * k, "y": 0.0, "z": z} for x, z in corners]}
+        for k, kind in enumerate(("Kitchen", "LivingRoom", "Bedroom", "Bathroom"))
+    ]
+    (tmp_path / "row.json").write_text(json.dumps({"rooms": rooms, "walls": [], "doors": [], "objects": []}))
+    with pytest.raises(NotFound):
+        load_house_case(located("row", tmp_path))  # asset-sizes.json is missing
+    (tmp_path / "asset-sizes.json").write_text("{}")
+    case = Experiment("house", located("row", tmp_path)).setting.case
+    assert (case.name, list(case.rooms)) == ("row", ["Kitchen", "LivingRoom", "Bedroom", "Bathroom"])
+    assert 6.0 < case.target[0] < 12.0  # in the room that the rule does not name
 
 
 @pytest.mark.parametrize(
     ("make", "path"),
     [
         (lambda: Experiment("house"), "house"),
-        (lambda: Experiment("case1", "house_0"), "house"),
+        (lambda: Experiment("case1", "drawn_0"), "house"),
         (lambda: Experiment("case1", noise="fog"), "noise"),
         (lambda: Experiment("case1", model="oracle"), "model"),
         (lambda: Experiment("house", "nowhere").setting, "house"),

@@ -27,7 +27,7 @@ from specshield.sim.learned.network import (
     features,
 )
 from specshield.sim.learned.reckoning import Reckoning
-from specshield.sim.model import make_model, softmax
+from specshield.sim.model import softmax
 from specshield.sim.robot import SimulatedRobot
 
 STEPS = WINDOW + 100
@@ -131,7 +131,7 @@ def test_the_last_action_and_the_past_matter(case):
 
 
 def test_alone_it_finds_its_target(case):
-    model = make_model("learned", case)
+    model = load_learned(case.instruction)
     results = [alone(case, model, 1, i) for i in range(10)]
     assert sum(found for found, _ in results) >= 8
     assert alone(case, model, 1, 0) == results[0]

@@ -8,10 +8,10 @@ pytest.importorskip("matplotlib")
 
 from evaluation import figures, writeup
 from evaluation.experiment import Experiment
+from evaluation.models import MODELS
 from evaluation.runs import Record
 from specshield.errors import NotFound
 from specshield.sim.cases import load_case
-from specshield.sim.model import MODELS
 
 
 def record(run, method, **fields):

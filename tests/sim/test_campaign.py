@@ -1,15 +1,16 @@
 """Campaigns through the SDK against a real server, and what is made of them."""
 
 import dataclasses
-import json
+import re
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from specshield.client import ShieldClient
-from specshield.sim import picture, report
+from specshield.sim import canvas, picture, report
 from specshield.sim.campaign import run
+from specshield.stl import parse
 from tests.oracles.judge import margin
 
 RUNS = 20  # with seed 0: the episodes of `make demo`
@@ -24,7 +25,7 @@ def campaign(server, case):
 
 def test_with_the_shield_the_rule_is_kept_and_without_it_broken(campaign, case):
     """The service's verdicts, and the oracle's."""
-    assert campaign.kept
+    assert campaign.broken == []
     for episode in campaign.shielded:
         assert margin(case.spec, padded(episode, case)) > 0.0
         assert set(episode.modes) <= {"shaped", "prior", "completion"}
@@ -60,23 +61,27 @@ def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
     assert campaign.shielded[1].start != campaign.shielded[0].start
 
 
-def test_the_table_and_the_json_say_what_happened(campaign):
-    figures = json.loads(json.dumps(report.summary(campaign)))
-    kept = figures["with_shield"]
-    done = [sum(e.main_done for e in episodes) for episodes in (campaign.shielded, campaign.unshielded)]
+def test_the_table_says_what_happened(campaign):
+    done = [sum(e.main_done for e in episodes) for episodes in (campaign.unshielded, campaign.shielded)]
     lucky = sum(episode.spec_status == "satisfied" for episode in campaign.unshielded)
-    assert (kept["satisfied"], kept["main_done"]) == (RUNS, done[0])
-    assert figures["without_shield"] == {"satisfied": lucky, "main_done": done[1]}
     every = [value for episode in campaign.shielded for value in episode.kl]
-    assert kept["kl_per_episode"] == pytest.approx(sum(every) / RUNS, abs=1e-3)
-    assert kept["kl_per_decision"] == pytest.approx(sum(every) / len(every), abs=1e-3)
     pairs = zip(campaign.shielded, campaign.unshielded, strict=True)
     later = [s.ended_at - u.ended_at for s, u in pairs if s.main_done and u.main_done]
-    assert kept["extra_steps"] == np.median(later)
-    lines = report.table([figures, figures]).splitlines()
-    assert lines[2].split() == ["rule", "satisfied", *f"{lucky} of {RUNS} {RUNS} of {RUNS}".split() * 2]
-    assert len({len(line) for line in lines[2:]}) <= 2
-    json.dumps([episode.to_json() for episode in campaign.shielded])
+    decisions = sum(len(episode.round_trip_ms) for episode in campaign.shielded)
+    expected = {
+        "rule satisfied": [f"{lucky} of {RUNS}", f"{RUNS} of {RUNS}"],
+        "main task done": [f"{n} of {RUNS}" for n in done],
+        "KL a decision": [f"{np.mean(every):.2f}"],
+        "KL an episode": [f"{sum(every) / RUNS:.0f}"],
+        "median extra steps": [f"{np.median(later):+.0f}"],
+        "decisions": [str(decisions)],
+        "starts refused": [f"{campaign.refused} of {RUNS + campaign.refused}"],
+    }
+    lines = report.table([campaign, campaign]).splitlines()
+    for name, cells in expected.items():
+        (line,) = (line for line in lines if line.startswith(f"{name} "))
+        assert re.split(" {2,}", line.removeprefix(name).strip()) == cells * 2
+    assert len({len(line) for line in lines[2:]}) == 1
 
 
 def test_a_pair_that_ended_at_once_is_counted(campaign):
@@ -84,12 +89,12 @@ def test_a_pair_that_ended_at_once_is_counted(campaign):
         dataclasses.replace(campaign.shielded[0], main_done=True, ended_at=end) for end in (0, 7)
     )
     pairs = dataclasses.replace(campaign, shielded=[later, at_once, at_once], unshielded=[at_once] * 3)
-    assert report.summary(pairs)["with_shield"]["extra_steps"] == 0.0  # of 7, 0 and 0
+    assert re.search(r"^median extra steps +\+0$", report.table([pairs]), re.MULTILINE)  # of 7, 0 and 0
 
 
 def test_a_broken_rule_is_noticed(campaign):
     broken = dataclasses.replace(campaign.shielded[0], spec_status="violated")
-    assert not dataclasses.replace(campaign, shielded=[broken]).kept
+    assert dataclasses.replace(campaign, shielded=[campaign.shielded[1], broken]).broken == [broken]
 
 
 def test_the_picture_shows_both_ways(campaign, case, tmp_path):
@@ -97,13 +102,28 @@ def test_the_picture_shows_both_ways(campaign, case, tmp_path):
     picture.draw(case, campaign.shielded[0], campaign.unshielded[0], path)
     with Image.open(path) as image:
         xmin, _, xmax, ymax = case.task.grid.bounds
-        assert image.width == round((xmax - xmin) * picture.PIXELS) + 2 * picture.BORDER
-        colors = {color for _, color in image.getcolors(1 << 20)}
-        assert {picture.SHIELDED, picture.UNSHIELDED, picture.TARGET, picture.WALL, picture.GOOD} <= colors
-        assert (picture.BAD in colors) == (case.name == "case2")
-        assert picture.AFTER in colors  # the rule's horizon has an end
-        u, v = (
-            picture.BORDER + (case.target[0] - xmin) * picture.PIXELS,
-            picture.BORDER + (ymax - case.target[1]) * picture.PIXELS,
-        )
-        assert image.getpixel((round(u), round(v))) == picture.TARGET
+        assert image.width == round((xmax - xmin) * picture.SCALE) + 2 * canvas.BORDER
+        seen = {color for _, color in image.getcolors(1 << 20)}
+        names = ("BLUE", "ORANGE", "GREY", "TARGET", "WALL", "VISIT")  # grey: the rule's horizon has an end
+        assert {color(name) for name in names} <= seen
+        assert (color("AVOID") in seen) == (case.name == "case2")
+        u, v = ((case.target[0] - xmin) * picture.SCALE, (ymax - case.target[1]) * picture.SCALE)
+        assert image.getpixel((round(u) + canvas.BORDER, round(v) + canvas.BORDER)) == color("TARGET")
+
+
+def color(name):
+    return ImageColor.getrgb(getattr(canvas, name))
+
+
+@pytest.mark.parametrize(
+    ("formula", "names"),
+    [
+        ("F[0,3] A and G[0,4] not B", {"B"}),
+        ("not (A or not B)", {"A"}),
+        ("G[0,9] (A -> F[0,3] B)", {"A"}),
+        ("not A U[0,6] B", {"A"}),
+        ("not not A", set()),
+    ],
+)
+def test_names_below_an_odd_number_of_negations_are_to_be_avoided(formula, names):
+    assert canvas.avoided(parse(formula)) == names

@@ -54,43 +54,6 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     assert "starting the service" in done.stderr
 
 
-def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path):
-    arguments = ["evaluate", "--case", "1", "--runs", "2", "--methods", "unmodified,ours"]
-    arguments += ["--processes", "1", "--out", str(tmp_path)]
-    done = specshield(*arguments)
-    assert "case1, none, model " in done.stdout
-    (row,) = (line for line in done.stdout.splitlines() if line.startswith("| ours |"))
-    assert "2 of 2 (15.8 to 100.0 %)" in row
-    folder = tmp_path / "case1" / "none"
-    names = ["experiment.json", "results.json", "runs.jsonl", "table.md"]
-    assert sorted(path.name for path in folder.iterdir()) == names
-    kept = (folder / "runs.jsonl").read_text()
-    figures = json.loads(specshield(*arguments, "--json").stdout)
-    assert (folder / "runs.jsonl").read_text() == kept
-    assert [one["satisfied"]["count"] for one in figures["methods"]] == [0, 2]
-    assert [record["run"] for record in figures["records"]] == [0, 0, 1, 1]
-
-
-def test_report_writes_a_page_and_its_pictures(tmp_path):
-    pytest.importorskip("matplotlib")
-    kept = tmp_path / "results" / "case2" / "gaussian"
-    kept.mkdir(parents=True)
-    calibration = {"method": "ours@0.04/4", "margin": 0.0391, "runs": 60}
-    (kept / "calibration.json").write_text(json.dumps({"ours@conformal/4": calibration}))
-    arguments = ["--runs", "2", "--processes", "1", "--out", str(tmp_path / "results")]
-    specshield("evaluate", "--case", "2", "--methods", "unmodified,simplex", *arguments)
-    specshield("evaluate", "--case", "2", "--methods", "ours@conformal/4", "--noise", "gaussian", *arguments)
-    page = tmp_path / "page.md"
-    specshield("report", str(tmp_path / "results"), "--out", str(page))
-    text = page.read_text()
-    assert "| case2, learned | unmodified | 0 % | 99 % | 0 % | 100 % |" in text
-    assert "| gaussian | ours@0.04/4 | 2 of 2 (15.8 to 100.0 %)" in text
-    assert "ours@0.04/4: 0.0391 m from 60 other runs; it covered every step of" in text
-    for name in ("ways", "robustness", "mass", "modes"):
-        assert f"![{name} of case2, learned](page/case2/{name}.png)" in text
-        assert (tmp_path / "page" / "case2" / f"{name}.png").stat().st_size > 10_000
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 @pytest.mark.parametrize("command", ["demo", "evaluate"])
@@ -164,7 +127,7 @@ def test_train_computes_a_policy_too(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["evaluate", "--case", "case9"], "one of case1, case2"),
+        (["train", "--case", "case9"], "one of case1, case2"),
         (["train", "--case", "case1", "--method", "dqn", "--option", "units=9000"], "from 4 to 128"),
         (["train", "--case", "case1", "--method", "magic"], "one of dqn, planner, reachability"),
     ],

@@ -13,7 +13,7 @@ from specshield.shield.decision import Carry, Config
 from specshield.shield.episode import close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
 from specshield.sim.cases import load_case, shipped
-from specshield.sim.model import make_model
+from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 
 
@@ -31,7 +31,7 @@ def begin(case, shield, seed):
 
 def episode(case, shield, seed, each=lambda decision, logits: None):
     """(path KL, verdict) of the stand-in model under the shield."""
-    model, robot = make_model("goal-seeker", case), SimulatedRobot(case, tuple(begin(case, shield, seed)))
+    model, robot = GoalSeeker(case.task.robot), SimulatedRobot(case, tuple(begin(case, shield, seed)))
     model.reset(np.random.default_rng([seed, 0]))
     history, carry, over, paid = [], None, False, 0.0
     for _ in range(case.task.horizon + 1):
@@ -77,7 +77,7 @@ def test_the_guarantee_stays_and_the_path_costs_less(world):
 def test_a_decision_made_again_is_the_same(world):
     case, shield = world
     ahead = replace(shield, config=Config(seed=4), preference=prepare(shield.task, shield.proposers))
-    model, robot = make_model("goal-seeker", case), SimulatedRobot(case, tuple(begin(case, ahead, 1)))
+    model, robot = GoalSeeker(case.task.robot), SimulatedRobot(case, tuple(begin(case, ahead, 1)))
     model.reset(np.random.default_rng(1))
     history, carry = [], None
     for t in range(12):

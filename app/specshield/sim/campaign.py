@@ -14,7 +14,7 @@ from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode, with_shield, without_shield
-from specshield.sim.model import make_model
+from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import Pose
 
 DRAWS = 100  # starts tried for one episode before giving up
@@ -24,7 +24,7 @@ DRAWS = 100  # starts tried for one episode before giving up
 class Campaign:
     """Episodes in pairs: `shielded[i]` and `unshielded[i]` share their start and the model's seed.
 
-    refused: starts that the service refused as infeasible; others were drawn in their place.
+    refused: how many starts the service refused as infeasible before it took those of the episodes.
     """
 
     case: Case
@@ -34,9 +34,9 @@ class Campaign:
     refused: int
 
     @property
-    def kept(self) -> bool:
-        """The promise: every shielded episode satisfied the rule."""
-        return all(episode.spec_status == "satisfied" for episode in self.shielded)
+    def broken(self) -> list[Episode]:
+        """The shielded episodes that did not satisfy the rule: none, by the shield's promise."""
+        return [episode for episode in self.shielded if episode.spec_status != "satisfied"]
 
 
 def run(
@@ -51,7 +51,7 @@ def run(
     def pair(i: int) -> tuple[Episode, Episode, int]:
         own = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
         session, start, refused = _begin(client, case, own)
-        model = make_model("learned", case)
+        model = load_learned(case.instruction)
         return (
             with_shield(session, case, model, start, own),
             without_shield(client, case, model, start, own),

@@ -5,12 +5,11 @@ from __future__ import annotations
 import sys
 import time
 
-WIDTH = 30
-EVERY = 10.0  # [s] between lines where nobody looks on
+EVERY = 10.0  # [s] between lines where standard error is no terminal
 
 
 class StatusLine:
-    """On a terminal one line that is written over; elsewhere a new line now and then."""
+    """One line that is written over on a terminal; elsewhere a new line every EVERY seconds at most."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
@@ -26,12 +25,6 @@ class StatusLine:
     def clear(self) -> None:
         if self._terminal:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-
-
-def bar(done: int, total: int) -> str:
-    """How much is done, WIDTH characters wide."""
-    filled = WIDTH * done // max(total, 1)
-    return "#" * filled + "." * (WIDTH - filled)
 
 
 def duration(seconds: float) -> str:

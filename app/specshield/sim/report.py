@@ -1,110 +1,72 @@
-"""Campaigns as a table to read and as JSON to keep."""
+"""The demo's campaigns as a table."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from evaluation.statistics import extra_steps
 from specshield.sim.campaign import Campaign
 from specshield.sim.episodes import Episode
 
 MODES = ("shaped", "completion", "prior", "fallback", "violated")
 
 
-def summary(campaign: Campaign) -> dict[str, Any]:
-    """The figures of a campaign, as JSON.
-
-    kl_per_decision, kl_per_episode [nats]: mean over the decisions made for the model, and of their sums.
-    extra_steps: median of how much later the model ended with the shield, where it did its task both times.
-    spread: of the decisions made while the rule was pending and the main task ran, the share that was
-    `shaped` and left the model more than one action. round_trip_ms, server_ms: of one decision.
-    """
-    shielded = campaign.shielded
-    extra = extra_steps(zip(shielded, campaign.unshielded, strict=True))
-    kl = [value for episode in shielded for value in episode.kl]
-    asked = sum(episode.asked for episode in shielded)
-    return {
-        "case": campaign.case.name,
-        "formula": str(campaign.case.task.formula),
-        "instruction": campaign.case.instruction,
-        "seed": campaign.seed,
-        "runs": len(shielded),
-        "refused_starts": campaign.refused,
-        "without_shield": _outcome(campaign.unshielded),
-        "with_shield": {
-            **_outcome(shielded),
-            "kl_per_decision": _rounded(np.mean(kl)) if kl else None,
-            "kl_per_episode": _rounded(np.mean([sum(episode.kl) for episode in shielded])),
-            "extra_steps": _rounded(np.median(extra)) if extra else None,
-            "modes": dict(sum((episode.modes for episode in shielded), Counter[str]())),
-            "spread": _rounded(sum(episode.spread for episode in shielded) / asked) if asked else None,
-            "round_trip_ms": _percentiles([ms for episode in shielded for ms in episode.round_trip_ms]),
-            "server_ms": _percentiles([ms for episode in shielded for ms in episode.server_ms]),
-        },
-    }
-
-
-def table(summaries: Sequence[dict[str, Any]]) -> str:
-    """One pair of columns a case, without and with the shield."""
-    columns = [column for one in summaries for column in (_without(one), _with(one))]
+def table(campaigns: Sequence[Campaign]) -> str:
+    """One pair of columns a case: without the shield, and with it."""
+    columns = [column for each in campaigns for column in (_outcome(each.unshielded), _shielded(each))]
     names = list(columns[1])
     cells = [[name, *(column.get(name, "") for column in columns)] for name in names]
-    heads = [["", *(one["case"] if i == 0 else "" for one in summaries for i in range(2))]]
-    heads.append(["", *("without", "with shield") * len(summaries)])
+    heads = [["", *(each.case.name if i == 0 else "" for each in campaigns for i in range(2))]]
+    heads.append(["", *("without", "with shield") * len(campaigns)])
     rows = heads + [row for row in cells if row[0] != "  violated" or set(row[1:]) > {"", "0"}]
     wide = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
     lines = ["  ".join([row[0].ljust(wide[0]), *map(str.rjust, row[1:], wide[1:])]) for row in rows]
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _without(one: dict[str, Any]) -> dict[str, str]:
-    runs, figures = one["runs"], one["without_shield"]
+def _outcome(episodes: Sequence[Episode]) -> dict[str, str]:
+    kept = sum(episode.spec_status == "satisfied" for episode in episodes)
+    done = sum(episode.main_done for episode in episodes)
     return {
-        "rule satisfied": f"{figures['satisfied']} of {runs}",
-        "main task done": f"{figures['main_done']} of {runs}",
+        "rule satisfied": f"{kept} of {len(episodes)}",
+        "main task done": f"{done} of {len(episodes)}",
     }
 
 
-def _with(one: dict[str, Any]) -> dict[str, str]:
-    runs, refused, figures = one["runs"], one["refused_starts"], one["with_shield"]
-    modes = figures["modes"]
+def _shielded(campaign: Campaign) -> dict[str, str]:
+    """What is told of the episodes with the shield.
+
+    KL: of the decisions made for the model from its own distribution [nats], a decision and summed over an
+    episode. Extra steps: how much later the model ended than without the shield, where it did its task both
+    times. More than one action left: of the decisions made while the rule was pending and the main task ran,
+    the share that was `shaped` and left the model a choice.
+    """
+    shielded = campaign.shielded
+    modes = sum((episode.modes for episode in shielded), Counter[str]())
+    kl = [value for episode in shielded for value in episode.kl]
+    later = [
+        one.ended_at - other.ended_at
+        for one, other in zip(shielded, campaign.unshielded, strict=True)
+        if one.main_done and other.main_done and one.ended_at is not None and other.ended_at is not None
+    ]
+    asked = sum(episode.asked for episode in shielded)
+    spread = sum(episode.spread for episode in shielded)
     return {
-        "rule satisfied": f"{figures['satisfied']} of {runs}",
-        "main task done": f"{figures['main_done']} of {runs}",
-        "KL a decision": _number(figures["kl_per_decision"], ".2f"),
-        "KL an episode": _number(figures["kl_per_episode"], ".0f"),
-        "median extra steps": _number(figures["extra_steps"], "+.0f"),
-        "decisions": str(sum(modes.values())),
-        **{f"  {mode}": str(modes.get(mode, 0)) for mode in MODES},
-        "more than one action left": _number(figures["spread"], ".1%"),
-        "a decision, p50 / p99": _times(figures["round_trip_ms"]),
-        "  of it in the server": _times(figures["server_ms"]),
-        "starts refused": f"{refused} of {runs + refused}",
+        **_outcome(shielded),
+        "KL a decision": f"{np.mean(kl):.2f}" if kl else "-",
+        "KL an episode": f"{sum(kl) / len(shielded):.0f}",
+        "median extra steps": f"{np.median(later):+.0f}" if later else "-",
+        "decisions": str(modes.total()),
+        **{f"  {mode}": str(modes[mode]) for mode in MODES},
+        "more than one action left": f"{spread / asked:.1%}" if asked else "-",
+        "a decision, p50 / p99": _times([ms for episode in shielded for ms in episode.round_trip_ms]),
+        "  of it in the server": _times([ms for episode in shielded for ms in episode.server_ms]),
+        "starts refused": f"{campaign.refused} of {len(shielded) + campaign.refused}",
     }
 
 
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
-def _times(figures: dict[str, float]) -> str:
-    return f"{figures['p50']:.1f} / {figures['p99']:.1f} ms"
-
-
-def _outcome(episodes: Sequence[Episode]) -> dict[str, Any]:
-    return {
-        "satisfied": sum(episode.spec_status == "satisfied" for episode in episodes),
-        "main_done": sum(episode.main_done for episode in episodes),
-    }
-
-
-def _percentiles(values: Sequence[float]) -> dict[str, float]:
-    return {f"p{q:g}": _rounded(np.percentile(values, q)) for q in (50, 90, 99)}
-
-
-def _rounded(value: Any) -> float:
-    return round(float(value), 4)
+def _times(milliseconds: Sequence[float]) -> str:
+    middle, high = np.percentile(milliseconds, (50, 99))
+    return f"{middle:.1f} / {high:.1f} ms"

@@ -15,7 +15,7 @@ from specshield.sim.senses import RAYS, Senses, scan, see
 from specshield.world.geodesic import geodesic_distance
 
 COMFORT = 0.32  # [m] clearance in which a Stretch turns freely about its origin
-LOOK_AHEAD = 10  # cells along the way
+LOOK_AHEAD = 10  # [cells] along the way: how far ahead the bearing is taken; chosen by hand
 NEAR = 1.0  # [m] along free space: an `end` within this has found the target
 
 Pose = tuple[float, float, float]
@@ -54,18 +54,9 @@ class SimulatedRobot:
     def at_target(self) -> bool:
         return bool(self._case.distance[self._case.cell(self.pose)] <= NEAR)
 
-    def observe(self, errand: Case | None = None) -> Observation:
-        """errand: the case with another target, that distance and bearing are to be of."""
-        errand, (x, y, theta) = errand or self._case, self.pose
-        cell = errand.cell(self.pose)
-        way = waypoints(errand)[cell] - (x, y)
-        bearing = math.atan2(way[1], way[0]) - theta
-        return Observation(
-            distance=float(errand.distance[cell]),
-            bearing=math.remainder(bearing, 2.0 * math.pi),
-            blocked=self._blocked(),
-            last_action=self.last_action,
-        )
+    def observe(self) -> Observation:
+        distance, bearing = way(self._case, self.pose)
+        return Observation(distance, bearing, self._blocked(), self.last_action)
 
     def sense(self) -> Senses:
         """What a robot without a map has: its scanner, its camera, and what it did."""
@@ -83,11 +74,23 @@ class SimulatedRobot:
         return np.where(robot.terminal, False, (short | unturned)[robot.motion_of])
 
 
+def way(case: Case, pose: Pose) -> tuple[float, float]:
+    """How far the case's target is along free space [m], and in which direction the way begins.
+
+    The direction is the bearing of the way from the robot's heading, in [-pi, pi].
+    """
+    cell, (x, y, theta) = case.cell(pose), pose
+    ahead = waypoints(case)[cell] - (x, y)
+    bearing = math.remainder(math.atan2(ahead[1], ahead[0]) - theta, 2.0 * math.pi)
+    return float(case.distance[cell]), bearing
+
+
 @lru_cache(maxsize=32)
 def waypoints(case: Case) -> NDArray[np.float64]:
-    """From each cell, the point LOOK_AHEAD cells on along the way, in metres. Shape [height, width, 2].
+    """From each cell, the point that lies LOOK_AHEAD cells on along the way to the target [m].
 
-    The way keeps off the walls, so that the robot can turn on it; from beside a wall it leads off it first.
+    The way keeps off the walls, so that the robot can turn on it; from a cell beside a wall it first leads
+    away from the wall. Shape [height, width, 2].
     """
     grid = case.task.grid
     free, comfortable = ~grid.occupied, grid.clearance > COMFORT

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from examples import chores_loop
 from specshield.client import ShieldClient
 from specshield.errors import InfeasibleStart, LogitsError, PoseError, RobotError
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
-from specshield.sim import adapters
 from specshield.sim.robot import SimulatedRobot
 
 # As AI2-THOR gives it in `last_event.metadata["agent"]`.
@@ -26,7 +26,7 @@ RECORDED = {
 
 @pytest.mark.parametrize(("yaw", "theta"), [(0, 90), (90, 0), (180, -90), (270, 180), (359.5, 90.5)])
 def test_their_pose_in_our_frame(yaw, theta):
-    x, y, got = adapters.pose_of({**RECORDED, "rotation": {"x": 0.0, "y": yaw, "z": 0.0}})
+    x, y, got = chores_loop.pose_of({**RECORDED, "rotation": {"x": 0.0, "y": yaw, "z": 0.0}})
     assert (x, y) == (4.25, 7.75)
     assert math.remainder(got - math.radians(theta), 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
     assert -math.pi < got <= math.pi
@@ -35,28 +35,28 @@ def test_their_pose_in_our_frame(yaw, theta):
 def test_their_moves_are_ours():
     """One metre ahead at yaw 30: theirs is (sin, cos) along (x, z); their rotate_left lessens the yaw."""
     yaw = math.radians(30)
-    _, _, theta = adapters.pose_of({**RECORDED, "rotation": {"y": 30.0}})
+    _, _, theta = chores_loop.pose_of({**RECORDED, "rotation": {"y": 30.0}})
     assert (math.cos(theta), math.sin(theta)) == pytest.approx((math.sin(yaw), math.cos(yaw)))
-    _, _, left = adapters.pose_of({**RECORDED, "rotation": {"y": 0.0}})
+    _, _, left = chores_loop.pose_of({**RECORDED, "rotation": {"y": 0.0}})
     assert left - theta == pytest.approx(STRETCH.actions[STRETCH.action_names.index("l")].rotate)
 
 
 def test_what_is_not_theirs_is_refused():
     with pytest.raises(PoseError):
-        adapters.pose_of({"position": {"x": 0.0}, "rotation": {"y": 0.0}})
-    adapters.check_actions(list(STRETCH.action_names))
+        chores_loop.pose_of({"position": {"x": 0.0}, "rotation": {"y": 0.0}})
+    chores_loop.check_actions(list(STRETCH.action_names))
     with pytest.raises(RobotError):
-        adapters.check_actions(STRETCH.action_names[::-1])
+        chores_loop.check_actions(STRETCH.action_names[::-1])
     for bad in (np.full(19, 1 / 19), np.full(20, 0.1), np.array([np.nan] * 20), np.eye(20)):
         with pytest.raises(LogitsError):
-            adapters.logits_of(bad)
+            chores_loop.logits_of(bad)
 
 
 def test_logits_give_the_probabilities_back():
     p = np.random.default_rng(0).dirichlet(np.ones(20)).astype(np.float32)
     p[3] = 0.0
     p /= p.sum()
-    logits = adapters.logits_of(p)
+    logits = chores_loop.logits_of(p)
     assert logits[3] == -np.inf
     weights = np.exp(logits - logits.max())
     assert weights / weights.sum() == pytest.approx(p, abs=1e-6)
@@ -135,7 +135,7 @@ def test_the_loop_keeps_the_rule_and_tells_the_agent_what_was_executed(server, c
             except InfeasibleStart:
                 continue
         world, agent = World(case, tuple(pose.tolist())), Recorded(kind)
-        adapters.drive(world, agent, session)
+        chores_loop.drive(world, agent, session)
     assert session.spec_status == "satisfied"
     assert world.names[-1] == "end"
     executed = [STRETCH.action_names.index(name) for name in world.names]

@@ -1,14 +1,14 @@
-"""How the evaluation loops of SPOC, PoliFormer and FLaRe are wired to the shield.
+"""The evaluation loops of SPOC, PoliFormer and FLaRe with the shield between the agent and the simulator.
 
-Their loop asks an agent for an action and steps a task with its name. Here the agent's probabilities go to
-the shield, the task is stepped with the shield's answer, and the agent is told what was really executed: both
-kinds of agent feed their own draw back into their memory, which the shield may have overruled.
+Their loop asks an agent for an action and steps a task with the action's name. In `drive`, the agent's
+probabilities go to the shield, and the task is stepped with the shield's answer. The agent is then told what
+was executed: both kinds of agent feed their own draw back into their memory, and the shield may have
+overruled it.
 
-**Not run.** Neither their weights nor their simulator (AI2-THOR with Objaverse houses) can be had where this
-was written, so none of the three models has been driven through this module. It was written against their
-public sources (spoc-robot-training, PoliFormer and FLaRe: `online_evaluation/online_evaluator_worker.py`,
-`environment/stretch_controller.py`, the agents in `architecture/models`), and is tested with objects that
-have the fields and shapes found there.
+**Not run with the real models.** Neither their weights nor their simulator (AI2-THOR with Objaverse houses)
+could be had where this was written. It follows their public sources (spoc-robot-training, PoliFormer and
+FLaRe: `online_evaluation/online_evaluator_worker.py`, `environment/stretch_controller.py`, the agents in
+`architecture/models`), and its test drives it with objects that have the fields and shapes found there.
 """
 
 from __future__ import annotations

@@ -1,0 +1,54 @@
+"""What `specshield demo` does: both cases over HTTP, a table of what came of them, and a picture of each."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+from specshield.client import ShieldClient
+from specshield.sim import picture, report
+from specshield.sim.campaign import Campaign, run
+from specshield.sim.cases import Case, case_names, load_case
+from specshield.sim.progress import StatusLine, duration
+from specshield.sim.service import own_server
+
+PATIENCE = 10.0  # [s] for one decision: other work may share the machine
+
+
+def run_demo(runs: int, seed: int, out: Path) -> int:
+    """Runs every case with and without the shield, and writes the pictures into the folder `out`.
+
+    Returns the exit status: 1 if an episode with the shield broke its rule.
+    """
+    began, status = time.monotonic(), StatusLine()
+    status.say("starting the service (its first start compiles: about a minute) ...")
+    with own_server() as url, ShieldClient(url, timeout=PATIENCE) as client:
+        campaigns = [_campaign(client, load_case(name), runs, seed, status) for name in case_names()]
+    for campaign in campaigns:
+        first, beside = campaign.shielded[0], campaign.unshielded[0]
+        picture.draw(campaign.case, first, beside, out / f"{campaign.case.name}.png")
+    status.clear()
+    print(f"{runs} episodes a case, seed {seed}, over HTTP\n")
+    for campaign in campaigns:
+        case = campaign.case
+        print(f'{case.name}  {case.task.formula}\n       model: "{case.instruction}"')
+    print(f"\n{report.table(campaigns)}\n")
+    for campaign in campaigns:
+        print(f"picture: {out / campaign.case.name}.png")
+    print(f"{time.monotonic() - began:.0f} s")
+    broken = [episode for campaign in campaigns for episode in campaign.broken]
+    for episode in broken:
+        where = f"{episode.case} from {episode.start}, seed {episode.seed}"
+        print(f"BROKEN: {where}: {episode.spec_status}", file=sys.stderr)
+    return 1 if broken else 0
+
+
+def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: StatusLine) -> Campaign:
+    began = time.monotonic()
+
+    def show(done: int) -> None:
+        left = (time.monotonic() - began) / done * (runs - done)
+        status.say(f"{case.name}: {done} of {runs} episodes, {duration(left)} left")
+
+    return run(client, case, runs, seed, show)

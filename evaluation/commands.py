@@ -1,0 +1,66 @@
+"""The commands that this package adds to `specshield`; each imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def evaluate(
+    case: Annotated[str, typer.Option(help="A case of maps/, as 1 or case1; or house.")],
+    runs: Annotated[int, typer.Option(help="Runs, each by every method.", min=1)] = 100,
+    seed: Annotated[int, typer.Option(help="Decides starts, model, draws and noise.", min=0)] = 0,
+    methods: Annotated[
+        str, typer.Option(help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps.")
+    ] = "",
+    noise: Annotated[
+        str, typer.Option(help="none, gaussian, slip, obstacle, shift, collider; or some.")
+    ] = "none",
+    model: Annotated[str, typer.Option(help="The model that is to be kept to the rule.")] = "learned",
+    house: Annotated[
+        str | None,
+        typer.Option(help="For the case house: drawn_N, a floor plan drawn with seed N, or one of --houses."),
+    ] = None,
+    houses: Annotated[
+        Path | None, typer.Option(help="A folder with ProcTHOR houses and their asset-sizes.json.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to keep results in and to take them up from.")
+    ] = None,
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+    redis: Annotated[
+        str | None,
+        typer.Option(help="Let the workers of this Redis do the runs instead.", envvar="REDIS_URL"),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print figures and records as JSON.")] = False,
+) -> None:
+    """Compare methods on one case, over any number of runs."""
+    from evaluation import campaigns
+    from evaluation.experiment import available, experiments
+    from evaluation.houses import located
+
+    status = campaigns.evaluate(
+        experiments(case, located(house, houses), model, noise, seed),
+        runs,
+        methods.split(",") if methods else available(case),
+        out,
+        processes or os.cpu_count() or 1,
+        redis,
+        json,
+    )
+    raise typer.Exit(status)
+
+
+def report(
+    results: Annotated[Path, typer.Argument(help="Folder that evaluate has kept results in.")],
+    out: Annotated[Path, typer.Option(help="The page to write; figures go into a folder beside it.")] = Path(
+        "docs/results.md"
+    ),
+) -> None:
+    """Write a page with tables and figures from what evaluate has measured."""
+    from evaluation import writeup
+
+    writeup.write_up(results, out)

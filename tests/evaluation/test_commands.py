@@ -1,0 +1,89 @@
+"""The commands that evaluation adds to `specshield`, as a user runs them."""
+
+import json
+import subprocess
+import sys
+from importlib.metadata import entry_points
+
+import pytest
+
+from evaluation import commands, jobs
+
+SPECSHIELD = (sys.executable, "-m", "specshield.cli")
+ALONE = (sys.executable, "-m", "evaluation")
+
+
+def specshield(*arguments, code=0, program=SPECSHIELD):
+    done = subprocess.run([*program, *arguments], capture_output=True, text=True, timeout=300)
+    assert done.returncode == code, done.stderr
+    return done
+
+
+def test_the_entry_points_name_what_there_is():
+    """Without them `specshield` would know neither the commands nor the queue."""
+    found = {each.name: each.load() for each in entry_points(group="specshield.commands")}
+    assert found.items() >= {"evaluate": commands.evaluate, "report": commands.report}.items()
+    queues = {each.name: each.load() for each in entry_points(group="specshield.queues")}
+    assert queues[jobs.QUEUE] is jobs.run_chunk
+    assert "evaluate" in specshield("--help").stdout
+
+
+def test_it_runs_without_being_installed_too(tmp_path):
+    done = specshield("evaluate", "--case", "house", "--house", "drawn_0", "--runs", "1", "--methods",
+                      "unmodified", "--processes", "1", program=ALONE)  # fmt: skip
+    assert "drawn_0, none, model learned, seed 0: F[0,80] Kitchen" in done.stdout
+
+
+def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path):
+    arguments = ["evaluate", "--case", "1", "--runs", "2", "--methods", "unmodified,ours"]
+    arguments += ["--processes", "1", "--out", str(tmp_path)]
+    done = specshield(*arguments)
+    assert "case1, none, model " in done.stdout
+    (row,) = (line for line in done.stdout.splitlines() if line.startswith("| ours |"))
+    assert "2 of 2 (15.8 to 100.0 %)" in row
+    folder = tmp_path / "case1" / "none"
+    names = ["experiment.json", "results.json", "runs.jsonl", "table.md"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    kept = (folder / "runs.jsonl").read_text()
+    figures = json.loads(specshield(*arguments, "--json").stdout)
+    assert (folder / "runs.jsonl").read_text() == kept
+    assert [one["satisfied"]["count"] for one in figures["methods"]] == [0, 2]
+    assert [record["run"] for record in figures["records"]] == [0, 0, 1, 1]
+
+
+def test_report_writes_a_page_and_its_pictures(tmp_path):
+    pytest.importorskip("matplotlib")
+    kept = tmp_path / "results" / "case2" / "gaussian"
+    kept.mkdir(parents=True)
+    calibration = {"method": "ours@0.04/4", "margin": 0.0391, "runs": 60}
+    (kept / "calibration.json").write_text(json.dumps({"ours@conformal/4": calibration}))
+    arguments = ["--runs", "2", "--processes", "1", "--out", str(tmp_path / "results")]
+    specshield("evaluate", "--case", "2", "--methods", "unmodified,simplex", *arguments)
+    specshield("evaluate", "--case", "2", "--methods", "ours@conformal/4", "--noise", "gaussian", *arguments)
+    page = tmp_path / "page.md"
+    specshield("report", str(tmp_path / "results"), "--out", str(page))
+    text = page.read_text()
+    assert "| case2, learned | unmodified | 0 % | 99 % | 0 % | 100 % |" in text
+    assert "| gaussian | ours@0.04/4 | 2 of 2 (15.8 to 100.0 %)" in text
+    assert "ours@0.04/4: 0.0391 m from 60 other runs; it covered every step of" in text
+    for name in ("ways", "robustness", "mass", "modes"):
+        assert f"![{name} of case2, learned](page/case2/{name}.png)" in text
+        assert (tmp_path / "page" / "case2" / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--case", "case9"], "one of case1, case2"),
+        (["--case", "house"], "--house drawn_0 with --case house"),
+        (["--case", "house", "--house", "house_0"], 'prior.load_dataset("procthor-10k")'),
+        (
+            ["--case", "house", "--house", "house_0", "--houses", "/nowhere"],
+            "no house '/nowhere/house_0.json'",
+        ),
+    ],
+)
+def test_a_mistake_is_told_in_a_line(arguments, said):
+    done = specshield("evaluate", *arguments, code=1)
+    (line,) = done.stderr.splitlines()
+    assert said in line
