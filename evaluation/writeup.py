@@ -1,4 +1,4 @@
-"""docs/results.md and its figures, from what `specshield evaluate --out` has kept.
+"""A page of results with its figures, from what `specshield evaluate --out` has kept.
 
 Every figure in the page is read from a results.json; the words around them are here.
 """
@@ -23,44 +23,58 @@ PAPER = {  # Table II: rule satisfied and main task done, in per cent of 200 run
 }
 METHODS = {
     "unmodified": "the model's own draws; after its `end` the robot stands still.",
-    "hcd": """next-step masking, SafeDec's hard constrained decoding: minus infinity where the states so far
-  and the next one leave some conjunct no chance, whatever follows.""",
-    "rcd": """SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)), rho of the
+    "hcd": """next-step masking, SafeDec's hard constrained decoding: a logit becomes minus infinity where the
+  states so far and the next one leave some conjunct no chance, whatever follows. After the model's `end` the
+  robot stands still.""",
+    "rcd": """SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)), with rho of the
   predicates that are asked for at the next step; alpha = {alpha:g} per metre, beta = {beta:g}, the best of 24
-  pairs by runs that kept the rule, on other seeds.""",
-    "simplex": "the model's draw where it is feasible, else the certified continuation.",
-    "paper": "the paper's: a DQN as pi_phi, rolled out literally after every action; hard projection.",
-    "ours": "reachability and the DQN together, witnesses carried on; hard projection.",
-    "lookahead": """ours, weighted inside S_t by what the rule will still cost the model, as a surrogate
-  fitted to its logits has it.""",
+  pairs by runs that kept the rule, on other seeds. After the model's `end` the robot stands still.""",
+    "simplex": "the model's own draw where it is feasible, else the certified continuation.",
+    "paper": """the paper's decision rule with our DQN as pi_phi, rolled out literally after every action;
+  hard projection. It is not the paper's policy: the shipped DQNs learned from the reward `progress`, not
+  from the paper's funnels (`models/*/card.json`).""",
+    "ours": """reachability and the DQN together; the certified continuation of each decision is handed to the
+  next; hard projection.""",
+    "lookahead": """ours, with the feasible actions weighted by what the rule will still cost the model from
+  there, as far as a surrogate fitted to its logits can tell.""",
 }
-CAREFUL = "- NAME@M/K: with a margin of M metres and deadlines aimed at K steps early."
+CAREFUL = "- **NAME@M/K**: that method with a margin of M metres, each deadline aimed at K steps early."
 NOISES = {
-    "none": "as told",
-    "gaussian": "every motion ends off by sigma 0.01 m along x and y, and 0.5 degrees",
+    "none": "the world is as the shield was told",
+    "gaussian": "every motion ends off by sigma 0.01 m along x and along y, and by sigma 0.5 degrees",
     "slip": "5 % of the motions do nothing",
-    "obstacle": "0.3 m wide, on no map, on the way that was certified at the start",
-    "shift": "walls and furniture 0.05 m off along x or y",
-    "collider": "the Stretch's off-centre footprint, told as a centred one",
+    "obstacle": "a box 0.3 m wide that is on no map stands on the way that was certified at the start",
+    "shift": "walls and furniture stand 0.05 m from where the map has them, along x or y",
+    "collider": "the footprint lies behind the robot's origin; the shield was told that it is centred",
 }
 
 MODELS = {
-    "decoyed": """decoyed, a goal-seeker that goes to another place first, and stays about it for some tens of
-steps before it turns to its target""",
-    "drifter": """drifter, which goes nowhere for a long time, its likings for actions drifting, and then
-seeks its target""",
-    "goal-seeker": "goal-seeker, a stand-in that is told the way along free space and strays from it",
-    "jumper": """jumper, a goal-seeker that sets out for another place at random steps, and in the end for its
-target""",
-    "learned": "learned, a transformer that imitates shortest paths, from egocentric senses",
+    "decoyed": """a goal-seeker that goes to another place first, and stays near it for some tens of steps
+  before it turns to its target.""",
+    "drifter": """it goes nowhere for a long time, while its preferences for actions drift, and then seeks
+  its target.""",
+    "goal-seeker": """it is told the way along free space and strays from it. Look-ahead's surrogate of a
+  model is nearly of this kind, so look-ahead is at its best here.""",
+    "jumper": "a goal-seeker that sets out for another place at random steps, and in the end for its target.",
+    "learned": """a transformer that imitates shortest paths, from egocentric senses. It was trained with
+  interference: in half of its training episodes it was held or steered elsewhere for tens of steps, as a
+  shield does. It probably bears being steered better than a model that never was.""",
 }
+NOT_THE_SAME = """\
+The paper's figures are of other models, maps and simulators; only the shapes of the rules and the number of
+runs are the same. The maps here are drawn, and their regions placed, so that a robot that only seeks its
+target breaks the rule. A region holds when the robot's origin is in it, as in the paper: a rule to stay out
+of a region does not keep the whole body out of it."""
 WHY_NEXT_STEP = """\
-Next-step methods see of a window the last step alone: where the place to visit is further than that, nothing
-is left to choose. HCD keeps a G. What RCD adds to the logits leads straight at a place, walls or not."""
+Next-step methods notice a window at its last step only: when the place to visit is further away than one
+step, no action is left that reaches it in time. HCD keeps a G. What RCD adds to the logits leads straight
+towards a place, also where a wall is between."""
 WHY_SLACK = """\
-Projection lets a model put a visit off to the last step from which it can still be certified, and noise then
-takes that step: slack gives time back. A margin keeps room to what is forbidden, and asks for visits that are
-not grazed."""
+Projection lets a model put a visit off to the last step from which it can still be certified, and noise can
+then take that step away: slack gives time back. A margin keeps a distance from what is forbidden, and asks
+for visits that reach further into a region than its edge. Without them, `ours` need not do better than
+`paper`. The slack of 8 steps was chosen by hand. The calibrated margin covers the surprise of one step; it
+promises nothing about the rule as a whole."""
 
 Results = dict[str, Any]
 
@@ -110,10 +124,12 @@ def _sections(
     yield "\n".join([*legend, CAREFUL]).format(alpha=ALPHA, beta=BETA)
     yield "## Beside the paper's Table II"
     yield _beside(r for r in told.values() if r["experiment"]["house"] is None)
+    yield NOT_THE_SAME
     if there & {"hcd", "rcd"}:
         yield WHY_NEXT_STEP
+    yield "The models know no rule:"
     used = dict.fromkeys(_model(results) for results in found.values())
-    yield f"Models: {'; '.join(MODELS[name] for name in used)}. They know no rule."
+    yield "\n".join(f"- **{name}**: {MODELS[name]}" for name in used)
     for kept, results in told.items():
         yield f"## {_title(results)}: method by method"
         yield _about(results)
@@ -146,8 +162,8 @@ def _about(results: Results) -> str:
     about = results["experiment"]
     return (
         f'`{results["formula"]}`, model {about["model"]} ("{results["instruction"]}"), '
-        f"{results['runs']} runs, seed {about['seed']}; {results['refused_starts']} starts drawn before them "
-        "would not do."
+        f"{results['runs']} runs, seed {about['seed']}; {results['refused_starts']} more starts were drawn "
+        "and refused, because no future that keeps the rule was found from there."
     )
 
 
@@ -174,7 +190,7 @@ def _beside(cases: Iterable[Results]) -> str:
 
 
 def _short(results: Results) -> str:
-    """What each method did not keep, and why main tasks were not done."""
+    """Which conjuncts each method did not keep, and why main tasks were not done."""
     lines = []
     for one in results["methods"]:
         parts = []
@@ -198,14 +214,14 @@ def _short(results: Results) -> str:
     left = results["left"]
     if left["of"]:
         lines.append(
-            f"- A rule may keep the model till its horizon; in the {left['steps']} steps that are then left, "
-            f"unmodified does its task in {left['done']} of {left['of']} runs."
+            f"- A rule may keep the model from its task until the horizon. In the {left['steps']} steps "
+            f"that are then left, unmodified does its task in {left['done']} of {left['of']} runs."
         )
     return "\n".join(lines)
 
 
 def _look_ahead(beside: Mapping[str, Mapping[str, float] | None] | None) -> Iterator[str]:
-    """What looking ahead costs beside the projection, where both were run and it costs something."""
+    """What look-ahead costs as a share of the projection's costs, where both were run and those are not 0."""
     names = {"kl": "KL a run", "extra_steps": "mean extra steps"}
     parts = [
         f"{names[name]} {one['share']:.2f} ({one['low']:.2f} to {one['high']:.2f})"
@@ -267,8 +283,10 @@ def _calibrations(found: dict[Path, Results]) -> Iterator[str]:
 def _commands(folder: Path, found: Mapping[Path, Results], page: Path) -> Iterator[str]:
     top = Path("out") / folder.resolve().name
     for kept, results in found.items():
-        about = results["experiment"]
-        case = f"house --house {about['house']}" if about["house"] else results["case"]
+        about, case = results["experiment"], results["case"]
+        if about["house"]:
+            folder_of = "" if about["house"] == case else f" --houses {Path(about['house']).parent}"
+            case = f"house --house {case}{folder_of}"
         out = top / kept.parent.parent.relative_to(folder)
         for runs in dict.fromkeys(one["runs"] for one in results["methods"]):
             methods = ",".join(one["method"] for one in results["methods"] if one["runs"] == runs)
