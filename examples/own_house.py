@@ -33,15 +33,15 @@ HOUSE = """
 ##########################
 """  # '#' is a wall or furniture; the lower left corner is (0, 0), x to the right, y up
 
-# In words: within 60 steps be at the plant, between steps 60 and 120 be back at the dock, and never be where
-# the stairs are. F means "at some step in this window", G "at every step in it"; a step is one decision.
-RULE = "F[0,60] Plant and F[60,120] Dock and G[0,120] not touches_stairs"
+# In words: within 60 steps be at the plant, between steps 60 and 120 be back at the dock, and never be close
+# to the stairs. F means "at some step in this window", G "at every step in it"; a step is one decision.
+RULE = "F[0,60] Plant and F[60,120] Dock and G[0,120] not NearStairs"
 REGIONS = {
     "Plant": {"type": "circle", "center": [5.4, 3.3], "radius": 0.4},
     "Dock": {"type": "rectangle", "min": [0.4, 0.4], "max": [1.2, 1.2]},
-    # A region speaks of the robot's origin, here its centre. The stairs are 1 m wide; the 0.2 m that are
-    # added on every side are the robot's radius, so that no part of it comes over them.
-    "touches_stairs": {"type": "rectangle", "min": [2.8, 3.0], "max": [4.2, 3.9]},
+    # A region speaks of the robot's origin, here its centre. The stairs go from (3.8, 3.2) to (4.8, 3.8). This
+    # region is larger by the robot's radius on every side, so that no part of the robot comes over them.
+    "NearStairs": {"type": "rectangle", "min": [3.6, 3.0], "max": [5.0, 4.0]},
 }
 ROBOT = {
     "footprint": {"radius": 0.2},  # [m]
