@@ -39,8 +39,8 @@ RULE = "F[0,60] Plant and F[60,120] Dock and G[0,120] not NearStairs"
 REGIONS = {
     "Plant": {"type": "circle", "center": [5.4, 3.3], "radius": 0.4},
     "Dock": {"type": "rectangle", "min": [0.4, 0.4], "max": [1.2, 1.2]},
-    # A region speaks of the robot's origin, here its centre. The stairs go from (3.8, 3.2) to (4.8, 3.8). This
-    # region is larger by the robot's radius on every side, so that no part of the robot comes over them.
+    # A region speaks of the robot's origin, here its centre. The stairs go from (3.8, 3.2) to (4.8, 3.8);
+    # this region is larger by the robot's radius on every side, so that no part of it comes over them.
     "NearStairs": {"type": "rectangle", "min": [3.6, 3.0], "max": [5.0, 4.0]},
 }
 ROBOT = {
