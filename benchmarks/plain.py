@@ -16,10 +16,9 @@ from torch import nn
 
 from benchmarks.plain_world import Floats, World, predicate
 from specshield.policy.dqn.network import NAMES
-from specshield.policy.dqn.observation import FAR, NEAR_ALWAYS, make_sight
+from specshield.policy.dqn.observation import DISTANCE_UNIT, SAFE, TIME_UNIT
 from specshield.policy.dqn.policy import Policy
-from specshield.robot.dynamics import make_body
-from specshield.rule.progress import make_rules
+from specshield.policy.dqn.scene import make_scene
 from specshield.stl import SATISFIED_ABOVE, Atom, obligations, robustness
 
 Ints = NDArray[np.int64]
@@ -33,8 +32,7 @@ class Plain:
         self.world, self.parts = World(task), obligations(task.formula)
         assert all(part.kind != "eventually_always" for part in self.parts), "no plain version of F G"
         self.predicates = [predicate(part.predicate, task) for part in self.parts]
-        rules = make_rules(task)
-        self.sight = make_sight(task, rules, make_body(task.robot, task.grid))
+        self.scene = make_scene(task)
         self.goals = [k for k, part in enumerate(self.parts) if part.kind == "eventually"]
         self.wait = task.robot.wait_motion
         self.network = _network(dqn)
@@ -107,14 +105,13 @@ class Plain:
         self, t: int, poses: Floats, settled: NDArray[np.bool_], broken: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
         """What pi_phi sees, [N, F]: time and pose, each obligation's progress, each motion's effect."""
-        n, sight, points = len(poses), self.sight, poses[:, :2]
+        n, scene, points = len(poses), self.scene, poses[:, :2]
         cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
         motions = len(self.world.motions)
         nexts = self.world.next_poses(np.repeat(poses, motions, axis=0), np.tile(np.arange(motions), n))
         nexts = nexts.reshape(n, motions, 3)
-        columns = [np.full(n, t / sight.horizon), cos, sin]
-        columns += [(poses[:, 0] - sight.centre_x) / sight.half_x]
-        columns += [(poses[:, 1] - sight.centre_y) / sight.half_y]
+        columns = [np.full(n, t / scene.horizon), cos, sin]
+        columns += list(((points - scene.centre) / scene.half).T)
         target, here = np.full(n, -1), np.zeros(n)
         probes = points[:, None] + [[0.0, 0.0], [-0.1, 0.0], [0.1, 0.0], [0.0, -0.1], [0.0, 0.1]]
         near = {k: self._field(k, probes) for k in self.goals}
@@ -126,21 +123,21 @@ class Plain:
         for k, part in enumerate(self.parts):
             value = self.predicates[k](points)
             if part.kind == "always":
-                columns += [np.clip(value / NEAR_ALWAYS, -1.0, 1.0), np.full(n, part.a <= t <= part.b)]
+                columns += [np.clip(value / SAFE, -1.0, 1.0), np.full(n, part.a <= t <= part.b)]
                 continue
             d, west, east, south, north = near[k].T
             gx, gy = west - east, south - north
             norm = np.maximum(np.hypot(gx, gy), 1e-6)
             columns += [
                 settled[:, k],
-                np.full(n, np.clip((part.a - t) / 50.0, 0.0, 2.0)),
-                np.full(n, np.clip((part.b - t) / 50.0, -0.2, 2.0)),
+                np.full(n, np.clip((part.a - t) / TIME_UNIT, 0.0, 2.0)),
+                np.full(n, np.clip((part.b - t) / TIME_UNIT, -0.2, 2.0)),
                 np.clip(value, -1.0, 1.0),
-                np.minimum(d / 5.0, FAR),
+                np.minimum(d / DISTANCE_UNIT, 2.0),
                 d / (d + 0.5),
                 (gx * cos + gy * sin) / norm,
                 (gy * cos - gx * sin) / norm,
-                np.clip(((part.b - t) * sight.stride - d) / 5.0, -1.0, 1.0),
+                np.clip(((part.b - t) * scene.stride - d) / DISTANCE_UNIT, -1.0, 1.0),
                 np.zeros(n),
             ]
         moved = np.hypot(*np.moveaxis(nexts[:, :, :2] - points[:, None], -1, 0))
@@ -151,18 +148,18 @@ class Plain:
             mine = (target == k)[:, None] & (moved > 0.0)
             if mine.any():
                 ahead = here[:, None] - self._field(k, nexts[:, :, :2])
-                gain = np.where(mine, np.clip(ahead / sight.stride, -1.5, 1.5), gain)
+                gain = np.where(mine, np.clip(ahead / scene.stride, -1.5, 1.5), gain)
         safe = np.ones((n, motions))
         for k, part in enumerate(self.parts):
             if part.kind == "always" and part.a <= t + 1 <= part.b:
-                after = self.predicates[k](nexts[:, :, :2]) / NEAR_ALWAYS
+                after = self.predicates[k](nexts[:, :, :2]) / SAFE
                 safe = np.minimum(safe, np.maximum(after, -1.0))
         effects = np.stack([full, gain, safe], axis=-1).reshape(n, -1)
         return np.concatenate([np.stack(columns, axis=-1), effects], axis=1).astype(np.float32)
 
     def _field(self, k: int, points: Floats) -> Floats:
         """The distance along free space to goal k at points [..., 2], bilinear."""
-        field = self.sight.distance[self.sight.goal[k]]
+        field = self.scene.distance[self.scene.goal[k]]
         u, v = np.moveaxis((points - self.world.origin) / self.world.h - 0.5, -1, 0)
         u, v = np.clip(u, 0.0, field.shape[1] - 1.0), np.clip(v, 0.0, field.shape[0] - 1.0)
         i = np.minimum(u.astype(int), field.shape[1] - 2)

@@ -18,7 +18,6 @@ from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.rollout import satisfies
 from specshield.policy.reachability import policy as reachability
 from specshield.policy.reachability.policy import load_reachability
-from specshield.robot.dynamics import motion_count
 from specshield.sim.cases import Case, load_case
 
 STARTS = 1000
@@ -84,7 +83,7 @@ def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]
     from stable_baselines3.common.callbacks import BaseCallback
 
     practice = Environment(case.task, 1, seed)
-    inputs, outputs = practice.observations.shape[1], motion_count(practice.body)
+    inputs, outputs = practice.observations.shape[1], len(case.task.robot.motions)
 
     class Practice(gymnasium.Env[np.ndarray, np.int64]):
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
@@ -97,7 +96,7 @@ def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]
             rewards, ended = practice.step(np.array([action]))
             return practice.observations[0].copy(), float(rewards[0]), bool(ended[0]), False, {}
 
-    poses = free_poses(case.task, practice.body, STARTS, np.random.default_rng(0))
+    poses = free_poses(case.task, practice.scene.body, STARTS, np.random.default_rng(0))
     curve: list[list[float]] = []
     began, measuring = time.perf_counter(), 0.0
 
@@ -116,16 +115,7 @@ def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]
         tensors = [p.detach().cpu().numpy() for p in model.q_net.parameters()]
         weights = {n: np.ascontiguousarray(t.T) for n, t in zip(NAMES, tensors, strict=True)}
         net = make_network(weights, inputs, outputs)
-        args = (
-            practice.body,
-            practice.rules,
-            practice.sight,
-            net,
-            poses,
-            False,
-            case.task.robot.wait_motion,
-        )
-        return float(satisfies(*args).mean())
+        return float(satisfies(practice.scene, net, poses, False).mean())
 
     ours = Settings()
     model = DQN(

@@ -1,16 +1,18 @@
-"""A small flat for policies: two rooms joined by a door, 4 x 3 m."""
+"""Small worlds for policies: a flat of two rooms joined by a door, 4 x 3 m, and a bare corridor."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from specshield.policy.card import make_card
 from specshield.policy.dqn.network import NAMES, make_network
-from specshield.policy.dqn.observation import observation_size
+from specshield.policy.dqn.observation import make_state, observation_size, place
 from specshield.policy.dqn.policy import Policy
 from specshield.robot import STRETCH, robot_from_json
-from specshield.robot.dynamics import make_body, motion_count
-from specshield.rule.progress import make_rules
+from specshield.robot.dynamics import make_body, motion_count, successors
+from specshield.rule.progress import PENDING, make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -68,3 +70,32 @@ def random_weights(task, seed=0, units=(16, 12)):
 def random_policy(task, seed=0):
     network = make_network(random_weights(task, seed), *sizes(task))
     return Policy(task, make_card(task, "dqn", {}, seed, {}), network)
+
+
+CRAWLER = robot_from_json(
+    {
+        "footprint": {"radius": 0.1},
+        "actions": [
+            {"name": "wait"},
+            {"name": "go", "translate": 0.5},
+            {"name": "left", "rotate": math.pi / 2},
+            {"name": "right", "rotate": -math.pi / 2},
+        ],
+    }
+)
+
+
+def corridor(formula, robot=CRAWLER):
+    """5 m long and 1.5 m wide, cells of 0.5 m, with the region End in its last metre."""
+    end = {"type": "rectangle", "min": [4.0, 0.0], "max": [5.0, 1.5]}
+    return make_task(OccupancyGrid(np.zeros((3, 10), bool), 0.5), robot, formula, {"End": end})
+
+
+def in_state(scene, pose, status=None, run=None):
+    """A robot at a pose, with this progress (by default all is pending), and what its motions lead to."""
+    state = make_state(scene, observation_size(scene.rules, scene.body))
+    state.status[:] = PENDING if status is None else status
+    state.run[:] = 0 if run is None else run
+    place(scene.rules, *pose, state)
+    successors(scene.body, state.pose, state.nexts)
+    return state

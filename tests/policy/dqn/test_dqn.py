@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from specshield.errors import FragmentError
 from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import NAMES
-from specshield.policy.dqn.train import Progress, Stopped, _Run, measure, train
+from specshield.policy.dqn.train import Progress, Replay, Run, Stopped, measure, train, weights_of
 from specshield.policy.methods import load_policy
 from specshield.policy.options import read_options
 from tests.policy.rooms import flat
@@ -29,7 +30,7 @@ def same(a, b):
 def test_a_short_training_beats_chance_clearly():
     reports: list[Progress] = []
     policy = train(TASK, SMALL, seed=0, on_progress=reports.append)
-    untrained = measure(TASK, _Run(TASK, SMALL, 0).q_network.weights(), 200, 0)
+    untrained = measure(TASK, weights_of(Run(TASK, SMALL, 0).q_network), 200, 0)
     metrics = policy.card["metrics"]
     assert metrics["satisfied"] > 0.4 + untrained["satisfied"]
     assert metrics["feasible_start"] >= metrics["satisfied"]
@@ -57,16 +58,16 @@ def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path):
     asked = iter(range(1000))
     with pytest.raises(Stopped):  # the replay buffer fills for 40 steps first, then updates 1 to 30
         train(TASK, TINY, 3, checkpoint=tmp_path, should_stop=lambda: next(asked) >= 70)
-    resumed = _Run(TASK, TINY, 3)
+    resumed = Run(TASK, TINY, 3)
     resumed.resume(tmp_path)
     assert (resumed.update, resumed.best_rate) == (20, resumed.latest)
-    assert not same(resumed.q_network.weights(), _Run(TASK, TINY, 3).q_network.weights())
-    before = resumed.q_network.weights()
+    assert not same(weights_of(resumed.q_network), weights_of(Run(TASK, TINY, 3).q_network))
     resumed.save(tmp_path)
-    again = _Run(TASK, TINY, 3)
+    again = Run(TASK, TINY, 3)
     again.resume(tmp_path)
-    assert same(again.q_network.weights(), before)
-    assert same(again.target_network.weights(), resumed.target_network.weights())
+    for name in ("q_network", "target_network", "best"):
+        assert same(weights_of(getattr(again, name)), weights_of(getattr(resumed, name)))
+    assert not same(weights_of(again.q_network), weights_of(again.target_network))
     for one, two in zip(again.q_network.parameters(), resumed.q_network.parameters(), strict=True):
         moments, expected = again.optimizer.state[one], resumed.optimizer.state[two]
         assert all((moments[name] == expected[name]).all() for name in ("step", "exp_avg", "exp_avg_sq"))
@@ -79,7 +80,7 @@ def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path):
 def test_another_tasks_checkpoint_is_ignored(tmp_path):
     train(TASK, TINY, 0, checkpoint=tmp_path)
     for task, settings in ((flat("F[0,31] West"), TINY), (TASK, replace(TINY, discount=0.9))):
-        run = _Run(task, settings, 0)
+        run = Run(task, settings, 0)
         run.resume(tmp_path)
         assert run.update == 0
 
@@ -89,6 +90,26 @@ def test_nothing_is_trained_outside_the_fragment():
         train(flat("West U[0,9] East"), TINY, 0)
 
 
+def test_the_replay_returns_n_steps_by_hand():
+    """Two robots, one with rewards 0, 1, 2, ... and one with tens of them; nine steps in a ring of six."""
+    replay = Replay(6, 2, 1)
+    for step in range(9):
+        reward, ended = np.float32([step, 10 * step]), np.array([step == 5, False])
+        replay.add(np.float32([[step], [100 + step]]), np.array([step, -step]), reward, ended)
+    batch = replay.sample(np.random.default_rng(0), 500, 2, 0.5)
+    for seen, motion, returns, factor, then in zip(*batch, strict=True):
+        second, step = divmod(int(seen[0]), 100)
+        assert 3 <= step <= 6  # the first three are gone, the last two have no state two steps on
+        assert then[0] == seen[0] + 2
+        assert motion == (-step if second else step)
+        if second:
+            assert (returns, factor) == (10 * step + 0.5 * 10 * (step + 1), 0.25)
+        elif step == 5:
+            assert (returns, factor) == (5, 0)  # nothing after an end counts
+        else:
+            assert (returns, factor) == (step + 0.5 * (step + 1), 0 if step == 4 else 0.25)
+
+
 def test_measured_rates_have_exact_intervals():
     """Clopper and Pearson, 1934: of 20, none gives [0, 0.1684] and all [0.8316, 1]."""
     for formula, rate, interval in (
@@ -96,6 +117,6 @@ def test_measured_rates_have_exact_intervals():
         ("F[0,1] x > -99", 1.0, [0.8316, 1.0]),
     ):
         task = flat(formula)
-        measured = measure(task, _Run(task, TINY, 0).q_network.weights(), 20, 0)
+        measured = measure(task, weights_of(Run(task, TINY, 0).q_network), 20, 0)
         for name in ("satisfied", "feasible_start"):
             assert (measured[name], measured[f"{name}_interval"]) == (rate, interval)

@@ -9,21 +9,19 @@ import numpy as np
 import pytest
 
 from specshield.policy.dqn.funnel import decay_rate, gamma, make_funnels, reward
-from specshield.policy.dqn.observation import make_sight
-from specshield.robot.dynamics import make_body
-from specshield.rule.progress import BROKEN, PENDING, SETTLED, make_rules
-from tests.policy.rooms import REGIONS, flat
+from specshield.policy.dqn.scene import make_scene
+from specshield.rule.progress import BROKEN, PENDING, SETTLED
+from tests.policy.rooms import corridor, flat, in_state
 
 FORMULA = "F[10,20] West and G[0,44] not Hole and F[4,8] G[2,6] East"
 # rho_max and min rho of each obligation's predicate
 HIGHEST, LOWEST = np.array([0.5, 2.0, 0.4]), np.array([-3.5, -0.5, -3.6])
 
 
-def prepared(literal, formula=FORMULA, lowest=LOWEST, highest=HIGHEST):
-    task = flat(formula)
-    rules, body = make_rules(task), make_body(task.robot, task.grid)
-    sight = make_sight(task, rules, body)
-    return task, rules, body, sight, make_funnels(rules, sight, lowest, highest, literal)
+def prepared(literal):
+    task = flat(FORMULA)
+    scene = make_scene(task)
+    return task, scene, make_funnels(scene, LOWEST, HIGHEST, literal)
 
 
 def test_the_decay_rate_of_table_1():
@@ -35,7 +33,7 @@ def test_the_decay_rate_of_table_1():
 
 
 def test_funnels_by_hand():
-    _, _, _, _, funnels = prepared(literal=True)
+    _, _, funnels = prepared(literal=True)
     assert funnels.gamma_0.tolist() == [4.0, 2.5, 4.0]
     assert funnels.gamma_inf.tolist() == [0.25, 1.0, 0.2]
     assert funnels.clock.tolist() == [10, 0, 6]  # each its own window's start: a, a, a + c2
@@ -50,7 +48,7 @@ def test_funnels_by_hand():
 
 @pytest.mark.parametrize("literal", [True, False])
 def test_every_funnel_narrows_from_gamma_0_to_gamma_inf(literal):
-    _, _, _, _, funnels = prepared(literal)
+    _, _, funnels = prepared(literal)
     assert (funnels.rate >= 0.0).all()
     assert (funnels.gamma_inf > 0.0).all()
     assert (funnels.gamma_inf < np.minimum(funnels.gamma_0, funnels.rho_max)).all()
@@ -62,11 +60,13 @@ def test_every_funnel_narrows_from_gamma_0_to_gamma_inf(literal):
 
 
 def test_the_literal_reward_is_the_least_of_the_pending_ones():
-    task, rules, body, sight, funnels = prepared(literal=True)
-    pose, predicates = np.array([*task.grid.to_map([1.0, 1.5]), 0.0]), np.array([0.2, 0.9, -2.0])
+    task, scene, funnels = prepared(literal=True)
+    pose = (*task.grid.to_map([1.0, 1.5]), 0.0)
 
     def literal(t, *status):
-        return reward(body, rules, sight, funnels, t, pose, np.array(status, np.int8), predicates)
+        state = in_state(scene, pose, status)
+        state.predicates[:] = [0.2, 0.9, -2.0]
+        return reward(scene, funnels, t, state)
 
     # rho + gamma(t) - rho_max at t = 15: 0.2 + 0.5 - 0.5;  0.9 + 1 + 1.5 / 1.5^15 - 2;  -2 + gamma - 0.4
     third = 3.8 * math.exp(-9 * math.log(19) / 2) + 0.2
@@ -80,31 +80,31 @@ def test_the_literal_reward_is_the_least_of_the_pending_ones():
 
 
 def test_the_default_reward_rises_with_progress_and_falls_with_danger():
-    task, rules, body, sight, funnels = prepared(literal=False)
-    safe = np.array([-1.0, 0.5, -1.0])
+    task, scene, funnels = prepared(literal=False)
 
-    def default(t, column, status, predicates=safe):
-        pose = np.array([*task.grid.to_map([column, 1.5]), 0.0])
-        return reward(body, rules, sight, funnels, t, pose, np.array(status, np.int8), predicates)
+    def default(t, column, status, predicates=(-1.0, 0.5, -1.0)):
+        state = in_state(scene, (*task.grid.to_map([column, 1.5]), 0.0), status)
+        state.predicates[:] = predicates
+        return reward(scene, funnels, t, state)
 
     # The hold in East is due first (step 14), so with nothing settled it is the goal.
     far, near = (default(5, column, [PENDING] * 3) for column in (1.0, 2.9))
     assert 0.0 <= far < near < 0.5
     one, both = (default(5, 1.0, [first, PENDING, SETTLED]) for first in (PENDING, SETTLED))
     assert near < 0.5 <= one < both == 1.0
-    assert default(5, 1.0, [SETTLED, PENDING, SETTLED], np.array([-1.0, 0.06, -1.0])) == pytest.approx(0.4)
-    assert default(5, 1.0, [SETTLED, PENDING, SETTLED], np.array([-1.0, -0.3, -1.0])) == pytest.approx(-2.0)
+    assert default(5, 1.0, [SETTLED, PENDING, SETTLED], [-1.0, 0.06, -1.0]) == pytest.approx(0.4)
+    assert default(5, 1.0, [SETTLED, PENDING, SETTLED], [-1.0, -0.3, -1.0]) == pytest.approx(-2.0)
 
 
-def test_distance_goes_round_walls_and_forbidden_regions():
-    """From beside the wall, East is nearer through the door than the straight line says."""
-    _, _, _, sight, _ = prepared(literal=False)
-    k = int(sight.goal[2])
-    cells = sight.distance[k]
-    assert cells[15, 35] == 0.0  # in East
-    assert cells[2, 18] > cells[15, 18]  # a cell from the wall, but further from the door
-    assert np.isfinite(sight.distance).all()
-    gate = {"type": "rectangle", "min": [1.8, 0.0], "max": [2.3, 3.0]}
-    shut = flat("F[0,20] East and G[0,20] not Gate", regions={**REGIONS, "Gate": gate})
-    closed = make_sight(shut, make_rules(shut), make_body(shut.robot, shut.grid)).distance[0]
-    assert closed[15, 5] > cells[15, 5] + 1.0
+def test_the_default_reward_in_a_corridor_by_hand():
+    """The map's farthest cells are 4 m from End, so gamma_0 is 4.15; t* is 9 steps into the window."""
+    scene = make_scene(corridor("F[2,20] End"))
+    funnels = make_funnels(scene, np.array([-4.0]), np.array([0.5]), False)
+    assert (funnels.gamma_0[0], funnels.rho_max[0], funnels.gamma_inf[0]) == (4.15, 0.15, 0.075)
+    assert funnels.rate[0] == pytest.approx(math.log(4.075 / 0.075) / 9)
+    here = in_state(scene, (1.25, 0.75, 0.0))  # 3 m from End
+    assert reward(scene, funnels, 2, here) == pytest.approx(0.5 + 0.5 * (4.15 - 3.0) / 4.15)
+    assert reward(scene, funnels, 11, here) == pytest.approx(0.5 + 0.5 * (0.15 - 3.0) / 4.15)  # t*
+    there = in_state(scene, (4.25, 0.75, 0.0))
+    assert reward(scene, funnels, 0, there) == 0.95  # not settled before its window
+    assert reward(scene, funnels, 2, in_state(scene, (4.25, 0.75, 0.0), [SETTLED])) == 1.0

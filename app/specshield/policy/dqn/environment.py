@@ -1,12 +1,14 @@
 """Many robots at once that practise one formula: the training environment, compiled.
 
-Half of the episodes begin in their middle, with consistent progress: a policy has to take over at any time.
-Time is part of the observation, so an episode's end at the horizon is a termination, not a truncation.
+Half of the episodes begin in their middle, with progress that a robot could have made by then, since a policy
+has to take over at any time. Time is part of the observation, so an episode's end at the horizon is a
+termination, not a truncation.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,64 +16,88 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel
 from specshield.errors import MapError
 from specshield.policy.dqn.funnel import Funnels, make_funnels, reward
-from specshield.policy.dqn.observation import Sight, make_sight, observation_size, observe, outcome
-from specshield.robot.dynamics import Body, in_collision, make_body, motion_count, successors
-from specshield.rule.progress import (
-    ALWAYS,
-    BROKEN,
-    PENDING,
-    SETTLED,
-    STACK,
-    Rules,
-    advance,
-    make_rules,
-    read_predicates,
-    value_count,
+from specshield.policy.dqn.observation import (
+    State,
+    arrive,
+    make_state,
+    observation_size,
+    observe,
+    outcome,
+    place,
 )
+from specshield.policy.dqn.scene import Scene, make_scene, predicates_at
+from specshield.robot.dynamics import Body, in_collision, motion_count, successors
+from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, advance
 from specshield.task import Task
+
+Floats = NDArray[np.float64]
+
+FROM_THE_START = 0.5  # share of the episodes that begin at t = 0; chosen by hand, nothing was measured
+PROBES = 4096  # poses over which the least and greatest robustness of a predicate are taken
+
+
+class Robots(NamedTuple):
+    """Where N robots are in their episodes. The members are `State`'s, one row for each robot."""
+
+    t: NDArray[np.int64]  # [N]
+    pose: Floats  # [N, 3]
+    status: NDArray[np.int8]  # [N, K]
+    run: NDArray[np.int64]  # [N, K]
+    nexts: Floats  # [N, M, 3]
+    observation: NDArray[np.float32]  # [N, F]
 
 
 class Environment:
-    """`robots` robots; `observations` (N, F) float32 are what each sees now. One seed decides everything."""
+    """`count` robots. One seed decides everything. literal: the paper's reward (policy/dqn/funnel.py)."""
 
-    def __init__(self, task: Task, robots: int, seed: int, literal: bool = False) -> None:
-        self.task = task
-        self.body, self.rules = make_body(task.robot, task.grid), make_rules(task)
-        self.sight = make_sight(task, self.rules, self.body)
+    def __init__(self, task: Task, count: int, seed: int, literal: bool = False) -> None:
+        self.task, self.scene = task, make_scene(task)
         self.random = np.random.default_rng(seed)
-        probe = free_poses(task, self.body, 4096, np.random.default_rng(0))
-        values = _predicates_at(self.rules, probe)
-        self.funnels = make_funnels(self.rules, self.sight, values.min(axis=0), values.max(axis=0), literal)
-        k, m = len(self.rules.kind), motion_count(self.body)
-        self.pose = np.zeros((robots, 3))
-        self.t = np.full(robots, task.horizon, dtype=np.int64)  # past the end: the first step resets all
-        self.status = np.zeros((robots, k), dtype=np.int8)
-        self.run = np.zeros((robots, k), dtype=np.int64)
-        self.nexts = np.zeros((robots, m, 3))
-        self.observations = np.zeros((robots, observation_size(self.rules, self.body)), dtype=np.float32)
-        self.step(np.zeros(robots, dtype=np.int64))
+        body, rules = self.scene.body, self.scene.rules
+        probed = predicates_at(rules, free_poses(task, body, PROBES, np.random.default_rng(0)))
+        self.funnels = make_funnels(self.scene, probed.min(axis=0), probed.max(axis=0), literal)
+        k, m, inputs = len(rules.kind), motion_count(body), observation_size(rules, body)
+        self.robots = Robots(
+            t=np.full(count, task.horizon, dtype=np.int64),  # so that the first step begins all episodes
+            pose=np.zeros((count, 3)),
+            status=np.zeros((count, k), dtype=np.int8),
+            run=np.zeros((count, k), dtype=np.int64),
+            nexts=np.zeros((count, m, 3)),
+            observation=np.zeros((count, inputs), dtype=np.float32),
+        )
+        self.step(np.zeros(count, dtype=np.int64))
+
+    @property
+    def observations(self) -> NDArray[np.float32]:
+        """What each robot sees now, (N, F)."""
+        return self.robots.observation
 
     def step(self, motions: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Each robot takes a motion (N,). Rewards and which episodes ended, (N,); those begin anew."""
-        n, k = self.status.shape
-        fresh = free_poses(self.task, self.body, n, self.random)
-        times = np.where(self.random.random(n) < 0.5, 0, self.random.integers(0, self.task.horizon, n))
+        """Each robot takes its motion, (N,). Returns the rewards (N,) and which episodes ended (N,).
+
+        The robots whose episodes ended are at the beginning of their next.
+        """
+        n, k = self.robots.status.shape
+        fresh = free_poses(self.task, self.scene.body, n, self.random)
+        midway = self.random.random(n) >= FROM_THE_START
+        times = np.where(midway, self.random.integers(0, self.task.horizon, n), 0)
+        chance = self.random.random((n, k))
         rewards, ended = np.zeros(n, np.float32), np.zeros(n, np.bool_)
-        _step_all(
-            self.body, self.rules, self.sight, self.funnels, self.pose, self.t, self.status, self.run,
-            self.nexts, self.observations, motions, fresh, times, self.random.random((n, k)), rewards, ended,
-        )  # fmt: skip
+        _step_all(self.scene, self.funnels, self.robots, motions, fresh, times, chance, rewards, ended)
         return rewards, ended
 
 
-def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> NDArray[np.float64]:
-    """Poses drawn uniformly over free space, none in collision. Shape (n, 3). The heading is uniform too."""
+def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> Floats:
+    """Poses (n, 3) drawn uniformly over free space, none in collision; the heading is uniform too.
+
+    Raises MapError for a map with next to no free space.
+    """
     xmin, ymin, xmax, ymax = task.grid.bounds
     kept = np.empty((0, 3))
     for _ in range(1000):
         draw = random.random((2 * n + 64, 3))
         poses = np.array([xmin, ymin, -math.pi]) + draw * np.array([xmax - xmin, ymax - ymin, 2 * math.pi])
-        kept = np.concatenate([kept, poses[~_colliding(body, poses)]])
+        kept = np.concatenate([kept, poses[_are_free(body, poses)]])
         if len(kept) >= n:
             return kept[:n]
     raise MapError(
@@ -81,88 +107,70 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> N
 
 
 @kernel
-def _colliding(body: Body, poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _are_free(body: Body, poses: Floats) -> NDArray[np.bool_]:
     out = np.empty(poses.shape[0], np.bool_)
     for i in range(poses.shape[0]):
-        out[i] = in_collision(body, poses[i, 0], poses[i, 1], poses[i, 2])
+        out[i] = not in_collision(body, poses[i, 0], poses[i, 1], poses[i, 2])
     return out
 
 
 @kernel
-def _predicates_at(rules: Rules, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    out = np.empty((poses.shape[0], rules.kind.shape[0]))
-    values, stack = np.empty(value_count(rules)), np.empty(STACK)
-    for i in range(poses.shape[0]):
-        read_predicates(rules, poses[i, 0], poses[i, 1], poses[i, 2], values, stack, out[i])
-    return out
+def begin_episode(rules: Rules, t: int, chance: Floats, state: State) -> None:
+    """Gives the robot at x_t progress that it could have: what is due before t is settled, what may be is by
+    chance, and x_t itself counts.
 
-
-@kernel
-def _begin(
-    rules: Rules,
-    t: int,
-    predicates: NDArray[np.float64],
-    chance: NDArray[np.float64],
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-) -> None:
-    """Progress that a robot at step t could have: windows gone by are settled, open ones by chance."""
-    run[:] = 0
+    chance (K,): uniform in [0, 1). A window that has been open for a while is the likelier to be settled, the
+    more of it is over, and at least as likely as not.
+    """
+    status = state.status
     for k in range(rules.kind.shape[0]):
-        status[k] = PENDING
+        status[k], state.run[k] = PENDING, 0
         if rules.last[k] < t:
             status[k] = SETTLED
         elif rules.kind[k] != ALWAYS and rules.a[k] < t:
-            open_for = (t - rules.a[k]) / (rules.last[k] - rules.a[k] + 1.0)
-            if chance[k] < max(open_for, 0.5):
+            over = (t - rules.a[k]) / (rules.last[k] - rules.a[k] + 1.0)
+            if chance[k] < max(over, 0.5):
                 status[k] = SETTLED
-    advance(rules, t, predicates, status, run)
+    advance(rules, t, state.predicates, status, state.run)
 
 
 @kernel
 def _step_all(
-    body: Body,
-    rules: Rules,
-    sight: Sight,
+    scene: Scene,
     funnels: Funnels,
-    pose: NDArray[np.float64],
-    t: NDArray[np.int64],
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-    nexts: NDArray[np.float64],
-    observations: NDArray[np.float32],
+    robots: Robots,
     motions: NDArray[np.int64],
-    fresh: NDArray[np.float64],
+    fresh: Floats,
     times: NDArray[np.int64],
-    chance: NDArray[np.float64],
+    chance: Floats,
     rewards: NDArray[np.float32],
     ended: NDArray[np.bool_],
 ) -> None:
-    values, stack = np.empty(value_count(rules)), np.empty(STACK)
-    predicates, after = np.empty(rules.kind.shape[0]), np.empty(rules.kind.shape[0])
-    for i in range(pose.shape[0]):
-        over = t[i] >= sight.horizon
+    """One step of every robot. fresh (N, 3), times (N,), chance (N, K): where a new episode would begin."""
+    rules, t = scene.rules, robots.t
+    scratch = make_state(scene, robots.observation.shape[1])
+    for i in range(t.shape[0]):
+        state = State(
+            robots.pose[i], robots.status[i], robots.run[i], scratch.predicates, robots.nexts[i],
+            robots.observation[i], scratch.values, scratch.stack, scratch.after,
+        )  # fmt: skip
+        over = t[i] >= scene.horizon
         if not over:
-            pose[i] = nexts[i, motions[i]]
             t[i] += 1
-            read_predicates(rules, pose[i, 0], pose[i, 1], pose[i, 2], values, stack, predicates)
-            advance(rules, t[i], predicates, status[i], run[i])
-            rewards[i] = reward(body, rules, sight, funnels, t[i], pose[i], status[i], predicates)
-            over = t[i] >= sight.horizon
-            if outcome(status[i]) == BROKEN:
+            m = motions[i]
+            arrive(rules, t[i], state.nexts[m, 0], state.nexts[m, 1], state.nexts[m, 2], state)
+            rewards[i] = reward(scene, funnels, t[i], state)
+            over = t[i] >= scene.horizon
+            if outcome(state.status) == BROKEN:
                 over = True
                 if not funnels.literal:
                     rewards[i] = min(rewards[i], np.float32(0.0))
         if over:
             ended[i] = True
-            pose[i] = fresh[i]
             t[i] = times[i]
-            read_predicates(rules, pose[i, 0], pose[i, 1], pose[i, 2], values, stack, predicates)
-            _begin(rules, t[i], predicates, chance[i], status[i], run[i])
-            if outcome(status[i]) == BROKEN:  # begun inside a forbidden region: over at the next step
-                t[i] = sight.horizon
-        successors(body, pose[i], nexts[i])
-        observe(
-            body, rules, sight, t[i], pose[i], status[i], run[i], predicates, nexts[i], values, stack, after,
-            observations[i],
-        )  # fmt: skip
+            place(rules, fresh[i, 0], fresh[i, 1], fresh[i, 2], state)
+            begin_episode(rules, t[i], chance[i], state)
+            if outcome(state.status) == BROKEN:  # it began inside a forbidden region: over at the next step
+                t[i] = scene.horizon
+        successors(scene.body, state.pose, state.nexts)
+        observe(scene, t[i], state)

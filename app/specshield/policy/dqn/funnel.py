@@ -3,10 +3,10 @@
     gamma(t) = (gamma_0 - gamma_inf) exp(-l t) + gamma_inf                      (eq. 4)
     r(x_t)   = rho(x_t, predicate) + gamma(t) - rho_max                         (eq. 5)
 
-Two rewards for a conjunction of obligations. `paper`: the minimum of r over the obligations not yet settled,
-taken literally. `progress`, the default: the share of goals settled plus the current goal's funnel along free
-space, in the minimum with the `always` obligations' robustness, capped: uncapped, the farthest distance from
-a forbidden region rules the minimum, and the straight-line distance to a region behind a wall misleads.
+There are two rewards for a conjunction of obligations. `paper` takes the minimum of r over the obligations
+that are not yet settled, literally. `progress`, the default, counts the goals that are settled, adds the
+current goal's funnel along free space, and takes the minimum with the robustness of each `always`, capped.
+Uncapped, the farthest distance from a forbidden region would rule that minimum.
 """
 
 from __future__ import annotations
@@ -18,50 +18,54 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf
-from specshield.policy.dqn.observation import Sight, current_goal, field_at
-from specshield.robot.dynamics import Body
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
+from specshield.policy.dqn.observation import State
+from specshield.policy.dqn.scene import Scene, current_goal, distance_to
+from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED
 
-CAP = 0.15  # [m] robustness of an `always` beyond which more is no better
-REST = 0.5  # gamma_inf as a share of its upper limit min(gamma_0, rho_max)
+Floats = NDArray[np.float64]
+
+# Chosen by hand; nothing was measured.
+CAP = 0.15  # [m] robustness of an `always` beyond which more is no better, and rho_max inside a goal
+REST = 0.5  # gamma_inf as a share of its upper limit min(gamma_0, rho_max) of Table I
+FAR_SHARE = 99  # [%] of the map's cells that are nearer to a goal than the reach of its funnel
+MOST_OF_A_GOAL = 0.95  # what being close to a goal counts at most; 1 is for a goal that is settled
 
 
 class Funnels(NamedTuple):
-    """One funnel an obligation, arrays of shape (K,): eq. 4's parameters and the step its clock starts at."""
+    """One funnel for each obligation: eq. 4's parameters and the step at which its clock starts, each [K]."""
 
-    gamma_0: NDArray[np.float64]
-    gamma_inf: NDArray[np.float64]
-    rate: NDArray[np.float64]
+    gamma_0: Floats
+    gamma_inf: Floats
+    rate: Floats
     clock: NDArray[np.int64]
-    rho_max: NDArray[np.float64]
+    rho_max: Floats
     literal: bool
 
 
 def decay_rate(gamma_0: float, gamma_inf: float, rho_max: float, t_star: float) -> float:
     """Table I's l: the funnel's boundary reaches zero robustness at t_star steps.
 
-    t_star is at least 1 (G[0,b] would divide by zero), and l at least 0 (where min rho > gamma_inf the
-    logarithm is negative: the whole space is already inside).
+    t_star counts as at least 1, since G[0,b] would divide by zero. l is at least 0: the logarithm is negative
+    where min rho > gamma_inf, which means that the whole space is inside the funnel already.
     """
     return max(math.log((gamma_0 - gamma_inf) / (rho_max - gamma_inf)) / max(t_star, 1.0), 0.0)
 
 
-def make_funnels(
-    rules: Rules, sight: Sight, lowest: NDArray[np.float64], highest: NDArray[np.float64], literal: bool
-) -> Funnels:
-    """Funnels of a task's obligations. lowest, highest (K,): each predicate's robustness over free space.
+def make_funnels(scene: Scene, lowest: Floats, highest: Floats, literal: bool) -> Funnels:
+    """The funnels of a task's obligations. lowest, highest (K,): each predicate's robustness over free space.
 
-    Each clock starts at its own window: t* is Table I's, halfway through it, counted from the window's start.
+    A clock starts with its obligation's window; t* is Table I's, half the window. literal: for the reward
+    `paper`.
     """
-    n = len(rules.kind)
+    rules, n = scene.rules, len(scene.rules.kind)
     gamma_0, gamma_inf, rate, rho_max = (np.zeros(n) for _ in range(4))
     clock = np.zeros(n, dtype=np.int64)
     for k in range(n):
         if literal or rules.kind[k] == ALWAYS:
             top, span = max(float(highest[k]), 1e-3), max(float(highest[k] - lowest[k]), 2e-3)
-        else:  # along free space: robustness is minus the distance, the top a small radius inside the goal
-            reach = sight.distance[sight.goal[k]]
-            top, span = CAP, float(np.percentile(reach, 99)) + CAP
+        else:  # along free space, robustness is minus the distance, and CAP inside the goal
+            reach = float(np.percentile(scene.distance[scene.goal[k]], FAR_SHARE))
+            top, span = CAP, reach + CAP
         gamma_0[k], rho_max[k] = span, top
         gamma_inf[k] = REST * min(span, top)
         hold = rules.kind[k] == EVENTUALLY_ALWAYS
@@ -81,28 +85,16 @@ def gamma(funnels: Funnels, k: int, t: int) -> float:
 
 
 @leaf
-def reward(
-    body: Body,
-    rules: Rules,
-    sight: Sight,
-    funnels: Funnels,
-    t: int,
-    pose: NDArray[np.float64],
-    status: NDArray[np.int8],
-    predicates: NDArray[np.float64],
-) -> float:
-    """The reward of having come to x_t with this progress. predicates (K,) at x_t."""
+def reward(scene: Scene, funnels: Funnels, t: int, state: State) -> float:
+    """The reward of having come to x_t, with its progress and predicates in `state`."""
     if funnels.literal:
-        least = np.inf
-        for k in range(rules.kind.shape[0]):
-            if status[k] == PENDING:
-                least = min(least, predicates[k] + gamma(funnels, k, t) - funnels.rho_max[k])
-        return least if least < np.inf else 0.0
+        return _paper_reward(funnels, t, state)
+    rules, status = scene.rules, state.status
     goals, settled, safe = 0, 0, 1.0
     for k in range(rules.kind.shape[0]):
         if rules.kind[k] == ALWAYS:
             if status[k] == PENDING and t >= rules.a[k]:
-                safe = min(safe, predicates[k] / CAP)
+                safe = min(safe, state.predicates[k] / CAP)
         else:
             goals += 1
             settled += status[k] == SETTLED
@@ -111,7 +103,16 @@ def reward(
     done = float(settled)
     k = current_goal(rules, status)
     if k >= 0:
-        distance = field_at(body, sight.distance[sight.goal[k]], pose[0], pose[1])
-        bonus = gamma(funnels, k, t) - distance  # eq. 5 with rho = rho_max - distance
-        done += min(max(0.5 + 0.5 * bonus / funnels.gamma_0[k], 0.0), 0.95)
+        bonus = gamma(funnels, k, t) - distance_to(scene, k, state.pose[0], state.pose[1])  # eq. 5
+        done += min(max(0.5 + 0.5 * bonus / funnels.gamma_0[k], 0.0), MOST_OF_A_GOAL)
     return min(done / goals, safe)
+
+
+@leaf
+def _paper_reward(funnels: Funnels, t: int, state: State) -> float:
+    """The minimum of eq. 5 over the obligations that are not yet settled, 0 where none is left."""
+    least = np.inf
+    for k in range(state.status.shape[0]):
+        if state.status[k] == PENDING:
+            least = min(least, state.predicates[k] + gamma(funnels, k, t) - funnels.rho_max[k])
+    return least if least < np.inf else 0.0

@@ -1,6 +1,4 @@
-"""A trained pi_phi: its card, its weights, and what it proposes. Weights are safetensors; nothing is
-unpickled.
-"""
+"""A trained pi_phi: its card, its weights, and what it proposes. Weights are safetensors, never pickles."""
 
 from __future__ import annotations
 
@@ -15,23 +13,23 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.policy.card import Card
 from specshield.policy.dqn.network import Network, make_network
-from specshield.policy.dqn.observation import Sight, make_sight, observation_size
+from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.rollout import propose_all
+from specshield.policy.dqn.scene import Scene, make_scene
 from specshield.policy.tensors import read_tensors
-from specshield.robot.dynamics import Body, make_body, motion_count, undoing_motions
-from specshield.rule.progress import Rules, make_rules, pasts, signal_rows
+from specshield.robot.dynamics import make_body, motion_count, undoing_motions
+from specshield.rule.progress import make_rules, pasts, signal_rows
 from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
 
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A DQN's greedy policy pi_phi(x, t) = argmax_a Q(x, a, t), with the formula's progress in its
-    observation.
+    """The greedy policy of a Q-network, pi_phi(x, t) = argmax_a Q(x, a, t), which also sees the progress.
 
-    After the motion it prefers it proposes its own rollout; after another, to undo it and go the same way if
-    that satisfies the formula, else its own rollout too. literal: its own rollout after every motion, as in
-    the paper: slower, and J is less often 1.
+    After the motion that it prefers, it proposes its own rollout. After another motion it proposes to undo
+    that motion and to go the same way, if that satisfies the formula, and else its own rollout too.
+    literal: its own rollout after every motion, as in the paper, which is slower, and J is 1 less often.
     """
 
     task: Task
@@ -44,9 +42,8 @@ class Policy:
         return str(self.card["id"])
 
     @cached_property
-    def _prepared(self) -> tuple[Body, Rules, Sight]:
-        body, rules = make_body(self.task.robot, self.task.grid), make_rules(self.task)
-        return body, rules, make_sight(self.task, rules, body)
+    def scene(self) -> Scene:
+        return make_scene(self.task)
 
     @cached_property
     def _undoing(self) -> NDArray[np.int64]:
@@ -55,17 +52,16 @@ class Policy:
     def propose(
         self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
     ) -> Proposal:
-        body, rules, sight = self._prepared
-        rules = rules._replace(signals=rules.signals.copy(), margin=margin)
-        t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
+        """As `Proposer` says."""
+        rules = self.scene.rules
+        scene = self.scene._replace(rules=rules._replace(signals=rules.signals.copy(), margin=margin))
+        rows = signal_rows(self.task, signals, len(history))
         proposals = []
-        for past in pasts(rules, history, rows):
-            motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
-            poses = np.empty((*motions.shape, 3))
+        for past in pasts(scene.rules, history, rows):
+            motions = np.empty((len(self._undoing), self.task.horizon + 1 - len(history)), np.int64)
             preferred = propose_all(
-                body, rules, sight, self.network, past, history, rows, self.task.robot.wait_motion,
-                self._undoing, self.literal, motions, poses,
-            )  # fmt: skip
+                scene, self.network, past, history, rows, self._undoing, self.literal, motions
+            )
             proposals.append(Proposal(motions, preferred))
         return joined(*proposals)
 

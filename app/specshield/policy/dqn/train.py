@@ -1,8 +1,8 @@
-"""pi_phi by deep Q-learning on funnel-shaped rewards (paper, section IV-A); alone in importing torch.
+"""pi_phi by deep Q-learning on funnel-shaped rewards (paper, section IV-A). Only this module imports torch.
 
-Double DQN, n-step returns, Huber loss, Polyak-averaged target network, one update a step of all robots. The
-robots step in a thread of their own while the network learns. Every figure in a card comes from the compiled
-rollout that serves, not from torch.
+Double DQN (van Hasselt et al., 2016), n-step returns, Huber loss, Polyak-averaged target network, one update
+for each step of all robots. The robots step in a thread of their own while the network learns. Every figure
+in a card comes from the compiled rollout that the service runs, not from torch.
 """
 
 from __future__ import annotations
@@ -19,24 +19,30 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load_file, save_file
-from scipy.stats import beta
+from safetensors import safe_open
+from safetensors.torch import save_file
+from scipy.stats import binomtest
 from torch import nn
 
 from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.method import Settings
-from specshield.policy.dqn.network import NAMES, Network, make_network
+from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.dqn.rollout import satisfies
+from specshield.policy.dqn.scene import make_scene
 from specshield.policy.options import options_to_json
-from specshield.robot.dynamics import motion_count
 from specshield.task import Task
+
+# Chosen by hand; nothing was measured.
+WARM_UP = 20  # steps of all robots before the first update, beside four times an n-step return
+LEAST_RATE = 0.02  # share of the learning rate that it falls to, linearly, by the last update
+REPORT_EVERY = 100  # updates
 
 
 @dataclass(frozen=True)
 class Progress:
-    """A report from a running training. satisfied: the latest measured rate, None before the first."""
+    """A report from a running training. satisfied: the rate measured last, None before the first."""
 
     update: int
     updates: int
@@ -45,7 +51,7 @@ class Progress:
 
 
 class Stopped(Exception):
-    """The training was told to stop."""
+    """`should_stop` ended the training."""
 
 
 def train(
@@ -59,12 +65,13 @@ def train(
 ) -> Policy:
     """Trains pi_phi and returns it with its card.
 
-    checkpoint: a folder to save to at every evaluation and to resume from after a kill (the replay buffer is
-    filled anew). Raises FragmentError for a formula outside the fragment, Stopped when `should_stop` says so.
+    checkpoint: a folder that the training saves to at every evaluation, and resumes from after a kill; the
+    replay buffer is not saved but filled anew. spec: for the card. Raises FragmentError for a formula outside
+    the fragment, Stopped when `should_stop` says so.
     """
-    # One core is the robots'; threads that wait for a core spin, at worst forty times slower than one thread.
+    # One core is for the robots. A thread that waits for a core spins, which was forty times slower at worst.
     torch.set_num_threads(max((os.cpu_count() or 1) - 1, 1))
-    run = _Run(task, settings, seed)
+    run = Run(task, settings, seed)
     if checkpoint is not None:
         run.resume(checkpoint)
     began, first = time.monotonic(), run.update
@@ -74,77 +81,69 @@ def train(
                 raise Stopped
             if not run.advance(stepper):
                 continue
-            if run.update % settings.evaluate_every == 0 or run.update == settings.updates:
+            last = run.update == settings.updates
+            if last or run.update % settings.evaluate_every == 0:
                 run.evaluate()
                 if checkpoint is not None:
                     run.save(checkpoint)
-            if run.update % 100 == 0 or run.update == settings.updates:
+            if last or run.update % REPORT_EVERY == 0:
                 pace = (time.monotonic() - began) / (run.update - first)
                 left = pace * (settings.updates - run.update)
                 on_progress(Progress(run.update, settings.updates, run.latest, left))
-    metrics = measure(task, run.best, settings.evaluation_starts, seed)
-    metrics["wall_time_s"] = round(run.elapsed + time.monotonic() - began, 1)
+    weights = weights_of(run.best)
+    metrics = measure(task, weights, settings.evaluation_starts, seed)
+    metrics["wall_time_s"] = round(time.monotonic() - run.began, 1)
     card = make_card(task, "dqn", options_to_json(settings), seed, metrics, spec)
-    return Policy(task, card, make_network(run.best, run.inputs, run.outputs))
+    return Policy(task, card, make_network(weights, run.inputs, run.outputs))
 
 
 def measure(task: Task, weights: dict[str, NDArray[np.float32]], starts: int, seed: int) -> dict[str, Any]:
     """How often pi_phi satisfies the formula from starts uniform over free space, t = 0.
 
-    `satisfied`: pi_phi alone. `feasible_start`: some first action, then pi_phi (a session opens there). Each
-    with its 95 % Clopper-Pearson interval.
+    `satisfied`: pi_phi alone. `feasible_start`: some first action, then pi_phi, which is where a session can
+    open. Each with its 95 % interval (Clopper and Pearson, 1934).
     """
-    env = Environment(task, 1, 0)
-    poses = free_poses(task, env.body, starts, np.random.default_rng([seed, 1]))
-    net = make_network(weights, env.observations.shape[1], motion_count(env.body))
+    scene = make_scene(task)
+    poses = free_poses(task, scene.body, starts, np.random.default_rng([seed, 1]))
+    net = make_network(weights, len(weights["w1"]), len(task.robot.motions))
     result: dict[str, Any] = {"starts": starts}
     for name, first in (("satisfied", False), ("feasible_start", True)):
-        kept = satisfies(env.body, env.rules, env.sight, net, poses, first, task.robot.wait_motion)
-        count = int(kept.sum())
-        low = float(beta.ppf(0.025, count, starts - count + 1)) if count else 0.0
-        high = float(beta.ppf(0.975, count + 1, starts - count)) if count < starts else 1.0
+        count = int(satisfies(scene, net, poses, first).sum())
+        interval = binomtest(count, starts).proportion_ci(0.95)
         result[name] = count / starts
-        result[f"{name}_interval"] = [round(low, 4), round(high, 4)]
+        result[f"{name}_interval"] = [round(float(interval.low), 4), round(float(interval.high), 4)]
     return result
 
 
-class _QNetwork(nn.Module):
-    def __init__(self, inputs: int, units: int, outputs: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(inputs, units), nn.ReLU(), nn.Linear(units, units), nn.ReLU(), nn.Linear(units, outputs)
-        )
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        out: torch.Tensor = self.layers(x)
-        return out
-
-    def weights(self) -> dict[str, NDArray[np.float32]]:
-        """In the serving layout: w [inputs, outputs]."""
-        tensors = [p.detach().cpu().numpy() for p in self.parameters()]
-        serving = [np.ascontiguousarray(t.T if t.ndim == 2 else t).copy() for t in tensors]
-        return dict(zip(NAMES, serving, strict=True))
-
-    def set_weights(self, weights: dict[str, NDArray[np.float32]]) -> None:
-        with torch.no_grad():
-            for name, parameter in zip(NAMES, self.parameters(), strict=True):
-                array = weights[name]
-                parameter.copy_(torch.from_numpy(np.ascontiguousarray(array.T if array.ndim == 2 else array)))
+def make_q_network(inputs: int, units: int, outputs: int) -> nn.Sequential:
+    """The network of network.py, for torch."""
+    hidden = (nn.Linear(inputs, units), nn.ReLU(), nn.Linear(units, units), nn.ReLU())
+    return nn.Sequential(*hidden, nn.Linear(units, outputs))
 
 
-class _Replay:
+def weights_of(network: nn.Module) -> dict[str, NDArray[np.float32]]:
+    """A copy of the weights as network.py has them: w [inputs, outputs]."""
+    arrays = [parameter.detach().cpu().numpy().T.copy() for parameter in network.parameters()]
+    return dict(zip(NAMES, arrays, strict=True))
+
+
+class Replay:
     """The last steps of all robots, as rings [steps, robots, ...]."""
 
-    def __init__(self, steps: int, robots: int, size: int) -> None:
+    def __init__(self, steps: int, robots: int, inputs: int) -> None:
         self.steps = steps
-        self.observation = np.zeros((steps, robots, size), np.float32)
+        self.observation = np.zeros((steps, robots, inputs), np.float32)
         self.motion = np.zeros((steps, robots), np.int64)
         self.reward = np.zeros((steps, robots), np.float32)
         self.ended = np.zeros((steps, robots), np.bool_)
         self.added = 0
 
     def add(
-        self, observation: NDArray[np.float32], motion: NDArray[np.int64], reward: Any, ended: Any
+        self,
+        observation: NDArray[np.float32],
+        motion: NDArray[np.int64],
+        reward: NDArray[np.float32],
+        ended: NDArray[np.bool_],
     ) -> None:
         at = self.added % self.steps
         self.observation[at], self.motion[at] = observation, motion
@@ -167,46 +166,44 @@ class _Replay:
         return self.observation[first], self.motion[first], returns, factor, self.observation[then]
 
 
-class _Run:
-    """One training run's state."""
+class Run:
+    """One training: the robots, the networks, and how far it is."""
 
     def __init__(self, task: Task, settings: Settings, seed: int) -> None:
-        self.settings, self.task = settings, task
+        self.task, self.settings = task, settings
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.env = Environment(task, settings.robots, seed, literal=settings.reward == "paper")
+        self.environment = Environment(task, settings.robots, seed, literal=settings.reward == "paper")
+        self.inputs, self.outputs = self.environment.observations.shape[1], len(task.robot.motions)
         self.random = np.random.default_rng([seed, 2])
         torch.manual_seed(seed)
-        self.inputs, self.outputs = self.env.observations.shape[1], motion_count(self.env.body)
-        self.q_network = _QNetwork(self.inputs, settings.units, self.outputs).to(self.device)
-        self.target_network = _QNetwork(self.inputs, settings.units, self.outputs).to(self.device)
-        self.target_network.load_state_dict(self.q_network.state_dict())
+        self.q_network, self.target_network, self.best = (
+            make_q_network(self.inputs, settings.units, self.outputs).to(self.device) for _ in range(3)
+        )
+        for other in (self.target_network, self.best):
+            other.load_state_dict(self.q_network.state_dict())
         self.optimizer = torch.optim.Adam(self.q_network.parameters(), lr=settings.learning_rate)
         low, high = sorted(settings.exploration)
-        self.epsilon = np.geomspace(high, max(low, 1e-6), settings.robots)
+        self.epsilon = np.geomspace(high, max(low, 1e-6), settings.robots)  # each robot has its own
         steps = max(settings.replay // settings.robots, 4 * settings.returns)
-        self.replay = _Replay(steps, settings.robots, self.inputs)
-        self.update, self.elapsed, self.latest, self.best_rate = 0, 0.0, None, -1.0
-        self.best = self.q_network.weights()
+        self.replay = Replay(steps, settings.robots, self.inputs)
+        self.update = 0
+        self.latest: float | None = None  # the rate measured last
+        self.best_rate = -1.0
         self.began = time.monotonic()
 
-    update: int
-    elapsed: float
-    latest: float | None
-
     def advance(self, stepper: ThreadPoolExecutor) -> bool:
-        """All robots step while the network learns from what was before; whether that was enough to learn."""
-        observation = self.env.observations.copy()
+        """All robots step while the network learns from earlier steps. False while those are too few."""
+        observation = self.environment.observations.copy()
         with torch.no_grad():
             motion = self.q_network(torch.from_numpy(observation).to(self.device)).argmax(1).cpu().numpy()
         explore = self.random.random(len(motion)) < self.epsilon
         motion[explore] = self.random.integers(0, self.outputs, int(explore.sum()))
-        stepping = stepper.submit(self.env.step, motion)
-        learns = self.replay.added >= 4 * self.settings.returns + 20
+        stepping = stepper.submit(self.environment.step, motion)
+        learns = self.replay.added >= 4 * self.settings.returns + WARM_UP
         if learns:
             self._learn()
             self.update += 1
-        reward, ended = stepping.result()
-        self.replay.add(observation, motion, reward, ended)
+        self.replay.add(observation, motion, *stepping.result())
         return learns
 
     def _learn(self) -> None:
@@ -214,12 +211,12 @@ class _Run:
         batch = self.replay.sample(self.random, s.batch, s.returns, s.discount)
         observation, motion, returns, factor, then = (torch.from_numpy(a).to(self.device) for a in batch)
         for group in self.optimizer.param_groups:
-            group["lr"] = s.learning_rate * max(1.0 - self.update / s.updates, 0.02)
+            group["lr"] = s.learning_rate * max(1.0 - self.update / s.updates, LEAST_RATE)
         with torch.no_grad():
             choice = self.q_network(then).argmax(1, keepdim=True)
             goal = returns + factor * self.target_network(then).gather(1, choice).squeeze(1)
-            # One step's delay is worth little beside a whole episode, less than the network's error: without
-            # a wider gap between actions (Bellemare et al., 2016) the greedy policy dithers.
+            # A step's delay costs little of an episode's return, less than the network's error. Without a
+            # wider gap between the actions' values (Bellemare et al., 2016) the greedy policy dithers.
             now = self.target_network(observation)
             goal -= s.gap * (now.max(1).values - now.gather(1, motion.unsqueeze(1)).squeeze(1))
         value = self.q_network(observation).gather(1, motion.unsqueeze(1)).squeeze(1)
@@ -232,55 +229,51 @@ class _Run:
                 slow.lerp_(fast, s.polyak)
 
     def evaluate(self) -> None:
-        """Keeps the weights that satisfy most often, measured on starts of their own."""
-        weights = self.q_network.weights()
-        net: Network = make_network(weights, self.inputs, self.outputs)
-        env, wait = self.env, self.task.robot.wait_motion
-        poses = free_poses(self.task, env.body, self.settings.evaluation_starts, np.random.default_rng(0))
-        rate = float(satisfies(env.body, env.rules, env.sight, net, poses, False, wait).mean())
-        self.latest = rate
-        if rate >= self.best_rate:
-            self.best_rate, self.best = rate, weights
+        """Measures the rate on starts of its own, always the same, and keeps the best network."""
+        scene = self.environment.scene
+        net = make_network(weights_of(self.q_network), self.inputs, self.outputs)
+        starts = free_poses(self.task, scene.body, self.settings.evaluation_starts, np.random.default_rng(0))
+        self.latest = float(satisfies(scene, net, starts, False).mean())
+        if self.latest >= self.best_rate:
+            self.best_rate = self.latest
+            self.best.load_state_dict(self.q_network.state_dict())
+
+    @property
+    def _networks(self) -> dict[str, nn.Module]:
+        return {"q": self.q_network, "target": self.target_network, "best": self.best}
 
     def save(self, folder: Path) -> None:
-        """Atomically: a kill leaves the checkpoint before."""
+        """Writes the checkpoint at once: a kill meanwhile leaves the one before."""
         folder.mkdir(parents=True, exist_ok=True)
-        arrays = {f"q.{n}": a for n, a in self.q_network.weights().items()}
-        arrays |= {f"target.{n}": a for n, a in self.target_network.weights().items()}
-        arrays |= {f"best.{n}": a for n, a in self.best.items()}
-        for i, parameter in enumerate(self.q_network.parameters()):
-            state = self.optimizer.state[parameter]
-            for name in ("exp_avg", "exp_avg_sq", "step"):
-                arrays[f"adam.{i}.{name}"] = state[name].detach().cpu().numpy().reshape(-1)
+        parts = {name: network.state_dict() for name, network in self._networks.items()}
+        parts |= {f"adam{i}": state for i, state in self.optimizer.state_dict()["state"].items()}
+        tensors = {f"{part} {name}": tensor for part in parts for name, tensor in parts[part].items()}
         meta = {
             "task": self.task.content_hash, "settings": options_to_json(self.settings), "update": self.update,
-            "elapsed": self.elapsed + time.monotonic() - self.began, "latest": self.latest,
-            "best_rate": self.best_rate, "random": self.random.bit_generator.state,
+            "elapsed": time.monotonic() - self.began, "latest": self.latest, "best_rate": self.best_rate,
+            "random": self.random.bit_generator.state,
         }  # fmt: skip
-        save_file(arrays, folder / "state.tmp", metadata={"meta": json.dumps(meta)})
+        save_file(tensors, folder / "state.tmp", metadata={"meta": json.dumps(meta)})
         os.replace(folder / "state.tmp", folder / "state.safetensors")
 
     def resume(self, folder: Path) -> None:
-        """Takes up a checkpoint of the same task and settings; any other is ignored."""
-        from safetensors import safe_open
-
+        """Goes on from a checkpoint of the same task and settings; any other is ignored."""
         path = folder / "state.safetensors"
         if not path.exists():
             return
-        with safe_open(path, framework="numpy") as opened:
+        parts: dict[str, dict[str, torch.Tensor]] = {}
+        with safe_open(path, framework="pt") as opened:
             meta = json.loads(opened.metadata()["meta"])
-        if (meta["task"], meta["settings"]) != (self.task.content_hash, options_to_json(self.settings)):
-            return
-        arrays = load_file(path)
-        self.q_network.set_weights({n: arrays[f"q.{n}"] for n in NAMES})
-        self.target_network.set_weights({n: arrays[f"target.{n}"] for n in NAMES})
-        self.best = {n: arrays[f"best.{n}"] for n in NAMES}
-        for i, parameter in enumerate(self.q_network.parameters()):
-            self.optimizer.state[parameter] = {
-                "step": torch.tensor(float(arrays[f"adam.{i}.step"][0])),
-                **{n: torch.from_numpy(arrays[f"adam.{i}.{n}"]).reshape(parameter.shape).to(self.device)
-                   for n in ("exp_avg", "exp_avg_sq")},
-            }  # fmt: skip
+            if (meta["task"], meta["settings"]) != (self.task.content_hash, options_to_json(self.settings)):
+                return
+            for key in opened.keys():  # noqa: SIM118 (not a dict)
+                part, name = key.split()
+                parts.setdefault(part, {})[name] = opened.get_tensor(key)
+        for part, network in self._networks.items():
+            network.load_state_dict(parts[part])
+        moments = {int(part[4:]): parts[part] for part in parts if part.startswith("adam")}
+        groups = self.optimizer.state_dict()["param_groups"]
+        self.optimizer.load_state_dict({"state": moments, "param_groups": groups})
         self.random.bit_generator.state = meta["random"]
-        self.update, self.elapsed = meta["update"], meta["elapsed"]
-        self.latest, self.best_rate = meta["latest"], meta["best_rate"]
+        self.update, self.latest, self.best_rate = meta["update"], meta["latest"], meta["best_rate"]
+        self.began -= meta["elapsed"]
