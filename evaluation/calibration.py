@@ -1,4 +1,4 @@
-"""Methods whose margin is to come from what was measured: NAME@conformal/K becomes NAME@M/K."""
+"""Margins that are measured: the method NAME@conformal/K becomes NAME@M/K, M metres from a calibration."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from evaluation.conformal import conformal_margin
 from evaluation.evaluation import evaluate
 from evaluation.experiment import Experiment
 
-RUNS = 60
-ALPHA = 0.05  # one episode in twenty may hold a larger surprise
-OTHER_SEED = 1_000_003  # calibration runs share none with those of the experiment
+RUNS = 60  # of a calibration campaign; ALPHA asks for 19 at least
+ALPHA = 0.05  # share of the episodes that may hold a surprise larger than the margin
+OTHER_SEED = 1_000_003  # added to the seed: no calibration run is a run of the experiment
 
 
 def calibrated(experiment: Experiment, method: str, folder: Path | None, processes: int) -> str:
-    """The method with its margin as a number, rounded up to millimetres; others are left as they are.
+    """The method with its margin as a number, rounded up to millimetres; other methods as they are.
 
-    The calibration campaign is the same experiment with another seed, by the method without a margin. With a
-    `folder`, what it found is kept there as calibration.json.
+    The calibration campaign is the same experiment with another seed, run by the method without a margin.
+    What it found is kept in `folder`, if one is given, as calibration.json.
     """
     kind, _, asked = method.partition("@conformal")
     if kind == method:

@@ -47,7 +47,7 @@ class HardDecoding:
         self._next = _NextStates(task)
 
     def decode(self, history: Floats, logits: Floats) -> Floats:
-        """Logits [A], -inf where the next state violates; what every next state violates masks nothing."""
+        """Logits [A], -inf where the next state violates; a conjunct that all of them violate masks none."""
         task, t = self._next.task, len(history) - 1
         if t >= task.horizon:
             return logits
@@ -76,7 +76,7 @@ class RobustDecoding:
         self._obligations = obligations(task.formula)
 
     def decode(self, history: Floats, logits: Floats) -> Floats:
-        """Logits [A]; as they are where nothing is asked for at the next step."""
+        """Logits [A]; unchanged where nothing is asked for at the next step."""
         asked = [part for part in self._obligations if self._is_asked(part, history)]
         if not asked:
             return logits

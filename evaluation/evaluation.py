@@ -1,4 +1,7 @@
-"""All runs of an experiment, over processes or job workers: kept as they finish, taken up again."""
+"""All runs of an experiment, spread over processes or job workers.
+
+Runs are kept in a folder as they finish; a campaign that was interrupted goes on from what the folder holds.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +33,12 @@ def evaluate(
     redis_url: str | None = None,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> list[Record]:
-    """The records of `runs` runs by each method, by run and then by method; one named twice counts once.
+    """The records of `runs` runs by each method, ordered by run and then by method.
 
-    folder: finished runs are kept there as they come, those that are there already are not made again.
-    processes: 1 is this one. redis_url: where job workers take the runs from instead. on_progress: how many
-    runs are finished. Raises InputError where `folder` holds another experiment, or records made from
-    another map, policy or model.
+    methods: one that is named twice counts once. folder: finished runs are kept there, and those that it
+    holds already are not made again. processes: with 1, the runs are made in this process. redis_url: a Redis
+    from which job workers take the runs instead. on_progress: called with the number of finished runs. Raises
+    InputError where `folder` holds another experiment, or records made from another map, policy or model.
     """
     methods = list(dict.fromkeys(methods))
     done = {} if folder is None else _open(folder, experiment)
@@ -56,7 +59,7 @@ def evaluate(
 
 
 def _over_processes(experiment: Experiment, missing: Missing, processes: int) -> Iterator[list[Record]]:
-    """Each run in one of `processes` fresh processes, which end with this one, however it goes."""
+    """Each run in one of `processes` new processes. They end when this one does, even if it is killed."""
     for name in THREADS:  # one thread each: the processes share the cores out
         os.environ.setdefault(name, "1")
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
@@ -73,7 +76,7 @@ def _over_processes(experiment: Experiment, missing: Missing, processes: int) ->
 
 
 def _end_with_parent() -> None:
-    """A process that nobody waits for any more ends, whatever it is at."""
+    """Makes this process end when the process that started it is gone, whatever it is doing."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -85,7 +88,7 @@ def _end_with_parent() -> None:
 
 
 def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]:
-    """What `folder` holds of the experiment."""
+    """The records that `folder` holds. It is made, with a description of the experiment, where it is new."""
     folder.mkdir(parents=True, exist_ok=True)
     about, written = folder / ABOUT, folder / "runs.jsonl"
     check(folder, experiment)
@@ -94,12 +97,12 @@ def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]
         about.write_text(json.dumps(described) + "\n")
     if not written.exists():
         return {}
-    os.truncate(written, written.read_bytes().rfind(b"\n") + 1)  # a line that was cut short
+    os.truncate(written, written.read_bytes().rfind(b"\n") + 1)  # a kill may have cut the last line short
     return {(record.run, record.method): record for record in read(folder)}
 
 
 def check(folder: Path, experiment: Experiment) -> None:
-    """Raises InputError unless the folder's records, if it has any, and new ones can stand side by side."""
+    """Raises InputError where new records would not be comparable with those that the folder holds."""
     if not (folder / ABOUT).exists():
         return
     found, made_from = read_about(folder)
@@ -117,20 +120,20 @@ def check(folder: Path, experiment: Experiment) -> None:
     changed = [name for name in {**made_from, **now} if made_from.get(name) != now.get(name)]
     if changed:
         raise InputError(
-            f"since the records in {folder} were made there is another {', '.join(changed)}", path="out",
-            got=changed, expected="another --out, or what was there then",
+            f"the records in {folder} were made with another {', '.join(changed)}", path="out",
+            got=changed, expected="another --out, or what those records were made with",
         )  # fmt: skip
 
 
 def read_about(folder: Path) -> tuple[Experiment, dict[str, Any] | None]:
-    """The experiment of a folder, and what its records were made from; None in a folder that does not say."""
+    """The experiment of a folder, and what its records were made from; None if the folder does not say it."""
     content = json.loads((folder / ABOUT).read_text())
     made_from = content.pop("made_from", None)
     return Experiment.from_json(content), made_from
 
 
 def read(folder: Path) -> list[Record]:
-    """The records kept in a folder, one a run and method: the last. A line that was cut off is none."""
+    """The records that a folder holds: the last for each run and method, no line that was cut off."""
     with open(folder / "runs.jsonl") as lines:
         records = [Record.from_json(json.loads(line)) for line in lines if line.endswith("\n")]
     return list({(record.run, record.method): record for record in records}.values())

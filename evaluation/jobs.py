@@ -18,7 +18,7 @@ from rq.serializers import JSONSerializer
 from specshield.errors import SpecshieldError, StoreError
 from specshield.sim.service import follow_parent
 
-if TYPE_CHECKING:  # a worker waits for jobs without the weight of the core
+if TYPE_CHECKING:  # while a worker waits for jobs it loads none of the core
     from evaluation.experiment import Experiment
     from evaluation.runs import Record
 
@@ -27,7 +27,7 @@ CHUNK = 4  # runs a job
 POLL = 0.2  # [s]
 TIMEOUT = 3600  # [s] for a job
 ATTEMPTS = 3
-SILENT = timedelta(seconds=120)  # without a sign of life after which a worker is taken for dead
+SILENT = timedelta(seconds=120)  # a worker that gives no sign of life for so long is taken for dead
 
 Chunk = list[tuple[int, list[str]]]
 
@@ -35,7 +35,7 @@ Chunk = list[tuple[int, list[str]]]
 def over_workers(
     url: str, experiment: Experiment, missing: Mapping[int, Sequence[str]]
 ) -> Iterator[list[Record]]:
-    """The records of each run, as the workers finish them; what is lost is given out again.
+    """The records of each run, as the workers finish them. Runs that were lost are given out again.
 
     missing: {run: methods}. Raises StoreError where the store cannot be reached or no worker listens, and
     SpecshieldError with a failed job's last line, or where runs are lost ATTEMPTS times.
@@ -114,7 +114,7 @@ def run_chunk(experiment: dict[str, Any], chunk: Chunk) -> list[list[dict[str, A
 
 
 def _fetched(connection: Any, job_id: str) -> Job | None:
-    """None where the store has forgotten the job, or most of it: a worker may write to what is gone."""
+    """None where the store has forgotten the job; what a worker has written to it since is not a job."""
     try:
         return Job.fetch(job_id, connection=connection, serializer=JSONSerializer)
     except NoSuchJobError:
@@ -122,12 +122,12 @@ def _fetched(connection: Any, job_id: str) -> Job | None:
 
 
 def _result(job: Job) -> Any:
-    """None where it has not finished, or the store has forgotten what came of it."""
+    """None where the job has not finished, or the store has forgotten its result."""
     return job.return_value() if job.get_status(refresh=False) == JobStatus.FINISHED else None
 
 
 def _is_lost(job: Job) -> bool:
-    """Whether a job will never have a result. Raises SpecshieldError where it failed by itself."""
+    """Whether a job will never have a result. Raises SpecshieldError where its own code failed."""
     status = job.get_status(refresh=False)
     if status in (JobStatus.FAILED, JobStatus.STOPPED, JobStatus.CANCELED):
         result = job.latest_result()

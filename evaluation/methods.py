@@ -1,11 +1,11 @@
 """Ways to choose an action for a model that knows no rule, side by side behind one interface.
 
 unmodified   the model's own draw
-hcd, rcd     SafeDec's next-step decoding (sim/decoding.py)
+hcd, rcd     SafeDec's next-step decoding (decoding.py)
 simplex      the model's draw where it is feasible, else the certified continuation takes over
-paper        a learned pi_phi alone, rolled out literally at every step; hard projection
-ours         reachability and the learned pi_phi, witnesses carried on; hard projection
-lookahead    ours, weighted inside S_t by what the rule will still cost the model from there
+paper        the paper's decision rule with our DQN alone, rolled out at every step; hard projection
+ours         reachability and the learned pi_phi, witnesses handed on from step to step; hard projection
+lookahead    ours, feasible actions weighted by what the rule will still cost the model from there
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Answer:
     """What a method makes of one step; A actions.
 
     distribution [A]: what the action is drawn from. action: the draw, a terminal one ends the main task.
-    execute: what the robot runs; None: it stands still from here on. mode: one of sim/statistics.py's MODES.
+    execute: what the robot runs; None: it stands still from here on. mode: one of MODES in statistics.py.
     spec_status: None where the method does not know. kl [nats]: from the model's own distribution.
     robustness: rho of the future that certifies `execute` [m].
     """
@@ -65,7 +65,7 @@ class Method(Protocol):
 
 
 class Decoding:
-    """A change of the logits that looks at most one step ahead, or (without one) none at all."""
+    """A draw from the model's logits, which `how` may change, looking one step ahead at most."""
 
     def __init__(self, task: Task, how: HardDecoding | RobustDecoding | None = None) -> None:
         self._terminal, self._how = task.robot.terminal, how
@@ -74,7 +74,7 @@ class Decoding:
         pass
 
     def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
-        if logits is None:  # the model has ended, and there is nothing else to decide
+        if logits is None:  # the model has ended, and this method has nothing to go on with
             raise InputError("next-step decoding has no plan of its own", path="logits", got=None)
         changed = logits if self._how is None else self._how.decode(history, logits)
         log_prior = shaping.log_softmax(logits)
@@ -90,7 +90,7 @@ class Decoding:
 
 
 class Shielded:
-    """The shield. carries: hand each decision's witnesses to the next."""
+    """The shield. carries: whether each decision's witnesses are handed to the next decision."""
 
     def __init__(self, shield: Shield, carries: bool = True) -> None:
         self._shield, self._carries = shield, carries
@@ -123,7 +123,7 @@ class Shielded:
 
 
 class Simplex(Shielded):
-    """The model's own action wherever that is feasible; all other mass on the certified continuation."""
+    """The model's own draw where it is feasible; otherwise the first action of the certified continuation."""
 
     def _chosen(self, decision: Decision, logits: Floats | None, draw: float) -> tuple[Floats, int, str]:
         if logits is None or decision.completion_action is None:

@@ -14,10 +14,11 @@ from evaluation.statistics import costs_beside, summary
 
 
 def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]:
-    """The figures of every method in `records`, as JSON. refused: starts drawn before those that would do.
+    """The figures of every method in `records`, as JSON.
 
-    left: the steps of a run that the rule leaves after its horizon, and in how many of its runs the model,
-    unmodified, does its task in as many. lookahead_beside_ours: `costs_beside`, None where either is missing.
+    refused_starts: starts that were drawn and could not be used. left: how many steps a run has after the
+    rule's horizon, and in how many of its runs the unmodified model does its task within so many steps.
+    lookahead_beside_ours: `costs_beside`, None where one of the two methods was not run.
     """
     by_method: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda r: r.run):
@@ -74,7 +75,7 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table, its columns after the first to the right."""
+    """A table in Markdown; all columns but the first are aligned to the right."""
     rule = ["---", *["--:"] * (len(heads) - 1)]
     return "\n".join(f"| {' | '.join(row)} |" for row in [heads, rule, *rows])
 

@@ -43,10 +43,10 @@ class Record:
     seed: of this run. refused: starts drawn before `start` that were infeasible. satisfied, rho: of the
     states x_0 .. x_T, the robot standing still where it stopped earlier [m]. main_done: the model ended
     within 1 m of its target before MAX_STEPS; ended_at: the step of its `end`. broken: the conjuncts that
-    were not kept. modes, reasons: decisions by
-    mode and by reason. kl: summed over the decisions made for the model, `asked` of them [nats]. residual:
-    the largest surprise of a step (sim/conformal.py) [m]. decision_ms: p50, p99 and max. mass: pi_FM(S_t)
-    step by step; certified: rho of the future that certified what was executed; None where there was none.
+    were not kept. modes, reasons: how many decisions had each mode and each reason. kl: summed over the
+    decisions made for the model, `asked` of them [nats]. residual: the largest surprise of a step
+    (conformal.py) [m]. decision_ms: p50, p99 and max. mass: pi_FM(S_t) step by step; certified: rho of the
+    future that certified what was executed; None where there was none.
     poses: x_0, x_1, ...
     """
 
@@ -93,7 +93,7 @@ def run(experiment: Experiment, i: int, methods: Sequence[str]) -> list[Record]:
 
 @dataclass(frozen=True)
 class _Beginning:
-    """case: the world as it really is. refused: starts drawn before that would not do."""
+    """case: the world as it really is. refused: how many starts were drawn before and could not be used."""
 
     case: Case
     pose: Pose
@@ -103,7 +103,7 @@ class _Beginning:
 def _begin(setting: Setting, own: int) -> _Beginning:
     """The first start, of those drawn uniformly over free space, that no shield refuses.
 
-    In a world that is not as told it has to be free there too.
+    Where the world is not as the shield was told, the start has to be free in the real world too.
     """
     shields = [setting.ours] if setting.learned is None else [setting.paper, setting.ours]
     starts = free_poses(setting.case.task, setting.case.body, DRAWS, np.random.default_rng([own, START]))
@@ -197,7 +197,7 @@ def _episode(experiment: Experiment, name: str, i: int, own: int, begun: _Beginn
 
 
 class _Tally:
-    """What the decisions of an episode come to."""
+    """Sums over the decisions of an episode."""
 
     def __init__(self) -> None:
         self.modes: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""What the records of an experiment come to, method by method."""
+"""The figures of an experiment, method by method, from its records."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from specshield.sim.episodes import Episode
 
 MODES = ("shaped", "switched", "completion", "prior", "fallback", "violated")  # of decisions
 CONFIDENCE = 0.95
-RESAMPLED = 2000  # times, for a bootstrap
-FEW = 20  # runs: extra steps of fewer are not compared
+RESAMPLED = 2000  # samples of a bootstrap; chosen by hand
+FEW = 20  # runs; with fewer, extra steps are not compared (chosen by hand)
 
 
 def clopper_pearson(k: int, n: int) -> tuple[float, float]:

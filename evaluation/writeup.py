@@ -117,7 +117,8 @@ def _sections(
         "Written by `specshield report`; every figure is from a campaign's `results.json`. Shares carry "
         "their 95 % Clopper-Pearson intervals. All methods share starts, model seeds, draws and "
         "disturbances, run by run. The main task is done when the model says `end` within 1 m of its target "
-        "before 600 steps."
+        "before 600 steps. The p50 and p99 of a decision are medians over the runs of each run's own "
+        "percentile."
     )
     there = {split(one["method"])[0] for r in found.values() for one in r["methods"]}
     legend = [f"- **{name}**: {text}" for name, text in METHODS.items() if name in there]

@@ -1,10 +1,13 @@
 """Trains the learned model, measures it and writes it: `python -m evaluation.model.command --help`.
 
-The model in models/fm was trained in two goes, both in generated apartments alone: as by default, `--out
-first`; `--start first --seed 1 --option own=0.7 --option rounds=200 --option houses=300 --option
-learning_rate=7e-4`. In the first go the code still let the network drive for 160 steps at most, and it
-did not tire of what changes nothing: these commands make such a model, not the same bits. The same command
-gives the same bits again on one machine, with one version of torch.
+The model in models/fm was trained twice in a row, both times in generated apartments alone: with the default
+options and `--out first`, and then with `--start first --seed 1 --option own=0.7 --option rounds=200 --option
+houses=300 --option learning_rate=7e-4`. The code has changed since the first training, so these commands make
+a model of the same kind, not the same bits: the network then drove for 160 steps at most, and nothing made
+it less likely to repeat an action that had changed nothing. With the code as it is, a command gives the same
+bits again on one machine with one version of torch.
+
+The training interferes with the robots (practice.py): what the model is later shielded with is not new to it.
 """
 
 from __future__ import annotations
@@ -41,8 +44,8 @@ def train_model(
 ) -> int:
     """Writes the weights and a card with what was measured to `out`; the exit status.
 
-    options: settings of learned/train.py. with_cases: the apartments of the cases are among those practised
-    in. start: a folder with a model to go on from. Raises NotFound, PolicyError.
+    options: settings of train.py. with_cases: whether it also practises in the apartments of the cases.
+    start: a folder with a model to go on from. Raises NotFound, PolicyError.
     """
     from evaluation.model.train import Report, Settings, train  # torch
     from evaluation.model.transformer import export, restore

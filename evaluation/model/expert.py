@@ -1,7 +1,7 @@
-"""The expert that is imitated: the shortest way to the target, known from the map, one action at a time.
+"""The expert that the learned model imitates: it knows the map and takes the shortest way to the target.
 
-Like the way that the stand-in model follows (sim/robot.py), it keeps off the walls: there the robot can turn.
-Its answer is a distribution: actions that lose little against the best one have some of it.
+Like the way in sim/robot.py, its way keeps off the walls, so that the robot can turn on it. Its answer is a
+distribution over the actions: those that lose little against the best one get some probability too.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from specshield.world.occupancy import OccupancyGrid
 Floats = NDArray[np.float64]
 
 END_WITHIN = 0.75  # [m]
-SHARPNESS = 4.0  # nats an action's saved step is worth
-BACKWARDS = 1.5  # steps that driving backwards costs more: it cannot see where it goes
-OFF = 1000.0  # [m] more than any way is long: added where the robot has to get off a wall first
-AT_WALL = 4.0  # steps that it costs to be at a wall
-LEFT_OVER = 0.02  # of the distribution, spread over all tokens but `end`
+SHARPNESS = 4.0  # [nats] for a step that an action saves
+BACKWARDS = 1.5  # [steps] that driving backwards costs more, since it does not see where it goes
+OFF = 1000.0  # [m] longer than any way: added where the robot has to get away from a wall first
+AT_WALL = 4.0  # [steps] that it costs to be at a wall
+LEFT_OVER = 0.02  # share of the distribution that is spread over all tokens but `end`
 AHEAD, RIGHT, LEFT, BACK, END, IDLE, LEFT_SMALL, RIGHT_SMALL = range(8)  # Stretch tokens; IDLE: `sub_done`
 
 
 def ways(grid: OccupancyGrid, targets: list[tuple[float, float]]) -> NDArray[np.float32]:
-    """Metres to go from each cell to each target, off the walls first and then clear of them. [K, h, w]."""
+    """Metres from each cell to each target, first away from the walls and then clear of them. [K, h, w]."""
     free = ~grid.occupied
     parts, _ = label(grid.clearance > COMFORT)
     cells = [tuple(int(i) for i in np.floor(grid.to_grid(t) / grid.resolution)) for t in targets]
@@ -48,7 +48,7 @@ def ways(grid: OccupancyGrid, targets: list[tuple[float, float]]) -> NDArray[np.
 
 @leaf
 def bearing_of_way(body: Body, to_go: NDArray[np.float32], x: float, y: float, theta: float) -> float:
-    """Where the way leads, from the heading [rad]: LOOK_AHEAD cells down the field, or off the wall."""
+    """The bearing [rad] of the point LOOK_AHEAD cells on along the way, or where it comes off the wall."""
     h = body.resolution
     row, col = math.floor((y - body.origin_y) / h), math.floor((x - body.origin_x) / h)
     at_wall = to_go[row, col] >= OFF

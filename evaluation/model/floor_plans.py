@@ -1,4 +1,4 @@
-"""Random apartments to learn in: rooms cut from a rectangle, doors, furniture, targets by their habits."""
+"""Random apartments: rooms cut from a rectangle, doors, furniture, and things in the places they are kept."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ IN_THE_MIDDLE = {
     "LivingRoom": ((0.8, 1.3), (0.7, 1.2), 0.7),
     "Office": ((0.6, 0.8), (0.5, 0.7), 0.5),
 }
-STRAY = (0.4, 0.2)  # the chances of a chair or two anywhere: they leave niches in which there is no turning
+STRAY = (0.4, 0.2)  # chances of a first and a second chair anywhere: beside them the robot cannot turn
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class House:
 
 
 def random_house(random: np.random.Generator) -> House:
-    """Draws until every room and every target can be reached by a robot that keeps off the walls."""
+    """An apartment in which a robot that keeps off the walls reaches every room and every target."""
     while True:
         house = _furnished(random)
         if house is not None:

@@ -1,4 +1,4 @@
-"""How well the learned model finds what it is sent for, alone: figures for its card."""
+"""How often a model without a shield finds what it is sent for: figures for the learned model's card."""
 
 from __future__ import annotations
 

@@ -1,11 +1,13 @@
-"""Many robots at once that practise finding targets in apartments: what they sense, and what the expert says.
+"""Many robots at once practise finding targets in apartments: what they sense, and what the expert says.
 
 The expert takes shortest paths: to the target once the robot has seen it; before, to the nearest room that
 has been in sight but not been looked at yet, rather one ahead than one behind. What it says follows from what
 the robot has seen, so it can be imitated by one that has no map.
 
-In some episodes the robot is interfered with, as a shield would: held where it is, or steered towards
-something else for tens of steps, or its actions fail at random. The expert says what to do from where it is.
+In half of the episodes the robot is interfered with, as a shield would do: it is held where it is, or steered
+towards something else, in two spells of tens of steps. In half of them its actions also fail at random. The
+expert says what to do from where the robot then is. What is measured with this model under a shield is
+therefore measured with one that has practised being steered.
 """
 
 from __future__ import annotations
@@ -29,11 +31,11 @@ from specshield.world.occupancy import OccupancyGrid
 
 ROOMS = 8  # of a house, at most
 PATCH = 5  # [cells] side of the squares in which is kept what has been looked at
-LOOKED_AT = 0.7  # share of a room's floor that is enough
-THERE = 0.35  # [m] from a room's middle: turn and look
-UNNOTICED = 100.0  # [m] more than any way: rooms of which nothing has been in sight come last
-STAY = 0.5  # [m] nearer that another room has to be for a change of mind
-TURN = 1.5  # [m] that a radian to turn counts: it goes on with the way on which it is
+LOOKED_AT = 0.7  # share of a room's floor after which it counts as looked at
+THERE = 0.35  # [m] from a room's middle; nearer than this, the expert turns and looks
+UNNOTICED = 100.0  # [m] longer than any way: rooms of which nothing has been in sight come last
+STAY = 0.5  # [m] by which another room has to be nearer than the one chosen before
+TURN = 1.5  # [m] that a turn of one radian counts, so that the expert rather goes on ahead
 
 
 class Apartments(NamedTuple):

@@ -1,10 +1,10 @@
 """Training of the learned foundation model: imitation of shortest paths, in rounds.
 
-Each round the robots practise in random apartments, of this round and of recent ones the network learns what
-the expert did. In a share of the episodes the network drives first, and where it has got to the expert takes
-over: the network learns to go on from where its own mistakes lead. What the expert would have done in their
-midst is not learned (as in DAgger: Ross et al., 2011). The expert knows the map: what it is up to often shows
-in its last actions alone, and a network that does not find them in its past learns to waver.
+In each round the robots practise in random apartments, and the network learns what the expert did in this
+round and in recent ones. In a share of the episodes the network drives first and then the expert takes over:
+so the network learns to go on from where its own mistakes lead. Other than in DAgger (Ross et al., 2011), it
+does not learn what the expert would have done while it drove itself. The expert knows the map, and often only
+its last actions show where it is going: a network that does not find them in its past learns to waver.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from specshield.sim.senses import RAYS
 
 CHANCES = (0.25, 0.25, *([0.125] * (len(KINDS) - 2)))  # of each kind: two of them are kept in kitchens
 
-ALONE = (10, 250)  # steps that it drives before the expert takes over,
-LATEST = 80  # half of the time from the first on, else from one before this
-WRONG_END = 3.0  # what an `end` at the wrong place costs, beside the imitation
+ALONE = (10, 250)  # steps that the network drives before the expert takes over
+LATEST = 80  # half of the time it drives from the first step on, otherwise from a step before this one
+WRONG_END = 3.0  # weight of an `end` at the wrong place, beside the imitation
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def train(
     on_round: Callable[[Report], None],
     start: Transformer | None = None,
 ) -> Transformer:
-    """given: apartments to practise in besides `settings.houses` random ones. start: goes on from it."""
+    """given: apartments to practise in besides the `settings.houses` random ones. start: goes on from it."""
     torch.set_num_threads(1)  # more of them wait for each other, one practises meanwhile
     random = np.random.default_rng(seed)
     torch.manual_seed(seed)

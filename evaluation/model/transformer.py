@@ -1,4 +1,4 @@
-"""The learned model's network in torch, to train it; network.py is the same for what is done with it."""
+"""The learned model's network in torch, to train it; sim/learned/network.py is the same in NumPy."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_pat
         ("fm", lambda _, models: last_bit(models / "fm" / "model.safetensors"), "learned model"),
     ):
         said, expected = changed(name, spoil)
-        assert said == f"since the records in {out} were made there is another {what}"
+        assert said == f"the records in {out} were made with another {what}"
         assert expected.startswith("another --out")
     (out / "experiment.json").write_text(json.dumps(asked.to_json()))  # as it was before it said
     with pytest.raises(InputError, match="does not say") as caught:

@@ -1,11 +1,10 @@
-"""One episode of a robot with a model, driven through the SDK: with the shield, and without it."""
+"""One episode of a simulated robot with a model, driven through the SDK: with the shield, and without it."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -19,12 +18,12 @@ MAX_STEPS = 600
 
 @dataclass
 class Episode:
-    """What came of one episode; filled in while it runs.
+    """What happened in one episode; filled in while it runs.
 
     spec_status, robustness: the service's verdict on the poses; (lo, hi) [m], None where unbounded.
     main_done: the model ended within 1 m of its target before MAX_STEPS. ended_at: the step of its `end`,
     None if never. modes: decisions by mode. asked: decisions made while the rule was pending and the main
-    task ran; spread: those of them that were `shaped` and left the model more than one action. kl: of each
+    task ran; spread: how many of them were `shaped` and left the model more than one action. kl: of each
     decision from the model's own distribution [nats]. round_trip_ms, server_ms: of each decision.
     poses: x_0 ... x_t.
     """
@@ -44,9 +43,6 @@ class Episode:
     round_trip_ms: list[float] = field(default_factory=list)
     server_ms: list[float] = field(default_factory=list)
     poses: list[Pose] = field(default_factory=list)
-
-    def to_json(self) -> dict[str, Any]:
-        return {**vars(self), "modes": dict(self.modes)}
 
     def judged(self, verdict: Verdict) -> Episode:
         self.spec_status, self.robustness = verdict.spec_status, verdict.robustness_bounds

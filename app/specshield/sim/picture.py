@@ -7,20 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from specshield.sim.canvas import (
-    AVOID,
-    BLUE,
-    BORDER,
-    FAINT,
-    GREY,
-    INK,
-    ORANGE,
-    PAPER,
-    TARGET,
-    VISIT,
-    Canvas,
-    avoided,
-)  # fmt: skip
+from specshield.sim import canvas
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode
 from specshield.sim.robot import Pose
@@ -29,29 +16,29 @@ from specshield.world.regions import signed_distance
 
 SCALE = 110  # pixels a metre
 LEGEND = 86  # pixels
-SHIELDED, UNSHIELDED = BLUE, ORANGE
+SHIELDED, UNSHIELDED = canvas.BLUE, canvas.ORANGE
 
 
 def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None:
     """Writes a PNG, and the folder that it is in."""
-    canvas = Canvas(case.task, SCALE, below=LEGEND)
-    canvas.walls()
-    _rooms(canvas, case)
-    canvas.regions(13)
-    canvas.way(unshielded.poses, UNSHIELDED, 2.2)
-    canvas.way(shielded.poses, SHIELDED, 3.0)
+    plan = canvas.Canvas(case.task, SCALE, below=LEGEND)
+    plan.walls()
+    _rooms(plan, case)
+    plan.regions(13)
+    plan.way(unshielded.poses, UNSHIELDED, 2.2)
+    plan.way(shielded.poses, SHIELDED, 3.0)
     for t, pose in _visits(case, shielded.poses):
-        canvas.dot(pose, 5.0, SHIELDED, PAPER)
-        canvas.text(pose, f"t={t}", 12, SHIELDED, shift=(9, -9), anchor="ls")
-    canvas.start(shielded.start)
-    canvas.dot(case.target, 8.0, TARGET, INK)
-    canvas.text(case.target, case.instruction.split()[-1], 14, shift=(0, 12), anchor="mt")
-    _legend(canvas, case, shielded, unshielded)
+        plan.dot(pose, 5.0, SHIELDED, canvas.PAPER)
+        plan.text(pose, f"t={t}", 12, SHIELDED, shift=(9, -9), anchor="ls")
+    plan.start(shielded.start)
+    plan.dot(case.target, 8.0, canvas.TARGET, canvas.INK)
+    plan.text(case.target, case.instruction.split()[-1], 14, shift=(0, 12), anchor="mt")
+    _legend(plan, case, shielded, unshielded)
     path.parent.mkdir(parents=True, exist_ok=True)
-    canvas.picture().save(path)
+    plan.picture().save(path)
 
 
-def _rooms(canvas: Canvas, case: Case) -> None:
+def _rooms(plan: canvas.Canvas, case: Case) -> None:
     """The name of each room, where there is most space in it that no region and no target takes."""
     grid = case.task.grid
     taken = [signed_distance(region, grid.centres) > -0.4 for region in case.task.regions.values()]
@@ -59,7 +46,7 @@ def _rooms(canvas: Canvas, case: Case) -> None:
     for name, room in case.rooms.items():
         roomy = np.minimum(signed_distance(room, grid.centres), grid.clearance)
         free = np.where(np.any(taken, axis=0), -1.0, roomy)
-        canvas.text(grid.centres[np.unravel_index(np.argmax(free), free.shape)], name, 13, FAINT)
+        plan.text(grid.centres[np.unravel_index(np.argmax(free), free.shape)], name, 13, canvas.FAINT)
 
 
 def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
@@ -75,11 +62,11 @@ def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
                 break
 
 
-def _legend(canvas: Canvas, case: Case, shielded: Episode, unshielded: Episode) -> None:
+def _legend(plan: canvas.Canvas, case: Case, shielded: Episode, unshielded: Episode) -> None:
     """Below the map; what is said of a way or of regions has their colour."""
 
-    def write(right: float, down: float, said: str, size: float = 14, color: str = INK) -> None:
-        canvas.text(canvas.bottom, said, size, color, (right, BORDER + down), anchor="lt")
+    def write(right: float, down: float, said: str, size: float = 14, color: str = canvas.INK) -> None:
+        plan.text(plan.bottom, said, size, color, (right, canvas.BORDER + down), anchor="lt")
 
     def outcome(episode: Episode) -> str:
         found = f"ended at t={episode.ended_at}" if episode.main_done else "target not found"
@@ -88,8 +75,8 @@ def _legend(canvas: Canvas, case: Case, shielded: Episode, unshielded: Episode) 
     write(0, 0, str(case.task.formula), 15)
     write(0, 26, f"with the shield: {outcome(shielded)}", color=SHIELDED)
     write(0, 50, f"without: {outcome(unshielded)}", color=UNSHIELDED)
-    write(560, 26, "to visit", color=VISIT)
-    if avoided(case.task.formula):
-        write(640, 26, "to avoid", color=AVOID)
-    write(730, 26, f"after t={case.task.horizon}, the rule's last", color=GREY)
+    write(560, 26, "to visit", color=canvas.VISIT)
+    if canvas.avoided(case.task.formula):
+        write(640, 26, "to avoid", color=canvas.AVOID)
+    write(730, 26, f"after t={case.task.horizon}, the rule's last", color=canvas.GREY)
     write(560, 50, f'"{case.instruction}"')

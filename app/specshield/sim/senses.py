@@ -15,9 +15,9 @@ from specshield.compiled import leaf
 from specshield.robot.dynamics import Body
 
 RAYS = 36
-REACH = 6.0  # [m] of a ray
+REACH = 6.0  # [m] length of a ray
 FIELD_OF_VIEW = math.radians(120.0)
-SIGHT = 5.0  # [m] farthest that the target is recognised
+SIGHT = 5.0  # [m] up to which the target is recognised
 
 
 class Senses(NamedTuple):
@@ -43,7 +43,7 @@ def scan(body: Body, x: float, y: float, theta: float, out: NDArray[np.float64])
 
 @leaf
 def see(body: Body, x: float, y: float, theta: float, tx: float, ty: float) -> tuple[bool, float, float]:
-    """Whether the point (tx, ty) is seen, how far off it is, and where from the heading."""
+    """Whether the point (tx, ty) is seen, how far away it is [m], and its bearing from the heading [rad]."""
     distance = math.hypot(tx - x, ty - y)
     bearing = math.atan2(ty - y, tx - x) - theta
     bearing -= 2.0 * math.pi * round(bearing / (2.0 * math.pi))

@@ -1,9 +1,9 @@
 """The learned foundation model: it imitates shortest paths, as SPOC does, and knows no rule and no region.
 
-Egocentric only: a range scan, whether and where the target is seen, what it is told to find, and the action
-that was executed last, its own or not. What it remembers is its own, and so is its count of where it has come
-since it began (reckoning.py). The weights that are shipped were trained in generated apartments alone; the
-card says how, and what was measured.
+It is given egocentric senses only: a range scan, whether and where its target is seen, what it is told to
+find, and the action that was executed last, which the shield may have chosen. Its memory is its own, and so
+is its count of where it has come since it began (reckoning.py). The shipped weights were trained in generated
+apartments alone, with interference as a shield's (evaluation/model/practice.py); the card has the figures.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FOLDER, WEIGHTS, CARD = "fm", "model.safetensors", "model.json"  # in models/
 
 
 class LearnedModel:
-    """weights: checked. target: one of KINDS. temperature: what the logits are divided by."""
+    """weights: as `check` returns them. target: one of KINDS. temperature: what the logits are divided by."""
 
     def __init__(self, weights: Mapping[str, Array], target: str, temperature: float) -> None:
         self._network, self._kind, self._temperature = Network(weights), KINDS.index(target), temperature

@@ -1,10 +1,10 @@
 """The learned model's network without torch: a causal transformer, one step at a time, in NumPy.
 
 A step's input is what the robot senses, what it looks for, the action that was executed last, and where it
-has come to by its own count of its actions (reckoning.py). Pre-norm blocks; attention over the last WINDOW
-steps, less to those longer ago (ALiBi: Press et al., 2022) and, of some heads, to those farther away; beside
-their values it gives the way to where they were. Nothing depends on the time or the place as such. Keys and
-values are kept from step to step.
+is by its own count of its actions (reckoning.py). The blocks are pre-norm. Attention covers the last WINDOW
+steps, with less weight on steps longer ago (ALiBi: Press et al., 2022) and, for some heads, on steps made
+farther away; its result holds the way to where those steps were made, beside their values. The absolute time
+and place have no influence. Keys and values are kept from step to step.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ NOTHING = ACTIONS  # the last action of a robot that has done nothing yet
 INPUTS = RAYS + 3  # ranges, seen, distance, bearing
 FEATURES = 2 * RAYS + 7
 UNITS, LAYERS, WINDOW = 128, 3, 256
-SLOPES = (2.0**-2, 2.0**-4, 2.0**-7, 2.0**-9)  # of each head: what a step longer ago takes off its attention
-FAR = (0.0, 0.0, 0.25, 2.0)  # of each head: what a metre between here and there takes off it
+SLOPES = (2.0**-2, 2.0**-4, 2.0**-7, 2.0**-9)  # of each head: taken off a score for each step ago
+FAR = (0.0, 0.0, 0.25, 2.0)  # of each head: taken off a score for each metre away
 SPAN = 5.0  # [m] a way to what is remembered is given as a share of this
 
 TEMPERATURE = 0.7  # as it is trained to drive, and shipped
 FLOOR = 16.0  # [nats] below the best logit is as unlikely as an action gets
-RELUCTANCE = 2.0  # [nats] to undo what was executed last: without it, it turns to and fro where it is unsure
-PATIENCE = 2.0  # [nats] to do once more what has changed nothing; as often as TIRED at most
+RELUCTANCE = 2.0  # [nats] off an action that undoes the last one; otherwise it turns to and fro when unsure
+PATIENCE = 2.0  # [nats] off an action for each time, TIRED at most, that it has changed nothing
 TIRED = 4
 OPPOSITE = np.array([3, 2, 1, 0, -1, -1, 7, 6, *[-1] * (ACTIONS - 7)])  # of each last action, -1 for none
 

@@ -1,7 +1,7 @@
-"""How the model itself counts where it has come since it began: from what it executed, and nothing else.
+"""How the model keeps count of where it has come since it began, from the actions that were executed.
 
-No pose and no map is given to it. A move is taken to be whole where the scan changed at all, and not to have
-been where it did not; slips, walls that stop a move short and noise put the count off, and nothing mends it.
+It is given no pose and no map. A move counts as a whole one if the range scan changed at all, and as none if
+it did not. Slips, walls that stop a move short and noise make the count wrong, and nothing corrects it.
 """
 
 from __future__ import annotations
