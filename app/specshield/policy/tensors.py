@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,23 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
         raise PolicyError(
             f"not a safetensors file: {error}", path="weights", got=got, expected="safetensors"
         ) from error
+
+
+def named_arrays(
+    tensors: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[type, int]]
+) -> list[NDArray[Any]]:
+    """The arrays of these names, {name: (dtype, rank)}, contiguous. Raises PolicyError for one that is
+    missing, or of another dtype or rank.
+    """
+    for name, (dtype, rank) in wanted.items():
+        array = tensors.get(name)
+        if array is None or array.dtype != dtype or array.ndim != rank:
+            raise PolicyError(
+                f"the array {name!r} is missing or of another kind", path=f"weights.{name}",
+                got=None if array is None else f"{array.dtype} {list(array.shape)}",
+                expected=f"{dtype.__name__}, rank {rank}",
+            )  # fmt: skip
+    return [np.ascontiguousarray(tensors[name]) for name in wanted]
 
 
 def replace_file(path: Path, content: bytes) -> None:

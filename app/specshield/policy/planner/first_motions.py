@@ -63,11 +63,10 @@ def _rejoin(world: World, way: Way, base: Ints) -> bool:
 
 @kernel
 def plan_all(
-    world: World, t: int, pose: Floats, signals: Floats, prefix: Floats, effort: float, motions: Ints,
-    poses: Floats,
-) -> tuple[int, bool]:  # fmt: skip
-    """A way after each first motion, into motions (M, T - t) and poses (M, T - t + 1, 3); returns the motion
-    that the plan from x_t takes, and whether there is one.
+    world: World, t: int, pose: Floats, signals: Floats, prefix: Floats, effort: float, motions: Ints
+) -> tuple[int, bool]:
+    """A way after each first motion, into motions (M, T - t); returns the motion that the plan from x_t
+    takes, and whether there is a plan.
 
     signals (S,): those held; prefix (size,): the formula's leaves to step t. One plan is made from x_t, if
     there is one. The other first motions only have to be undone to go the same way; those for which that
@@ -104,5 +103,5 @@ def plan_all(
             base = m
         if not found:
             stay(world, way, n, steps)
-        motions[m], poses[m] = way.motions, way.poses
+        motions[m] = way.motions
     return (base, True) if base >= 0 else (world.pad, False)

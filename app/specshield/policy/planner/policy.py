@@ -1,15 +1,17 @@
-"""pi_phi for any formula: no tables of its progress, but a plan at every decision (policy/plan.py).
+"""pi_phi for any formula: no tables of its progress, but a plan at every decision.
 
 For each predicate of the formula, and its negation where that is asked for, a field of the steps to go is
-computed once (policy/fields.py). A decision asks the formula what is due (policy/agenda.py), and searches for
-a way that serves it. What it proposes is certified by the shield like anything else; how often it finds a way
-that exists is measured. It covers what reachability does not: reactive rules over signals, patrols (G F),
-until, disjunctions of temporal parts, nested mixes.
+computed once (fields.py). A decision asks the formula which literals are due (due_dates.py), and searches for
+a way that serves them (search.py). The shield certifies what is proposed like anything else, so a way that is
+not found costs permission, never safety; how often a way that exists is found is measured. The planner covers
+what reachability does not: reactive rules over signals, patrols (G F), until, disjunctions of temporal parts,
+nested mixes.
 
-A robot that cannot stand still, or cannot turn in place, is planned for too. Of the first motions that some
-future of 7 or 8 steps keeps the rule after, in random rooms with one to three random conjuncts, it certifies
-0.99 for one that moves on arcs and cannot stand, 0.99 or more for one that turns but cannot stand and for one
-that goes to and fro on a line (one that stands and turns: 0.99 or more). Longer horizons are not measured.
+A robot that cannot stand still, or cannot turn in place, is planned for too. In random rooms with one to
+three random conjuncts, of the first motions after which some future of 7 or 8 steps keeps the rule, it
+certifies 0.99 for a robot that moves on arcs and cannot stand, and 0.99 or more for one that turns but cannot
+stand, for one that goes to and fro on a line, and for one that stands and turns. Longer horizons are not
+measured.
 """
 
 from __future__ import annotations
@@ -37,11 +39,11 @@ from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
-from specshield.policy.tensors import read_tensors
+from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turns_in_place
 from specshield.rule.progress import signal_rows
 from specshield.rule.residual import bounds_after, residuals, still_open
-from specshield.rule.values import initial_signals, places, regions_of
+from specshield.rule.values import REGIONS, initial_signals, places, regions_of
 from specshield.rule.view import look
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
@@ -50,9 +52,9 @@ from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree
 from specshield.task import Task
 
 MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
-MAX_FIELDS = 32
-USUAL = 150
-BAND = 6.0  # [steps] how far the fields may err; without a turn in place, a lattice has few of the ways
+MAX_FIELDS = 32  # further literals have no field, and no plan goes to where they hold
+USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effort of the settings
+BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
 STARTS = 50  # poses that a new policy is tried from
 
 
@@ -93,6 +95,7 @@ class PlannerPolicy:
             if i >= 0:
                 field[k] = self.chosen[i]
         pad, stands = calmest_motion(self._body), self.task.robot.wait_motion >= 0
+        # Without a turn in place the lattice has few of the ways that there are: its fields rule out nothing.
         band = BAND if turns_in_place(self._body) else 2.0 * OUT_OF_REACH
         return World(self._body, self.fields, packed, field, band, pad, stands, cost_of(packed.formula.tree))
 
@@ -142,10 +145,9 @@ class PlannerPolicy:
         known = np.empty(literals.formula.tree.size)
         look(literals.formula, history, rows, known)
         motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
-        poses = np.empty((len(motions), motions.shape[1] + 1, 3))
-        effort = self.settings.effort * max(1.0, self.task.horizon / USUAL) ** 2
+        effort = self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
         world = world._replace(literals=literals)
-        first, found = plan_all(world, t, history[-1], rows[-1], known, effort, motions, poses)
+        first, found = plan_all(world, t, history[-1], rows[-1], known, effort, motions)
         return Proposal(motions, int(first)), bool(found)
 
     def feasible_start(self, lattice: Lattice) -> float:
@@ -207,17 +209,9 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_options(Settings, card.get("options", {}))
     _, literals = literals_of(task, task.formula)
-    tensors = read_tensors(weights)
-    wanted = {"cell": (np.int32, 2), "code": (np.uint16, 3), "chosen": (np.int32, 2)}
-    for name, (dtype, rank) in wanted.items():
-        array = tensors.get(name)
-        if array is None or array.dtype != dtype or array.ndim != rank:
-            raise PolicyError(
-                f"the field {name!r} is missing or of another kind", path=f"weights.{name}",
-                got=None if array is None else f"{array.dtype} {list(array.shape)}",
-                expected=f"{dtype.__name__}, rank {rank}",
-            )  # fmt: skip
-    cell, code, chosen = (np.require(tensors[name], requirements=["C", "W"]) for name in wanted)
+    cell, code, chosen = named_arrays(
+        read_tensors(weights), {"cell": (np.int32, 2), "code": (np.uint16, 3), "chosen": (np.int32, 2)}
+    )
     ny, nx, headings = _shape(task, settings)
     fits = (
         cell.shape == (ny, nx) and code.shape[2] == headings and chosen.shape == (len(literals), 2)
@@ -271,7 +265,7 @@ def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> 
     """
     size = packed.formula.tree.size
     bounds = make_bounds(size)
-    values = np.concatenate([np.zeros(3 + len(task.regions)), list(task.signals.values())])
+    values = np.concatenate([np.zeros(REGIONS + len(task.regions)), initial_signals(task)])
     held = np.empty(len(packed.leaf))
     read_signals(packed, values, np.empty(STACK_SIZE), held)
     foresee(packed, -1, np.empty(size), held, bounds)

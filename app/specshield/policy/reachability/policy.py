@@ -23,7 +23,7 @@ from specshield.policy.reachability.search import propose_all
 from specshield.policy.reachability.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
 from specshield.policy.reachability.tables import INVALID, SCALE, Tables
 from specshield.policy.reachability.work import Guide
-from specshield.policy.tensors import read_tensors
+from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.progress import (
     ALWAYS,
@@ -118,11 +118,11 @@ def load_reachability(weights: bytes | Path, card: Card, task: Task) -> Reachabi
     goals, pitch = _goals(task, rules, settings)
     tensors, (shape, headings) = read_tensors(weights), _shape(task, pitch)
     if task.robot.wait_motion < 0:
-        cell, bits = _read(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
+        cell, bits = named_arrays(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
         _check_fit(cell, shape, bits.shape[1], bits.shape == size, f"bits {list(size)}")
         return ReachabilityPolicy(task, card, settings, _step_tables(rules, task.horizon, cell, bits, pitch))
-    cell, code, table = _read(
+    cell, code, table = named_arrays(
         tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
     )
     phases = phases_of(rules, task.horizon)
@@ -135,18 +135,6 @@ def load_reachability(weights: bytes | Path, card: Card, task: Task) -> Reachabi
     return ReachabilityPolicy(
         task, card, settings, _time_tables(rules, goals, phases, cell, code, table, pitch)
     )
-
-
-def _read(tensors: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[type, int]]) -> list[NDArray[Any]]:
-    for name, (dtype, rank) in wanted.items():
-        array = tensors.get(name)
-        if array is None or array.dtype != dtype or array.ndim != rank:
-            raise PolicyError(
-                f"the table {name!r} is missing or of another kind", path=f"weights.{name}",
-                got=None if array is None else f"{array.dtype} {list(array.shape)}",
-                expected=f"{dtype.__name__}, rank {rank}",
-            )  # fmt: skip
-    return [np.ascontiguousarray(tensors[name]) for name in wanted]
 
 
 def _check_fit(cell: NDArray[np.int32], shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
