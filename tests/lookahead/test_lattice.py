@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from specshield.lookahead.lattice import _bits, _slots, is_blocked, pose_at
+from specshield.lookahead.lattice import _bits, _slots, blocked_at, is_blocked, pose_at
 from tests.lookahead.two_cells import BACK, EAST, GO, STOP, WEST, make_world, place
 
 
@@ -55,3 +55,4 @@ def test_a_motion_is_blocked_where_it_goes_less_than_half_its_way():
     assert is_blocked(body, GO, *WEST, (0.19, 0.1, 0.0))
     assert not is_blocked(body, BACK, *EAST, (0.19, 0.1, 0.0))
     assert not is_blocked(body, STOP, *WEST, WEST)
+    assert blocked_at(body, *WEST).tolist() == [False, True, False]  # GO, BACK, STOP

@@ -12,7 +12,7 @@ from specshield.lookahead.belief import STYLE, Belief
 from specshield.lookahead.desirability import UNKEEPABLE, desirability, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import make_goals
-from specshield.lookahead.lattice import is_blocked, make_planes
+from specshield.lookahead.lattice import blocked_at, make_planes
 from specshield.lookahead.lookahead import prepare
 from specshield.lookahead.surrogate import (
     WANDER,
@@ -23,7 +23,7 @@ from specshield.lookahead.surrogate import (
     step_price,
 )
 from specshield.robot import STRETCH
-from specshield.robot.dynamics import make_body, step, successors
+from specshield.robot.dynamics import make_body, step
 from specshield.rule.progress import make_rules
 from specshield.shield.shaping import log_softmax, restrict
 from specshield.world.occupancy import OccupancyGrid
@@ -113,14 +113,12 @@ def test_exact_steps_and_the_lattice_charge_alike(which):
     """A stand-in's D after each motion, two exact steps before the lattice, on the cells that are exact."""
     body, rules, goals = WORLD.body, make_rules(WORLD.task), make_goals(WORLD.body, WORLD.task.grid)
     lead = WANDER if which is None else range(len(goals.distance))[which]
-    nexts, log_r = np.empty((MOTIONS, 3)), np.empty(MOTIONS)
+    log_r = np.empty(MOTIONS)
     r, e, left = np.full((len(STATES), MOTIONS), 1 / MOTIONS), np.zeros(len(STATES)), np.zeros(len(STATES))
     free = [s for s, (i, j, _) in enumerate(STATES) if not body.occupied[j, i]]
     for s in free:
         pose = WORLD.pose(*STATES[s])
-        successors(body, np.array(pose), nexts)
-        blocked = np.array([is_blocked(body, m, *pose, tuple(after)) for m, after in enumerate(nexts)])
-        e[s] = follow(body, goals, lead, STYLE, *pose, blocked, log_r)
+        e[s] = follow(body, goals, lead, STYLE, *pose, blocked_at(body, *pose), log_r)
         r[s], left[s] = np.exp(log_r), price_left(body, goals, lead, *pose[:2])
     assert np.ptp(left) > 1.0 or lead != len(goals.distance) - 1
     planes, table = solve_cells(r, e, step_price(lead), left)
@@ -234,10 +232,8 @@ def seeks(goal):
     ahead = prepare(TASK)
 
     def speak(t, pose, random):
-        nexts, motions = np.empty((len(TASK.robot.motions), 3)), len(TASK.robot.motions)
-        successors(ahead.body, pose, nexts)
-        blocked = np.array([is_blocked(ahead.body, m, *pose, tuple(after)) for m, after in enumerate(nexts)])
-        log_r, style = np.empty(motions), np.array(SHARP_STYLE)
+        blocked = blocked_at(ahead.body, *pose)
+        log_r, style = np.empty(len(blocked)), np.array(SHARP_STYLE)
         end = follow(ahead.body, ahead.goals, goal, style, *pose, blocked, log_r)
         of = TASK.robot.motion_of
         shares = np.bincount(of[~TASK.robot.terminal])

@@ -154,6 +154,15 @@ def is_blocked(
 
 
 @kernel
+def blocked_at(body: Body, x: float, y: float, theta: float) -> NDArray[np.bool_]:
+    """Which motions an obstacle stops short at a pose, shape (M,)."""
+    blocked = np.empty(motion_count(body), np.bool_)
+    for m in range(len(blocked)):
+        blocked[m] = is_blocked(body, m, x, y, theta, step(body, x, y, theta, m))
+    return blocked
+
+
+@kernel
 def _survey(body: Body, rules: Rules, planes: Planes) -> None:
     """Where poses are free, which motions are, and which predicates hold."""
     headings, cells = planes.valid.shape
@@ -169,9 +178,7 @@ def _survey(body: Body, rules: Rules, planes: Planes) -> None:
                 planes.holds[h, c] |= np.int32(read[planes.goal[g]] > rules.margin) << g
             for k in range(read.shape[0]):
                 planes.keeps[h, c] |= np.int32(read[k] > rules.margin) << k
-            for m in range(planes.free.shape[0]):
-                after = step(body, x, y, theta, m)
-                planes.free[m, h, c] = not is_blocked(body, m, x, y, theta, after)
+            planes.free[:, h, c] = ~blocked_at(body, x, y, theta)
 
 
 @kernel

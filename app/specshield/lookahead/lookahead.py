@@ -1,10 +1,11 @@
-"""Look-ahead shaping: inside S_t, weigh what the model wants by what it will cost the model later.
+"""Look-ahead: inside the feasible set S_t, weigh what the model wants by what it will cost the model later.
 
-Projection lets the model put a visit off until it is forced, step after step. Stand-ins for the model, one
-for each of some places that it may be going to and one that wanders, have each a table of what the rule will
-still cost from every pose, in KL and in steps: D (desirability.py), solved once a task. Weighing by exp(-D),
-D the mean over what the session's logits say that the model is, spreads that over the path. Only the
-preference inside S_t changes: safety rests on S_t alone.
+Projection lets the model put a visit off, step after step, until it is forced. Look-ahead spreads that force
+over the path. It has stand-ins for the model: one for each of some places that the model may be going to, and
+one that wanders. Each has a table of D, what the rule will still cost it from every pose in KL and in steps
+(desirability.py), which is solved once for a task. A session learns which of the stand-ins the model is like
+(belief.py), and each action is weighed by exp(-D), with D the mean over them. Only the preference inside S_t
+changes: the rule is kept because of S_t alone.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from specshield.lookahead.belief import STYLE, Belief
 from specshield.lookahead.desirability import UNKEEPABLE, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import Goals, make_goals
-from specshield.lookahead.lattice import Planes, is_blocked, make_planes
+from specshield.lookahead.lattice import Planes, blocked_at, make_planes
 from specshield.lookahead.surrogate import WANDER, stand_in_for
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
-from specshield.robot.dynamics import Body, make_body, successors
+from specshield.robot.dynamics import Body, make_body
 from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
 from specshield.shield.proposal import Proposer
 from specshield.task import Task
@@ -34,22 +35,23 @@ from specshield.task import Task
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-AHEADS = 8  # tasks kept prepared in a process
-LEAD_GAP = 1.0  # [m] along free space between the places that have a table
-WORK = 200_000_000  # entries solved for a task, at most, where that leaves a few places
-MOST, FEWEST = 64, 8  # places
-REACH = 0.3  # [m] further than the nearest at which a place with a table stands for a goal, less and less
-LEADERS = 16  # tables asked in a decision
-NEGLIGIBLE = 0.02  # a probability, or trust, not worth the work
-WORST = 10.0  # [nats] more than the worst action that has a D, for those that have none
+AHEADS = 8  # tasks that a process keeps prepared
+# Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
+LEAD_GAP = 1.0  # [m] along free space between the places that have a table, where that makes few enough
+WORK = 200_000_000  # entries that are solved for a task, at most, where that leaves FEWEST places
+MOST, FEWEST = 64, 8  # places that have a table
+REACH = 0.3  # [m] further off than the nearest, at which a place stands for a goal 1 / e as much
+LEADERS = 16  # tables that a decision asks
+NEGLIGIBLE = 0.02  # a probability, or trust, that is not worth the work
+WORST = 10.0  # [nats] above the worst action that has a D, for those that have none
 
 
 @dataclass(frozen=True, eq=False)
 class LookAhead:
     """A task as the look-ahead sees it, prepared once.
 
-    leads [B]: the goals that have a table of D and, last, WANDER; shares [G + 1, B]: how far each of them
-    stands for each goal, and for wandering. tables [B, kept, H, rows].
+    leads [B]: the goals that have a table of D and, last, WANDER. shares [G + 1, B]: how much each of them
+    stands for each goal, and for wandering; a row sums to 1. tables [B, kept, H, rows]: codes of D.
     """
 
     task: Task
@@ -81,17 +83,12 @@ class LookAhead:
     ) -> tuple[Belief, Floats]:
         """What is believed after the model's log_prior [A] at x_t, and the log-weights [A]."""
         robot, pose = self.task.robot, history[-1]
-        x, y, theta = (float(v) for v in pose)
-        nexts = np.empty((len(robot.motions), 3))
-        successors(self.body, pose, nexts)
         prior = np.exp(log_prior)
         going_on = prior[~robot.terminal]
         if going_on.sum() <= 0.0:  # the model ends for certain: it says nothing of where it would go
             return belief, np.zeros(len(prior))
-        said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(nexts)) / going_on.sum()
-        blocked = np.array(
-            [is_blocked(self.body, m, x, y, theta, tuple(after)) for m, after in enumerate(nexts)]
-        )
+        said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(robot.motions)) / going_on.sum()
+        blocked = blocked_at(self.body, *pose)
         end = float(prior[robot.terminal].sum())
         belief = beliefs.observe(belief, self.body, self.goals, pose, blocked, said, end)
         if belief.trust < NEGLIGIBLE:
@@ -100,7 +97,7 @@ class LookAhead:
         return belief, np.where(robot.terminal, 0.0, -belief.trust * costs[robot.motion_of])
 
     def _costs(self, belief: Belief, history: Floats, signals: Mapping[str, Floats]) -> Floats:
-        """D after each motion [M], above the least."""
+        """D after each motion above the least of them, [M]: the mean over the likely stand-ins."""
         t = len(history) - 1
         rules = self.rules._replace(signals=self.rules.signals.copy())
         status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
@@ -117,7 +114,7 @@ class LookAhead:
         known = np.all(costs < UNKEEPABLE, axis=0)
         if not known.any():
             return np.zeros(costs.shape[1])
-        # a model twice as sharp costs twice as much to bend, which is most of D
+        # A model twice as sharp costs twice as much to bend, and that is most of D.
         sharp = np.where(self.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
         total = (weights[asked] / weights[asked].sum() * sharp) @ np.where(known, costs, 0.0)
         result: Floats = np.where(known, total - total[known].min(), np.ptp(total[known]) + WORST)

@@ -38,8 +38,9 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
 def named_arrays(
     tensors: Mapping[str, NDArray[Any]], wanted: Mapping[str, tuple[type, int]]
 ) -> list[NDArray[Any]]:
-    """The arrays of these names, {name: (dtype, rank)}, contiguous. Raises PolicyError for one that is
-    missing, or of another dtype or rank.
+    """The arrays of these names, {name: (dtype, rank)}, contiguous and writable.
+
+    Raises PolicyError for one that is missing, or of another dtype or rank.
     """
     for name, (dtype, rank) in wanted.items():
         array = tensors.get(name)
@@ -49,7 +50,7 @@ def named_arrays(
                 got=None if array is None else f"{array.dtype} {list(array.shape)}",
                 expected=f"{dtype.__name__}, rank {rank}",
             )  # fmt: skip
-    return [np.ascontiguousarray(tensors[name]) for name in wanted]
+    return [np.require(tensors[name], requirements=["C", "W"]) for name in wanted]
 
 
 def replace_file(path: Path, content: bytes) -> None:
