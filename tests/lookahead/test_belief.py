@@ -9,7 +9,7 @@ from specshield.lookahead.goals import UNIT
 from specshield.lookahead.surrogate import AHEAD, OTHER, TURN, WANDER_END
 from specshield.robot.dynamics import make_body
 from specshield.world.occupancy import OccupancyGrid
-from tests.lookahead.test_surrogate import NONE, goals_of
+from tests.lookahead.by_hand import goals_of
 from tests.oracles.cells import MOTIONS, ROBOT
 
 SAID = np.array([0.7, 0.1, 0.1, 0.1])  # ahead, left, right, wait
@@ -35,7 +35,7 @@ def observed():
     goals = goals_of((UNIT, 0), (-UNIT, 0))
     begun = beliefs.begin(2, MOTIONS)
     pose = np.array([0.5, 0.5, 0.0])
-    return begun, beliefs.observe(begun, body, goals, pose, NONE, SAID, 0.1)
+    return begun, beliefs.update(begun, body, goals, pose, np.zeros(MOTIONS, bool), SAID, 0.1)
 
 
 def test_before_anything_is_seen(observed):

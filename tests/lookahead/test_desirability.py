@@ -5,7 +5,7 @@ import pytest
 
 from specshield.lookahead.desirability import UNKEEPABLE, desirability, solve
 from specshield.lookahead.surrogate import StandIn
-from tests.lookahead.two_cells import BACK, EAST, GO, STOP, WEST, make_world
+from tests.lookahead.by_hand import BACK, EAST, GO, STOP, WEST, make_world
 
 R = np.array([0.2, 0.3, 0.5])  # of going on, back and stopping
 CLOSE = {"rel": 0.02, "abs": 0.02}  # the codes of a table are 1/32 nat, its exp within 2 %

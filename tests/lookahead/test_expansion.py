@@ -8,8 +8,7 @@ from specshield.lookahead.desirability import UNKEEPABLE, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import UNIT
 from specshield.lookahead.surrogate import AHEAD, OTHER, SEARCH_PRICE, WANDER, WANDER_END, stand_in_for
-from tests.lookahead.test_surrogate import goals_of
-from tests.lookahead.two_cells import BACK, EAST, GO, STOP, WEST, make_world
+from tests.lookahead.by_hand import BACK, EAST, GO, STOP, WEST, goals_of, make_world
 
 OPEN = np.exp([AHEAD, OTHER, OTHER])  # what it says of going on, back and stopping in the western cell
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from specshield.lookahead.lattice import _bits, _slots, blocked_at, is_blocked, pose_at
-from tests.lookahead.two_cells import BACK, EAST, GO, STOP, WEST, make_world, place
+from tests.lookahead.by_hand import BACK, EAST, GO, STOP, WEST, make_world, place
 
 
 def test_the_lattice_knows_where_poses_are_free_and_which_motions():

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from specshield.lookahead.goals import NO_PATH, UNIT, Goals
+from specshield.lookahead.goals import NO_PATH, UNIT
 from specshield.lookahead.surrogate import (
     AHEAD,
     END_CHANCE,
@@ -23,17 +23,11 @@ from specshield.lookahead.surrogate import (
 )
 from specshield.robot.dynamics import make_body
 from specshield.world.occupancy import OccupancyGrid
-from tests.lookahead.two_cells import EAST, make_world, place
+from tests.lookahead.by_hand import EAST, goals_of, make_world, place
 from tests.oracles.cells import FORWARD, LEFT, MOTIONS, RIGHT, ROBOT, WAIT
 
 STYLE = np.array([2.0, 2.0, -2.0, -1.0])
 NONE = np.zeros(MOTIONS, bool)
-
-
-def goals_of(*ways, distance=300):
-    """A goal for each direction (u, v) to go, all [cm] away, on a grid of one cell."""
-    way = np.array(ways, np.int8).reshape(-1, 1, 1, 2)
-    return Goals(1.0, np.full((len(ways), 1, 1), distance, np.uint16), way)
 
 
 @pytest.fixture(scope="module")

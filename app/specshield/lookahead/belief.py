@@ -92,7 +92,7 @@ def begin(goals: int, motions: int) -> Belief:
     return Belief(np.zeros(goals + 1), SURE * np.eye(FEATURES), SURE * STYLE, habit, WARY)
 
 
-def observe(
+def update(
     belief: Belief,
     body: Body,
     goals: Goals,

@@ -117,7 +117,7 @@ def _back(
     """
     cost, least, total = sums
     (headings, cells), edge = ahead.shape, _edge(planes)
-    last, zero, one = cells - edge, np.float32(0.0), np.float32(1.0)
+    last, one = cells - edge, np.float32(1.0)
     least[:] = UNKEEPABLE
     total[:] = 0.0
     for m in range(cost.shape[0]):
@@ -127,8 +127,7 @@ def _back(
         part = np.float32(max(turn - low, 0.0)) if turn - low > 1e-6 else np.float32(0.0)
         g0, g1 = ahead[(h + low) % headings], ahead[(h + low + 1) % headings]
         if move == 0.0:  # between two headings of the same cell
-            here, next_ = g0[edge:last], g1[edge:last]
-            _blend(here, next_, here, next_, one - part, part, zero, zero, cost[m])
+            _mix(g0[edge:last], g1[edge:last], one - part, part, cost[m])
         else:  # between four cells of the nearest heading
             g = g0 if part < 0.5 else g1
             angle = 2.0 * math.pi * h / headings
@@ -146,6 +145,17 @@ def _back(
     for m in range(cost.shape[0]):
         _accumulate(cost[m], least, total)
     _sum_up(least, total, stand_in.ends[h, edge:last], price, out[h, edge:last])
+
+
+@kernel
+def _mix(a: Singles, b: Singles, wa: np.float32, wb: np.float32, out: Singles) -> None:
+    """As `_blend`, of two: it takes two thirds of the time, and most motions turn."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    for c in range(out.shape[0]):
+        va, vb = wa if a[c] < UNKEEPABLE else zero, wb if b[c] < UNKEEPABLE else zero
+        weight = va + vb
+        value = (va * a[c] + vb * b[c]) / max(weight, np.float32(1e-6)) + TIGHT * (one - weight)
+        out[c] = value if weight > np.float32(1e-3) else UNKEEPABLE
 
 
 @kernel

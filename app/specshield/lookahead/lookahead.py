@@ -90,7 +90,7 @@ class LookAhead:
         said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(robot.motions)) / going_on.sum()
         blocked = blocked_at(self.body, *pose)
         end = float(prior[robot.terminal].sum())
-        belief = beliefs.observe(belief, self.body, self.goals, pose, blocked, said, end)
+        belief = beliefs.update(belief, self.body, self.goals, pose, blocked, said, end)
         if belief.trust < NEGLIGIBLE:
             return belief, np.zeros(len(prior))
         costs = self._costs(belief, history, signals)

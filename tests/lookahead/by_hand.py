@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from specshield.lookahead.goals import Goals
 from specshield.lookahead.lattice import make_planes
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body
@@ -36,3 +37,9 @@ def make_world(formula):
 def place(planes, column):
     """Where a plane has a cell: 0 for the western one, 1 for the eastern."""
     return planes.pad * planes.width + planes.pad + column
+
+
+def goals_of(*ways, distance=300):
+    """A goal for each direction (u, v) to go, all [cm] away, on a grid of one cell."""
+    way = np.array(ways, np.int8).reshape(-1, 1, 1, 2)
+    return Goals(1.0, np.full((len(ways), 1, 1), distance, np.uint16), way)
