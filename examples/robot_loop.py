@@ -22,11 +22,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from specshield.client import Session, ShieldClient, Verdict
+from specshield.client import Decision, Session, ShieldClient, Verdict
 from specshield.errors import NotFound, ServerError, StoreError, TransportError
 from specshield.sim.cases import load_case
 from specshield.sim.model import GoalSeeker
-from specshield.sim.robot import SimulatedRobot
+from specshield.sim.robot import Pose, SimulatedRobot
 
 T = TypeVar("T")
 POLICY = "case1"  # the rule: visit a charger within 60 steps, and again between steps 80 and 140
@@ -45,9 +45,9 @@ class Notes:
     """
 
     session: str
-    pose: tuple[float, float, float]
+    pose: Pose
     plan: list[int] = field(default_factory=list)
-    unsent: dict[int, tuple[float, float, float]] = field(default_factory=dict)
+    unsent: dict[int, Pose] = field(default_factory=dict)
     main_task_done: bool = False
 
     def write(self, file: Path) -> None:
@@ -69,12 +69,8 @@ def drive(client: ShieldClient, robot: Any, model: Any, file: Path) -> Verdict:
     while not session.finished:
         pose = robot.pose
         logits = None if session.main_task_done else model.logits(robot)
-        try:
-            decision = session.step(pose, logits)
-        except AWAY:
-            if not notes.plan:  # the plan has been followed to its end, and with it the rule was kept
-                time.sleep(PAUSE)
-                continue
+        decision = ask(session, pose, logits, notes.plan)
+        if decision is None:  # the service is away: the plan keeps the rule, the model's own task waits
             notes.unsent[session.t] = pose
             session.record(pose)  # the service gets this pose with the next step that reaches it
             action, notes.plan = notes.plan[0], notes.plan[1:]
@@ -89,6 +85,21 @@ def drive(client: ShieldClient, robot: Any, model: Any, file: Path) -> Verdict:
     verdict = patiently(lambda: session.close(robot.pose))
     file.unlink()
     return verdict
+
+
+def ask(session: Session, pose: Pose, logits: Any, plan: list[int]) -> Decision | None:
+    """The decision of the next step; None if the service is away and there is a plan to follow meanwhile.
+
+    Without a plan the robot stands and asks again, with the same pose and logits: the service may have
+    decided this step, and only its answer was lost. It gives the same answer to the same question.
+    """
+    while True:
+        try:
+            return session.step(pose, logits)
+        except AWAY:  # noqa: PERF203
+            if plan:
+                return None
+            time.sleep(PAUSE)
 
 
 def begin_or_resume(client: ShieldClient, robot: Any, file: Path) -> tuple[Session, Notes]:

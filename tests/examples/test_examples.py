@@ -44,7 +44,7 @@ def test_a_house_of_ones_own(url: str, tmp_path: Path) -> None:
 
 
 def test_a_loop_that_nothing_disturbs(url: str, tmp_path: Path) -> None:
-    assert run("robot_loop.py", url, tmp_path) == ["the rule is satisfied"]
+    assert run("robot_loop.py", url, tmp_path)[-1] == "the rule is satisfied"
     assert not list(tmp_path.iterdir())  # the notes are gone with the session
 
 
@@ -83,13 +83,13 @@ def test_a_loop_that_goes_on_through_outage_bump_and_restart(tmp_path: Path) -> 
 
         events = {8: server.kill, 12: end_process, 25: push, 35: end_process}
         robot = EventfulRobot(robot_loop.START, events)
-        with ShieldClient(server.url, timeout=1.0) as client, pytest.raises(Restart):
+        with ShieldClient(server.url, timeout=30.0) as client, pytest.raises(Restart):
             robot_loop.drive(client, robot, model, notes)
         stack.enter_context(serving(tmp_path / "data", port=port, ready=False))  # the next loop waits for it
-        with ShieldClient(server.url, timeout=1.0) as client, pytest.raises(Restart):
+        with ShieldClient(server.url, timeout=30.0) as client, pytest.raises(Restart):
             robot_loop.drive(client, robot, model, notes)
         session = robot_loop.Notes.read(notes).session
-        with ShieldClient(server.url, timeout=1.0) as client:
+        with ShieldClient(server.url, timeout=30.0) as client:
             verdict = robot_loop.drive(client, robot, model, notes)
         with ShieldClient(server.url, timeout=10.0) as client:
             states = client.sessions.get(session).trajectory()
@@ -97,7 +97,7 @@ def test_a_loop_that_goes_on_through_outage_bump_and_restart(tmp_path: Path) -> 
     assert not notes.exists()
     assert not events
     undecided = [state.t for state in states if state.decision is None]
-    assert undecided[:4] == [8, 9, 10, 11]  # where the robot followed its plan
+    assert undecided == [8, 9, 10, 11]  # where the robot followed its plan
     pushed = states[25].decision
     assert pushed is not None
     assert pushed["residual"]["translation"] > 0.05
