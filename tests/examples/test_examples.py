@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 
@@ -46,6 +47,34 @@ def test_a_house_of_ones_own(url: str, tmp_path: Path) -> None:
 def test_a_loop_that_nothing_disturbs(url: str, tmp_path: Path) -> None:
     assert run("robot_loop.py", url, tmp_path)[-1] == "the rule is satisfied"
     assert not list(tmp_path.iterdir())  # the notes are gone with the session
+
+
+class LosesAnswers(httpx.HTTPTransport):
+    """The first answers to steps are lost, after the service has decided."""
+
+    def __init__(self, answers: int) -> None:
+        super().__init__()
+        self.answers = answers
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        response = super().handle_request(request)
+        if request.url.path.endswith("/steps") and self.answers > 0:
+            self.answers -= 1
+            response.close()
+            raise httpx.ReadTimeout("lost", request=request)
+        return response
+
+
+def test_a_loop_whose_first_answers_are_lost(url: str, tmp_path: Path) -> None:
+    """More of them than the SDK's own tries: the loop has to ask the very same question again."""
+    case = load_case(robot_loop.POLICY)
+    robot, model = SimulatedRobot(case, robot_loop.START), GoalSeeker(case.task.robot)
+    model.reset(np.random.default_rng(0))
+    lossy = LosesAnswers(7)
+    with ShieldClient(url, timeout=30.0, transport=lossy) as client:
+        verdict = robot_loop.drive(client, robot, model, tmp_path / "notes.json")
+    assert lossy.answers == 0
+    assert verdict.spec_status == "satisfied"
 
 
 class Restart(Exception):
