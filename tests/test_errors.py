@@ -38,10 +38,14 @@ def test_every_type_is_one_stable_word():
 
 def test_an_error_says_what_where_and_what_is_valid():
     error = InputError("not a number", path="radius", got="x", expected="a number", position=3)
-    assert (str(error), error.path, error.got, error.expected) == ("not a number", "radius", "x", "a number")
+    assert (error.path, error.got, error.expected) == ("radius", "x", "a number")
+    assert str(error) == "radius: not a number; got 'x'; expected a number"
     assert error.details == {"position": 3}
     assert error.at("footprint").at("robot") is error
     assert error.path == "robot.footprint.radius"
     assert InputError("lost").at("spec").path == "spec"
-    with pytest.raises(SpecshieldError):
+    with pytest.raises(SpecshieldError, match=r"^robot\.footprint\.radius: not a number"):
         raise error
+    assert str(InputError("t is late", path="t")) == "t is late", "the field is told already"
+    assert str(InputError("the step is late", path="t")) == "t: the step is late"
+    assert len(str(InputError("long", got="x" * 5000))) < 300

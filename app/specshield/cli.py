@@ -21,7 +21,9 @@ try:
 except ImportError:  # the base install is the client
     typer = None  # type: ignore[assignment]
 
-NEEDS_SERVER = "This command needs the server's parts: pip install 'specshield[server]'"
+NEEDS_SERVER = """\
+This command needs the server's parts: pip install 'specshield[server]'
+What is installed here is the client, for Python: from specshield.client import ShieldClient"""
 
 NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
 
@@ -50,7 +52,7 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
             app.command()(command)
         app()
     except SpecshieldError as error:
-        sys.exit(f"{error}; expected {error.expected}" if error.expected else str(error))
+        sys.exit(str(error))
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
         if missing == "torch":

@@ -36,12 +36,18 @@ SpecshieldError
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
+SHOWN = 200  # characters of a value that was got, as `str` of an error shows it
+
 
 class SpecshieldError(Exception):
-    """Base of the tree. `path` names the field at fault, `got` what it held, `expected` what is valid."""
+    """Base of the tree. `path` names the field at fault, `got` what it held, `expected` what is valid.
+
+    `str` tells all of them: "footprint.radius: not a number in range; got -1; expected above 0".
+    """
 
     type: ClassVar[str] = "error"
 
@@ -60,6 +66,14 @@ class SpecshieldError(Exception):
         self.got = got
         self.expected = expected
         self.details: dict[str, Any] = details
+
+    def __str__(self) -> str:
+        told = re.search(rf"(?<![\w.]){re.escape(self.path or '')}(?![\w.]*\w)", self.message)
+        where = f"{self.path}: " if self.path and not told else ""
+        shown = "" if self.got is None else repr(self.got)
+        got = f"; got {shown if len(shown) <= SHOWN else shown[:SHOWN] + '…'}" if shown else ""
+        expected = f"; expected {self.expected}" if self.expected else ""
+        return f"{where}{self.message}{got}{expected}"
 
     def at(self, path: str) -> SpecshieldError:
         """The same error, its path put below `path`: 'formula' at 'spec' is 'spec.formula'."""

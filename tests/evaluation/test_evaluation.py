@@ -137,7 +137,7 @@ def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_pat
             try:
                 return evaluate(asked, 1, ["unmodified"], out)
             except InputError as error:
-                return str(error), error.expected
+                return error.message, error.expected
             finally:
                 experiment._setting.cache_clear()
 

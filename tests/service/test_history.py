@@ -29,7 +29,7 @@ def test_a_gap_names_the_first_missing_step():
 
 
 def test_too_many_poses():
-    with pytest.raises(PoseError, match="more than there have been"):
+    with pytest.raises(PoseError, match="poses cannot end at step"):
         join(TRAJECTORY[:3], 1, TRAJECTORY[:3])
 
 

@@ -146,7 +146,8 @@ def build(cls: type[T], body: Mapping[str, Any], **more: Any) -> T:
         return cls(**{name: _tuples(value) for name, value in body.items() if name in known}, **more)
     except (AttributeError, TypeError) as error:
         raise ServerError(
-            f"not a {cls.__name__.lower()} as this client knows it: {error}", got=body
+            f"the server answered a {cls.__name__.lower()} that this client does not understand: {error}",
+            got=body,
         ) from error
 
 

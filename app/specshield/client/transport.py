@@ -21,7 +21,7 @@ def address(base_url: str) -> httpx.URL:
         url = httpx.URL("")
     if url.scheme not in ("http", "https") or not url.host:
         raise InputError(
-            "not the address of a server",
+            "this is not the address of a server",
             path="base_url",
             got=base_url,
             expected="http://host:port or https://host:port",
@@ -33,7 +33,9 @@ def headers(api_key: str | None) -> dict[str, str]:
     """InputError for a key that no header can carry."""
     if api_key is not None and not re.fullmatch(r"[!-~]([ -~]*[!-~])?", api_key):
         raise InputError(
-            "the key cannot be sent", path="api_key", expected="ASCII without control characters"
+            "the API key cannot be sent in a header",
+            path="api_key",
+            expected="ASCII without control characters",
         )
     return {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
 
@@ -58,7 +60,7 @@ def arguments(request: Request, timeout: float) -> dict[str, Any]:
 
 def check_open(http: httpx.Client | httpx.AsyncClient) -> None:
     if http.is_closed:
-        raise TransportError("the client is closed", expected="a client that is not")
+        raise TransportError("the client is closed", expected="a client that is still open")
 
 
 def reply(response: httpx.Response, seconds: float, timeout: float) -> Reply:
@@ -75,6 +77,9 @@ def failure(
     if isinstance(error, httpx.TimeoutException):
         mapped = TransportTimeout(f"no answer within {timeout:g} s: {what}")
     else:
-        mapped = TransportError(f"{str(error) or type(error).__name__}: {what}")
+        mapped = TransportError(
+            f"the server cannot be reached: {str(error) or type(error).__name__}: {what}",
+            expected="a specshield server that runs at this address",
+        )
     mapped.__cause__ = error
     return Failure(mapped, seconds, timeout)

@@ -86,7 +86,12 @@ def path(*segments: str) -> str:
     """InputError for an id that would lead elsewhere: an empty one, `.` or `..`."""
     for segment in segments:
         if not isinstance(segment, str) or segment in ("", ".", ".."):
-            raise InputError("not an id", path="id", got=segment, expected="an id as the server gives them")
+            raise InputError(
+                "this cannot be an id or a name",
+                path="id",
+                got=segment,
+                expected="an id or a name that the server gave",
+            )
     return "/v1/" + "/".join(quote(segment, safe="", errors="replace") for segment in segments)
 
 
@@ -128,7 +133,10 @@ def content(source: Content, where: str) -> bytes:
             return Path(source).read_bytes()
         except OSError as error:
             raise InputError(
-                f"{where}: {error}", path=where, got=str(source), expected="a file that can be read"
+                f"{where} cannot be read: {error.strerror}",
+                path=where,
+                got=str(source),
+                expected="a file that can be read",
             ) from error
     return source.encode() if isinstance(source, str) else source
 

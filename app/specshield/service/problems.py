@@ -100,7 +100,9 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
         return InputError(f"{what} is not JSON: {reason}", path=below or None, expected="a JSON object")
     if isinstance(body, bytes):  # not read at all
         return InputError(
-            "the body was not taken for JSON", path="Content-Type", expected="Content-Type: application/json"
+            "the body is not declared as JSON",
+            path="Content-Type",
+            expected="the header Content-Type: application/json",
         )
     listed = [
         {
@@ -113,17 +115,21 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
     first = listed[0]
     parts = re.split(r"[.\[]", first["path"])
     kind = next((FIELD_ERRORS[part] for part in parts if part in FIELD_ERRORS), InputError)
-    message = f"{first['path'] or 'the body'}: {first['expected']}"
+    wrong = {"missing": "is missing", "extra_forbidden": "is not a field of this request"}
+    message = f"{first['path'] or 'the body'} {wrong.get(found[0]['type'], 'is not valid')}"
     return kind(message, path=first["path"], got=first["got"], expected=first["expected"], errors=listed)
 
 
 def _expected(item: Mapping[str, Any]) -> str:
-    said, context = str(item["msg"]).removeprefix("Value error, "), item.get("ctx", {})
-    if item["type"].startswith("union_tag"):
-        return (
-            f"one of {context['expected_tags']}" if "expected_tags" in context else "this field is required"
-        )
-    return {"extra_forbidden": "no such field", "missing": "this field is required"}.get(item["type"], said)
+    said, context = str(item["msg"]), item.get("ctx", {})
+    if item["type"].startswith("union_tag") and "expected_tags" in context:
+        return f"one of {context['expected_tags']}"
+    told = {
+        "extra_forbidden": "the fields that /docs lists",
+        "missing": "a value: this field is required",
+        "union_tag_not_found": "a value: this field is required",
+    }
+    return told.get(item["type"], said.removeprefix("Value error, ").removeprefix("Input should be "))
 
 
 def _path(item: Mapping[str, Any], body: Any) -> str:
@@ -185,11 +191,11 @@ def install(app: FastAPI) -> None:
             )
         if error.status_code == 405:
             allowed = _allowed(request)
-            message = f"{request.method} is not for {path}"
+            message = f"{path} does not take {request.method}"
             return response(
                 errors.MethodNotAllowed(message, got=request.method, expected=allowed), {"Allow": allowed}
             )
-        return response(InputError(str(error.detail), expected="a body as /docs has it"))
+        return response(InputError(str(error.detail), expected="a request in the form that /docs describes"))
 
     async def unknown(request: Request, error: Exception) -> Response:
         # The traceback goes to the log: starlette raises the error again after this answer.

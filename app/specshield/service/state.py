@@ -50,6 +50,6 @@ def problems(**said: str) -> dict[int | str, dict[str, Any]]:
 
 
 def problem_documents(**said: str) -> dict[int | str, dict[str, Any]]:
-    """Those alone that are said."""
+    """The problem documents of the statuses that are named, with what is said of each."""
     content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {int(status[1:]): {"description": text, "content": content} for status, text in said.items()}

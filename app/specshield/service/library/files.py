@@ -32,7 +32,7 @@ def check_writable(folder: Path, name: str) -> None:
             pass
     except OSError as error:
         raise InputError(
-            f"{name} cannot be used: {folder}: {error.strerror}",
+            f"{name} cannot be used: {error.strerror}",
             path=name,
             got=str(folder),
             expected="a folder to write to",
@@ -82,7 +82,8 @@ def check_room(folder: Path, limit: int, what: str) -> None:
     """Raises LimitReached where `folder` holds `limit` of them."""
     if len(ids(folder)) >= limit:
         raise LimitReached(
-            f"the server keeps no more than {limit} {what}", got=limit + 1, expected=f"at most {limit}"
+            f"the server keeps no more than {limit} {what}",
+            expected=f"room for one more: its operator can raise SPECSHIELD_MAX_{what.upper()}",
         )
 
 

@@ -28,7 +28,7 @@ log = logging.getLogger("specshield")
 
 @dataclass(frozen=True)
 class Description:
-    """What a policy is of: enough to make its task and to train it. All of it JSON."""
+    """What a policy is for and how it is made: enough to make its task and to train it. All of it is JSON."""
 
     map_id: str
     robot: str | dict[str, Any]
@@ -104,7 +104,10 @@ class Policies:
     def _load(self, record: Record) -> Proposer:
         if record.card is None:
             raise PolicyError(
-                f"policy {record.id} is not ready", path="policy_id", got=record.id, expected="status ready"
+                f"policy {record.id} is not ready",
+                path="policy_id",
+                got=record.id,
+                expected="a policy whose status is `ready`",
             )
         folder = self._models / record.name if record.name else self._folder / record.id
         return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
@@ -185,7 +188,7 @@ class Policies:
 
 @contextmanager
 def _left_out(folder: Path) -> Iterator[None]:
-    """A policy that cannot be had is said to be, and keeps no server from starting."""
+    """Logs why a policy cannot be loaded, and goes on: one broken folder must not stop the whole server."""
     try:
         yield
     except (SpecshieldError, KeyError, ValueError) as error:

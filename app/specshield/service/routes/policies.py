@@ -169,7 +169,7 @@ async def read(policy_id: PolicyId, server: ServerState) -> Any:
     summary="Cancel or remove a policy",
     responses=problems(
         _404="No such policy.",
-        _409="`in-use`: a session still asks it, or it came with the server.",
+        _409="`in-use`: a session still uses it, or it came with the server.",
         _503="The store is away.",
     ),
 )
@@ -178,10 +178,10 @@ async def delete(policy_id: PolicyId, server: ServerState) -> Response:
     record = await asyncio.to_thread(server.policies.record, policy_id)
     if record.name is not None:
         raise InUse(
-            f"policy {record.name!r} came with the server",
+            f"policy {record.name!r} came with the server and cannot be deleted",
             path="policy_id",
             got=policy_id,
-            expected="one that was sent",
+            expected="a policy that was made or sent here",
         )
     training = await asyncio.to_thread(_training, server, record)
     if training.status in ("queued", "training"):
@@ -189,9 +189,13 @@ async def delete(policy_id: PolicyId, server: ServerState) -> Response:
         return Response(status_code=204)
     session = await server.sessions.using(record.id)
     if session is not None:
-        message = f"session {session!r} still asks this policy"
+        message = f"session {session!r} still uses this policy"
         raise InUse(
-            message, path="policy_id", got=policy_id, expected="a policy without sessions", session_id=session
+            message,
+            path="policy_id",
+            got=policy_id,
+            expected="a policy that no session uses: close the session first",
+            session_id=session,
         )
     await asyncio.to_thread(server.policies.delete, record)
     await asyncio.to_thread(server.jobs.forget, record.id)

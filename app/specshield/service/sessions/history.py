@@ -25,7 +25,7 @@ def join(stored: Poses, t: int, poses: Poses) -> Poses:
     first = t - len(poses) + 1
     if first < 0:
         raise PoseError(
-            f"{len(poses)} poses end at step {t}: more than there have been",
+            f"{len(poses)} poses cannot end at step {t}: a trajectory has {t + 1} poses up to there",
             path="poses",
             got=len(poses),
             expected=f"1 to {t + 1} poses, the last of them x_{t}",

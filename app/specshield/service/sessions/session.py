@@ -103,14 +103,19 @@ def check_step(session: Session, request: StepRequest) -> None:
         )
     if t < state.next_t:
         raise StepConflict(
-            f"the session is past step {t}, which was not decided",
+            f"step {t} was passed over and can no longer be decided",
             path="t",
             got=t,
             expected=f"{state.next_t} or later",
             expected_t=state.next_t,
         )
     if state.main_task_done and not request.main_task_done:
-        raise StepConflict("the main task was over before", path="main_task_done", got=False, expected="true")
+        raise StepConflict(
+            "an earlier step said that the main task is done, which cannot be taken back",
+            path="main_task_done",
+            got=False,
+            expected="true",
+        )
 
 
 def replay(session: Session, request: StepRequest, digest: bytes) -> bytes:
@@ -169,7 +174,7 @@ def pack(rows: Floats) -> bytes:
 
 def over(session: Session, t: int) -> SessionFinished:
     return SessionFinished(
-        f"session {session.id!r} is over",
+        f"session {session.id!r} is over: no further step is decided",
         path="t",
         got=t,
         expected="a step already decided, to read it again",

@@ -81,11 +81,11 @@ class Jobs:
         state = {name.decode(): value.decode() for name, value in found.items()}
         status, error = state.get("status", "failed"), state.get("error") or None
         if status == "failed" and not state:
-            error = "nothing is known of its training; ask for it again"
+            error = "the store knows nothing of its training any more; ask for it again"
         if status == "training" and not alive:
             status, error = (
                 "failed",
-                "its worker is gone; ask for it again and it goes on from its checkpoint",
+                "its worker is gone; ask for it again, and the training goes on from its last checkpoint",
             )
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
@@ -101,17 +101,17 @@ class Jobs:
     # --- for the run itself
 
     def report(self, id: str, attempt: str, **fields: Any) -> bool:
-        """Of no effect, and False, where another attempt, or nobody, is to go on."""
+        """Notes how the run stands. False, with nothing noted, once it was cancelled or asked for again."""
         pairs = [part for pair in fields.items() for part in pair]
         return bool(self._try(lambda: self._write(keys=[_key(id)], args=[attempt, *pairs])))
 
     def sign_of_life(self, id: str, attempt: str) -> bool:
-        """Of a run. False where another attempt, or nobody, is to go on."""
+        """Says that the run is alive. False once it was cancelled or asked for again."""
         self._try(lambda: self.redis.set(_alive(id), 1, ex=SIGN_OF_LIFE))
         return bool(self._try(lambda: self.redis.hget(_key(id), "attempt")) == attempt.encode())
 
     def worker_lives(self, methods: Sequence[str]) -> None:
-        """The sign of life of a worker for these methods."""
+        """Says that a worker for these methods is alive."""
 
         def live() -> None:
             for method in methods:
@@ -127,7 +127,7 @@ class Jobs:
 
 
 def queue_of(method: str) -> str:
-    """Of rq: one a method, since not every worker can do them all."""
+    """The name of rq's queue for a method: each has its own, since not every worker can make them all."""
     return f"specshield-{method}"
 
 

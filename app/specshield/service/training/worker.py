@@ -78,7 +78,8 @@ class _Worker(Worker):
     def request_stop(self, signum: int, frame: Any) -> None:
         if self._running is not None:
             self._fail(
-                self._running, "the worker was stopped; ask for it again and it goes on from its checkpoint"
+                self._running,
+                "its worker was stopped; ask for it again, and it goes on from its last checkpoint",
             )
             self.kill_horse()
         raise SystemExit(0)
@@ -92,7 +93,8 @@ class _Worker(Worker):
         if status and os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
         self._fail(
-            job, f"the training process ended {how}; ask for it again and it goes on from its checkpoint"
+            job,
+            f"the training process ended {how}; ask for it again, and it goes on from its last checkpoint",
         )
 
     def _fail(self, job: Job, reason: str) -> None:
@@ -122,13 +124,14 @@ def train(id: str, attempt: str) -> None:
             _train(settings, jobs, id, attempt, cancelled)
             done: dict[str, Any] = {"status": "ready", "progress": 1, "eta_s": 0}
         except SpecshieldError as error:
-            done = {"status": "failed", "error": error.message, "eta_s": ""}
+            done = {"status": "failed", "error": str(error), "eta_s": ""}
         except Exception as error:
             if cancelled.is_set():
                 return
             log.exception("training of %s", id)
-            name = type(error).__name__  # what it says may be of the inside: paths, lines of code
-            done = {"status": "failed", "error": f"{name}; the worker's log says more", "eta_s": ""}
+            name = type(error).__name__  # its text may tell of the inside: paths, lines of code
+            said = f"an unexpected {name}; the worker's log says more"
+            done = {"status": "failed", "error": said, "eta_s": ""}
         jobs.report(id, attempt, **done)  # of no effect once cancelled
 
 
