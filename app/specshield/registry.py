@@ -27,12 +27,15 @@ log = logging.getLogger("specshield")
 class Registry(Generic[E]):
     """Entries of one type by name.
 
-    word: what one entry is called, and the field of a request that names it. group: of the entry points that
-    add to it. built_in: where each of the project's own is, as "module:attribute".
+    word: what one entry is called. group: of the entry points that add to it. built_in: where each of the
+    project's own is, as "module:attribute". field: of a request that names an entry; by default the word.
     """
 
-    def __init__(self, word: str, cls: type[E], group: str, built_in: Mapping[str, str]) -> None:
+    def __init__(
+        self, word: str, cls: type[E], group: str, built_in: Mapping[str, str], field: str | None = None
+    ) -> None:
         self.word, self._cls, self._group, self._built_in = word, cls, group, built_in
+        self._field = field or word
         self._loaded: dict[str, E] = {}
 
     @cached_property
@@ -56,7 +59,10 @@ class Registry(Generic[E]):
         """
         if name not in self._points:
             raise InputError(
-                f"unknown {self.word}", path=self.word, got=name, expected=f"one of {', '.join(self.names())}"
+                f"unknown {self.word}",
+                path=self._field,
+                got=name,
+                expected=f"one of {', '.join(self.names())}",
             )
         if name not in self._loaded:
             self._loaded[name] = self._load(self._points[name])
@@ -78,7 +84,7 @@ class Registry(Generic[E]):
             log.exception("%s cannot be loaded", what)
             raise Unsupported(
                 f"{what} cannot be loaded: {type(error).__name__}; the log says more",
-                path=self.word,
+                path=self._field,
                 got=point.name,
                 expected=f"a {self.word} whose package is whole",
             ) from error

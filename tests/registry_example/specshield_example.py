@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
-from specshield.lookahead.preferences import PreferenceKind
-from specshield.shield.proposal import Proposal
 
 from specshield.errors import MapError, PolicyError
+from specshield.lookahead.preferences import PreferenceKind
 from specshield.policy.card import Card, make_card
 from specshield.policy.methods import Method, Run
 from specshield.policy.options import option, options_to_json
 from specshield.policy.tensors import read_tensors
+from specshield.shield.proposal import Proposal
 from specshield.task import Task
 from specshield.world.formats import MapFormat
 from specshield.world.occupancy import OccupancyGrid

@@ -25,6 +25,7 @@ from specshield.lookahead.desirability import UNKEEPABLE, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import Goals, make_goals
 from specshield.lookahead.lattice import Planes, blocked_at, make_planes
+from specshield.lookahead.preferences import PreferenceKind
 from specshield.lookahead.surrogate import WANDER, stand_in_for
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body
@@ -149,6 +150,12 @@ def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     for table, lead in zip(tables, leads, strict=True):
         table[:] = solve(body, planes, stand_in_for(body, goals, planes, int(lead), STYLE))
     return LookAhead(task, body, rules, goals, planes, leads, block_diag(shares, 1.0), tables)
+
+
+PREFERENCE = PreferenceKind(
+    "Spreads what the rule will cost the model over the whole path; for the formulas `reachability` takes.",
+    prepare,
+)
 
 
 def _leads(goals: Goals, most: int) -> tuple[Integers, Floats]:

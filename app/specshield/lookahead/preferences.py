@@ -1,28 +1,60 @@
-"""The preferences that a session can name in `shaping`, beside "projection", which is none."""
+"""The preferences that a session can name in `shaping`, beside "projection", which is none.
+
+To add one: a file that defines a `PreferenceKind`, and a line below (or an entry point of the group
+`specshield.preferences` in a package of its own).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from specshield.lookahead.lookahead import prepare as look_ahead
+from specshield.errors import InputError
+from specshield.registry import Registry
 from specshield.shield.preference import Preference
 from specshield.shield.proposal import Proposer
 from specshield.task import Task
 
 PROJECTION = "projection"
-PREFERENCES: dict[str, Callable[[Task, Sequence[Proposer]], Preference]] = {"lookahead": look_ahead}
+
+
+@dataclass(frozen=True)
+class PreferenceKind:
+    """A kind of preference.
+
+    about: one sentence. prepare(task, proposers): the preference for a task whose policies are `proposers`;
+    it may take seconds, and raises FragmentError or Unsupported for a task that it does not cover.
+    """
+
+    about: str
+    prepare: Callable[[Task, Sequence[Proposer]], Preference]
+
+
+PREFERENCES = Registry(
+    "preference",
+    PreferenceKind,
+    "specshield.preferences",
+    {"lookahead": "specshield.lookahead.lookahead:PREFERENCE"},
+    field="shaping",
+)
+
+
+def check_shaping(name: str) -> None:
+    """Raises InputError for a name that is neither "projection" nor a preference's."""
+    names = [PROJECTION, *PREFERENCES.names()]
+    if name not in names:
+        raise InputError("unknown shaping", path="shaping", got=name, expected=f"one of {', '.join(names)}")
 
 
 def prepare(name: str, task: Task, proposers: Sequence[Proposer], pose: Sequence[float]) -> Preference:
     """The preference of that name for a task, ready for its first step: its kernels are compiled.
 
-    pose: any pose (x, y, theta) of the robot's. Raises what the preference raises for a task that it does not
-    cover, such as FragmentError or Unsupported.
+    pose: any pose (x, y, theta) of the robot's. Raises what `PreferenceKind.prepare` raises.
     """
-    preference = PREFERENCES[name](task, proposers)
+    preference = PREFERENCES.get(name).prepare(task, proposers)
     actions = len(task.robot.actions)
     signals = {signal: np.array([value]) for signal, value in task.signals.items()}
     even = np.full(actions, -math.log(actions))

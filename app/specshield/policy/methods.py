@@ -1,5 +1,7 @@
-"""The ways to make a policy, by name. To add one: a file that defines a `Method`, and a line below (or an
-entry point of the group `specshield.methods` in a package of its own).
+"""The ways to make a policy, by name.
+
+To add one: a file that defines a `Method`, and a line below (or an entry point of the group
+`specshield.methods` in a package of its own).
 """
 
 from __future__ import annotations

@@ -1,5 +1,7 @@
-"""The forms in which a map can be sent, by name. To add one: a file that defines a `MapFormat`, and a line
-below (or an entry point of the group `specshield.map_formats` in a package of its own).
+"""The forms in which a map can be sent, by name.
+
+To add one: a file that defines a `MapFormat`, and a line below (or an entry point of the group
+`specshield.map_formats` in a package of its own).
 """
 
 from __future__ import annotations

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 
+from specshield.lookahead.preferences import PREFERENCES, PROJECTION
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Id, Pose, SpecStatus, Strict
+from specshield.service.schemas.base import Answer, Id, Name, Pose, SpecStatus, Strict
+
+
+def _describe_shaping(schema: dict[str, Any]) -> None:
+    """The preferences that are installed where the description is made."""
+    schema["enum"] = [PROJECTION, *PREFERENCES.names()]
+    told = [f"`{name}`: {kind.about}" for name, kind in PREFERENCES.usable()]
+    none = f"`{PROJECTION}`: the closest distribution that keeps the rule."
+    schema["description"] = " ".join(["What the answer prefers within the rule.", none, *told])
 
 
 class SessionRequest(Strict):
@@ -45,10 +54,7 @@ class SessionRequest(Strict):
         "the rule may keep some probability; where no action reaches the threshold, as often with 1 m, the "
         "answer is a `fallback`: choose one that fits the rule.",
     )
-    shaping: Literal["projection", "lookahead"] = Field(
-        "projection",
-        description="How the prior is bent. `lookahead` is for formulas that `reachability` takes.",
-    )
+    shaping: Name = Field(PROJECTION, json_schema_extra=_describe_shaping)
     max_steps: int | None = Field(
         None, ge=1, description="The session ends there [steps]. Default: max(600, T + 1)."
     )
@@ -78,7 +84,7 @@ class SessionResponse(Answer):
     margin: float = Field(description="Robustness kept in hand [the unit of the formula, m].")
     slack: int = Field(description="Steps kept in hand.")
     evaluation: str = Field(description="`feasibility` or `robustness`.")
-    shaping: str = Field(description="`projection` or `lookahead`.")
+    shaping: str = Field(description="`projection`, or the name of a preference.")
     max_steps: int = Field(description="The last step there can be.")
     next_t: int = Field(description="The step expected next.")
     feasible: bool = Field(description="Whether some action from x_0 had a satisfying future.")

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from specshield.errors import InputError, SessionFinished, StepConflict
 from specshield.service.library import files
-from specshield.service.schemas import StepRequest
+from specshield.service.schemas.steps import StepRequest
 from specshield.service.sessions import history
 from specshield.service.storage.store import Record
 from specshield.shield.decision import Decision

@@ -18,12 +18,13 @@ import numpy as np
 
 from specshield.errors import Conflict, FragmentError, InfeasibleStart, InputError, LimitReached, NotFound
 from specshield.lookahead.lookahead import AHEADS
-from specshield.lookahead.preferences import PROJECTION, prepare
+from specshield.lookahead.preferences import PROJECTION, check_shaping, prepare
 from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
-from specshield.service.schemas import CloseRequest, SessionRequest, StepRequest
+from specshield.service.schemas.sessions import SessionRequest
+from specshield.service.schemas.steps import CloseRequest, StepRequest
 from specshield.service.sessions.session import (
     Floats,
     Session,
@@ -77,6 +78,7 @@ class Sessions:
         if (request.max_steps or 0) > self._settings.max_steps:
             expected = f"at most {self._settings.max_steps}"
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
+        check_shaping(request.shaping)
         config = Config(**{name: getattr(request, name) for name in CONFIG})
         if request.shaping != PROJECTION:
             check_preferring(config)
