@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -11,7 +12,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from specshield.errors import SpecshieldError
+from specshield.errors import InputError, SpecshieldError
 
 if TYPE_CHECKING:
     from specshield.service.settings import Settings
@@ -80,6 +81,7 @@ def serve(
     from specshield.service.storage.embedded import EmbeddedStore
 
     settings = _settings()  # what is wrong with them is said here, in one line
+    _check_address(host, port)
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
     if embedded is not None:
         embedded.join()  # and so is why it does not start
@@ -147,6 +149,17 @@ def train(
     from specshield.sim import training
 
     raise typer.Exit(training.train(case, method, seed, updates, option or [], out, resume))
+
+
+def _check_address(host: str, port: int) -> None:
+    """Raises InputError where no server can listen there."""
+    try:
+        socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError as error:
+        raise InputError(
+            f"the server cannot listen on {host} at port {port}: {error.strerror}",
+            expected="an address of this machine and a free port; --port 0 takes any that is free",
+        ) from None
 
 
 def _settings() -> Settings:

@@ -6,7 +6,6 @@ import json
 import socket
 import subprocess
 import sys
-import time
 
 import httpx
 import pytest
@@ -101,10 +100,9 @@ def test_a_lasting_failure_is_a_transport_error_with_its_cause(use, fault, cls):
 def test_a_server_that_never_answers_costs_a_bounded_time(use):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
-        start = time.monotonic()
-        with pytest.raises(errors.TransportTimeout):
+        with pytest.raises(errors.TransportTimeout) as caught:
             use(url, validate, timeout=0.1)
-        assert time.monotonic() - start < 1.0
+        assert 1 <= caught.value.details["tries"] <= 5
 
 
 def test_a_closed_port_is_a_transport_error(use):

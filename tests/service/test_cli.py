@@ -1,6 +1,7 @@
 """The command without its parts, and with settings that cannot be."""
 
 import os
+import socket
 import subprocess
 import sys
 
@@ -113,3 +114,19 @@ def test_why_the_store_does_not_start_is_said_in_one_line(tmp_path, more):
     (line,) = run.stderr.splitlines()
     assert line.startswith("the embedded store does not start: Invalid AOF manifest file format; see ")
     assert line.endswith("store.log")
+
+
+def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        run = subprocess.run(
+            [sys.executable, "-m", "specshield.cli", "serve", "--port", port],
+            env={**os.environ, "SPECSHIELD_DATA_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+    assert run.returncode == 1
+    (line,) = run.stderr.splitlines()
+    assert line.startswith(f"the server cannot listen on 127.0.0.1 at port {port}: Address already in use")
+    assert "--port 0" in line

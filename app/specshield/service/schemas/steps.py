@@ -46,10 +46,11 @@ class Residual(Answer):
 class StepResponse(Answer):
     t: int = Field(description="The step that was decided.")
     mode: Literal["prior", "shaped", "completion", "fallback", "violated"] = Field(
-        description="How `distribution` came about. `prior`: it is the model's own, since the rule is settled. "
-        "`shaped`: it is the closest to the model's that keeps the rule. `completion`: the main task is over, "
-        "and the certified continuation goes on. `fallback`: nothing that the model gives any probability "
-        "keeps the rule; `reason` says more. `violated`: the rule is broken, and what is left of it is kept."
+        description="How `distribution` came about. `prior`: it is the model's own; the rule is settled. "
+        "`shaped`: it is the closest to the model's that keeps the rule. `completion`: the main task is "
+        "over, and the certified continuation goes on. `fallback`: nothing that the model gives any "
+        "probability keeps the rule; `reason` says more. `violated`: the rule is broken, and what is left "
+        "of it is kept."
     )
     distribution: list[float] = Field(description="pi*: the probability of each action.")
     j_values: list[float | None] = Field(description="J of each action; null where it was not evaluated.")

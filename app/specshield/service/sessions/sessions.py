@@ -269,7 +269,8 @@ class Sessions:
                 break
         if await self._store.count() >= limit:
             raise LimitReached(
-                f"the server keeps no more than {limit} sessions", expected="delete some, or wait"
+                f"the server keeps no more than {limit} sessions",
+                expected="room for one more: delete a session, or wait until one expires",
             )
 
     def _shield(self, policy_ids: Sequence[str], config: Config) -> Shield:
@@ -340,4 +341,6 @@ def _missing(id: str) -> NotFound:
 
 
 def _contended(id: str) -> Conflict:
-    return Conflict(f"others keep writing to session {id!r}", path="id", got=id, expected="one writer")
+    return Conflict(
+        f"several callers write to session {id!r} at once", path="id", got=id, expected="one caller a session"
+    )
