@@ -1,4 +1,4 @@
-"""A task: the world, the robot and the rule it has to keep. Immutable, named by the hash of its content."""
+"""A task: the world, the robot and the rule that it has to keep. Immutable, named by its content's hash."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Region, region_from_json, region_to_json, signed_distance
 
 POSE_NAMES = ("x", "y", "theta")
-MAX_REGIONS = 256
-MAX_HORIZON = 1000
-MAX_NAME = 64
-LARGEST = 1e100  # a signal's value, so that arithmetic on it stays finite
+MAX_REGIONS = 256  # of one spec
+MAX_HORIZON = 1000  # [steps] unless the caller sets another limit
+MAX_NAME = 64  # characters
+LARGEST = 1e100  # magnitude of a signal's value, so that arithmetic on it stays finite
 SIGNAL = f"a number from {-LARGEST:g} to {LARGEST:g}"
 
 
@@ -30,8 +30,7 @@ SIGNAL = f"a number from {-LARGEST:g} to {LARGEST:g}"
 class Task:
     """regions: those that the formula names, the spec's own and the map's rooms.
 
-    signals: the names of other signals the formula may use, with the value each holds before its first
-    sample.
+    signals: the other signals that the formula uses, with the value that each holds before its first sample.
     """
 
     grid: OccupancyGrid
@@ -59,10 +58,10 @@ class Task:
     def samples(
         self, poses: ArrayLike, signals: Mapping[str, NDArray[np.float64]] | None = None
     ) -> dict[str, NDArray[np.float64]]:
-        """The signals of a trajectory, for `stl.robustness`.
+        """What the formula reads along a trajectory, {name: [..., N]}, for `stl.robustness`.
 
-        poses [..., N, 3] in metres and radians; signals {name: [n]} with n <= N, their last value held to N
-        (J is conditional on that), the initial value where none was sent. Result {name: [..., N]}.
+        poses [..., N, 3] in metres and radians. signals {name: [n]} with n <= N: the last value is held to N
+        (J is conditional on that), and the initial value where none was sent.
         """
         array = np.asarray(poses, dtype=np.float64)
         result: dict[str, NDArray[np.float64]] = {}
@@ -78,7 +77,7 @@ class Task:
     def signal(
         self, name: str, signals: Mapping[str, NDArray[np.float64]] | None, n: int
     ) -> NDArray[np.float64]:
-        """A signal's first n samples, shape (n,), its last value held where fewer were sent."""
+        """A signal's first n samples, shape (n,). Where fewer were sent, the last value is held."""
         sent = np.asarray((signals or {}).get(name, ()), dtype=np.float64)
         held = np.full(n, sent[-1] if len(sent) else self.signals[name])
         held[: len(sent)] = sent
@@ -119,7 +118,7 @@ def make_task(
     tree = parse(formula, names=[*known, *POSE_NAMES, *initial], max_horizon=max_horizon)
     if tree.horizon < 1:
         raise FormulaError(
-            "the formula looks at no step after the first",
+            "the formula says nothing of any step after the first",
             path="formula",
             got=formula,
             expected="a horizon of at least 1",
@@ -151,7 +150,7 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
             )
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not -LARGEST <= value <= LARGEST:
             raise SampleError(
-                "a signal's initial value is a number",
+                "a signal's initial value has to be a number in range",
                 path=f"signals.{name}",
                 got=value,
                 expected=SIGNAL,

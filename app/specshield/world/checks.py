@@ -1,4 +1,4 @@
-"""Numbers and objects of a request, checked: a wrong one raises MapError with path, value and range."""
+"""Checks of the parts of a request. Each raises MapError with the path, the value and what is valid."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from specshield.errors import MapError
 
-LIMIT = 1e8  # metres: beyond any map, and its square still fits a float64 with millimetres to spare
+LIMIT = 1e8  # [m] beyond any map; a float64 still tells 1e-7 m apart there
 
 
 def number(value: Any, path: str, low: float = -LIMIT, high: float = LIMIT) -> float:
@@ -20,19 +20,19 @@ def number(value: Any, path: str, low: float = -LIMIT, high: float = LIMIT) -> f
 
 
 def integer(value: Any, path: str, low: int, high: int) -> int:
-    """`value` as an int in [low, high]; 3.0 is not one."""
+    """`value` as an int in [low, high]. 3.0 is an error: it is not an int."""
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise wrong("integer", path, value, f"an integer from {low} to {high}")
     return value
 
 
 def numbers(value: Any, length: int, path: str) -> tuple[float, ...]:
-    """`value` as that many finite floats."""
+    """`value` as `length` finite floats."""
     return tuple(number(v, f"{path}[{i}]") for i, v in enumerate(items(value, path, length, length)))
 
 
 def items(value: Any, path: str, low: int = 0, high: int = 1_000_000) -> Sequence[Any]:
-    """`value` if it is a list of low to high items."""
+    """`value`, which has to be a list of low to high items."""
     if not isinstance(value, Sequence) or isinstance(value, str | bytes) or not low <= len(value) <= high:
         raise wrong("list", path, value, f"{low} items" if low == high else f"{low} to {high} items")
     return value
@@ -51,7 +51,7 @@ def text(value: Any, path: str) -> str:
 
 
 def member(value: Any, key: str, path: str) -> Any:
-    """`value[key]`, or an error that names the missing member; an empty path is the top of the document."""
+    """`value[key]`. An empty path stands for the top of the document."""
     if key not in mapping(value, path or "document"):
         where = f"{path}.{key}" if path else key
         raise MapError(f"{where} is missing", path=where, expected=f"a member {key!r}")
@@ -63,7 +63,7 @@ def wrong(kind: str, path: str, value: Any, expected: str) -> MapError:
 
 
 def shown(value: Any) -> Any:
-    """`value` as an error may echo it: whole if it is short, else what it is."""
+    """`value` as an error repeats it: short values whole, of others the type and size."""
     if isinstance(value, str):
         return value if len(value) <= 100 else f"{value[:100]}... ({len(value)} characters)"
     if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 1 << 63):

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from specshield.compiled import kernel
 
-EXACT_WITHIN = (
-    12  # cells around the goal where straight lines are used: a point source is where upwinding errs most
-)
+# [cells] around the goal within which straight lines give the distance, since upwinding errs most near a
+# point source. Chosen by hand; nothing was measured.
+EXACT_WITHIN = 12
 
 
 def geodesic_distance(
@@ -20,9 +20,10 @@ def geodesic_distance(
 ) -> NDArray[np.float64]:
     """Metres from each cell centre to the nearest goal cell's centre through free cells. [height, width].
 
-    free, goal: bool[height, width]; goal cells that are not free do not count. 0 in the goal, inf where it
-    cannot be reached. Free cells that touch only at a corner are not connected. First-order upwind, so never
-    short by more than rounding and long by about 2 %, near corners half a cell more.
+    free, goal: bool[height, width]; goal cells that are not free do not count. The distance is 0 in the goal
+    and inf where the goal cannot be reached. Free cells that touch only at a corner are not connected. The
+    scheme is first-order upwind: it is never short by more than rounding, and about 2 % too long, near
+    corners by half a cell more.
     """
     goal = np.ascontiguousarray(goal & free)
     blocked = np.zeros((free.shape[0] + 1, free.shape[1] + 1), dtype=np.int64)
@@ -44,7 +45,7 @@ def _march(
                 distance[i, j] = 0.0
                 inner = 0 < i < h - 1 and 0 < j < w - 1
                 if inner and goal[i - 1, j] and goal[i + 1, j] and goal[i, j - 1] and goal[i, j + 1]:
-                    continue  # its neighbours are nearer to everything
+                    continue  # one of its neighbours is nearer to every other cell
                 _straight_lines(i, j, blocked, distance)
     heap = [(0.0, -1)]
     for i in range(h):
@@ -94,6 +95,6 @@ def _upwind(distance: NDArray[np.float64], done: NDArray[np.bool_], i: int, j: i
         b = distance[i, j - 1]
     if j < w - 1 and done[i, j + 1]:
         b = min(b, distance[i, j + 1])
-    if abs(a - b) >= 1.0:  # inf - inf cannot be: some neighbour is settled
+    if abs(a - b) >= 1.0:  # one of them is finite, since some neighbour is settled
         return min(a, b) + 1.0
     return (a + b + math.sqrt(2.0 - (a - b) ** 2)) / 2.0

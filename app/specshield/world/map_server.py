@@ -28,8 +28,8 @@ MODES = ("trinary", "scale", "raw")
 def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
     """A map_server map. `image` holds PGM or PNG, row 0 the top of the map; the YAML's `image:` is ignored.
 
-    Values follow nav2_map_server (map_io.cpp): raw ignores negate and thresholds, trinary averages alpha in
-    with the colours, scale takes transparent pixels for unknown. MapError for anything that does not fit.
+    Values follow nav2_map_server (map_io.cpp): mode raw ignores negate and the thresholds, trinary averages
+    alpha with the colours, and scale takes transparent pixels for unknown. Raises MapError with the field.
     """
     document = _read_yaml(yaml_text)
     resolution = _scalar(document, "resolution", 1e-4, 100.0)
@@ -82,7 +82,7 @@ def from_values(values: NDArray[Any], resolution: float, origin: tuple[float, fl
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe, and without aliases: merged ones grow without bound."""
+    """Loads plain data alone, and refuses aliases, which can make a short text grow without bound."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -100,9 +100,9 @@ def _read_yaml(text: str) -> dict[str, Any]:
     except Exception as error:  # tags on text that they do not fit raise anything
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "it cannot be read"
+        problem = getattr(error, "problem", None) or "it is not YAML"
         raise MapError(
-            f"the YAML is malformed{where}: {problem}", path="metadata", expected="YAML"
+            f"the YAML cannot be read{where}: {problem}", path="metadata", expected="a map_server YAML"
         ) from error
     if not isinstance(document, dict):
         raise checks.wrong("map_server YAML", "metadata", document, "resolution, origin, negate, ...")
@@ -114,7 +114,7 @@ def _scalar(document: dict[str, Any], key: str, low: float, high: float) -> floa
 
 
 def _number(value: Any, path: str, low: float = -checks.LIMIT, high: float = checks.LIMIT) -> float:
-    """YAML 1.1 reads 5e-2 as text; ROS reads it as a number."""
+    """`value` as a number. YAML 1.1 reads 5e-2 as text, but ROS reads it as a number."""
     if isinstance(value, str):
         try:
             return checks.number(float(value), path, low, high)

@@ -35,7 +35,7 @@ def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
         values = np.array(None)
     if values.dtype.kind != "i" or values.ndim != 1:
         raise MapError(
-            "data holds something other than integers", path="data", expected="integers from -1 to 100"
+            "data has to hold integers alone", path="data", expected="integers from -1 (unknown) to 100"
         )
     wrong = np.flatnonzero((values < UNKNOWN) | (values > 100))
     if wrong.size:
@@ -50,7 +50,7 @@ def _yaw(orientation: Any) -> float:
     x, y, z, w = (checks.number(checks.member(orientation, k, path), f"{path}.{k}") for k in "xyzw")
     if abs(x * x + y * y + z * z + w * w - 1) > 1e-3 or math.hypot(x, y) > 1e-3:
         raise MapError(
-            "a map is turned about z alone",
+            "a map can be turned about z only",
             path=path,
             got=[x, y, z, w],
             expected="a unit quaternion, x = y = 0",

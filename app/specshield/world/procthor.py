@@ -1,7 +1,8 @@
 """ProcTHOR houses as occupancy grids: the map's (x, y) is the house's (x, z), theta = pi/2 - yaw.
 
-A cell is occupied if it lies in no room, or touches a wall or a fixed thing that stands on the floor. Left
-out: what hangs higher than STANDS_BELOW, and what is not fixed (`kinematic: false`), since it gets moved.
+A cell is occupied if it lies in no room, or touches a wall or a fixed thing that stands on the floor. Things
+that hang higher than STANDS_BELOW are left out, and so are things that are not fixed (`kinematic: false`),
+since those get moved.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from specshield.world.formats import MapFormat
 from specshield.world.occupancy import OccupancyGrid, check_size
 from specshield.world.regions import Polygon, Region, Union, signed_distance
 
-STANDS_BELOW = 0.3  # metres: a fixed thing whose lowest point is higher hangs on a wall or stands on another
-TOUCH = 1e-9  # metres: what comes this near touches
-MAX_ITEMS = 10_000
+STANDS_BELOW = 0.3  # [m] a fixed thing whose lowest point is higher hangs on a wall or stands on another
+TOUCH = 1e-9  # [m] things that come this near touch
+MAX_ITEMS = 10_000  # of one list, so that hostile JSON ends early
 
 Array = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ def _rooms(polygons: list[tuple[str, Polygon]]) -> dict[str, Region]:
 
 
 def _walls(house: Any) -> Iterator[tuple[Array, Array]]:
-    """Ends [2] of each straight piece of wall, doorways cut out."""
+    """The two ends [2] of each straight piece of wall that is left when the doorways are cut out."""
     walls: dict[str, tuple[Array, Array]] = {}
     open_plan: set[str] = set()
     for path, wall in _items(house, "walls"):
@@ -109,9 +110,9 @@ def _walls(house: Any) -> Iterator[tuple[Array, Array]]:
 
 
 def _passable(door: Mapping[str, Any], path: str) -> bool:
-    """An inner door that stands fully open, or a frame without a leaf (no `openness`).
+    """Whether a robot can pass: an inner door that stands fully open, or a frame without `openness`.
 
-    Outer doors, and doors that lead back to their own room, are closed.
+    Outer doors, and doors that lead back to their own room, count as closed.
     """
     inner = checks.member(door, "room0", path) != checks.member(door, "room1", path)
     outer_wall = any(
@@ -142,7 +143,7 @@ def _pieces(start: Array, end: Array, gaps: list[tuple[Array, Array]]) -> Iterat
 
 
 def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Array, Array]]:
-    """Centre [2] and half edges [3, 2], on the floor plane, of each fixed thing that stands on the floor."""
+    """Centre [2] and half edges [3, 2] on the floor plane of each fixed thing that stands on the floor."""
     sizes = checks.mapping(asset_sizes, "asset_sizes")
     pending = list(_items(house, "objects"))
     for path, thing in pending:  # grows by the children
@@ -194,14 +195,14 @@ def _rotation(degrees: tuple[float, float, float]) -> Array:
 
 @dataclass(frozen=True)
 class _Canvas:
-    """Cells being drawn on: occupied bool[height, width], resolution in metres, corner (x, y) lower left."""
+    """The cells while they are drawn: bool[height, width], resolution [m], lower left corner (x, y)."""
 
     occupied: NDArray[np.bool_]
     resolution: float
     corner: Array
 
     def window(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
-        """The cells [h, w] that touch the rectangle from low to high, a view, and their centres [h, w, 2]."""
+        """A view of the cells [h, w] that touch a rectangle, and their centres [h, w, 2]."""
         size = self.occupied.shape[::-1]
         j0, i0 = np.clip(np.floor((low - TOUCH - self.corner) / self.resolution), 0, size).astype(int)
         j1, i1 = np.clip(np.ceil((high + TOUCH - self.corner) / self.resolution), 0, size).astype(int)
@@ -209,9 +210,9 @@ class _Canvas:
         return self.occupied[i0:i1, j0:j1], self.corner + np.stack([columns, rows], axis=-1) * self.resolution
 
     def cover(self, centre: Array, spans: Array) -> None:
-        """Occupy the cells that touch {centre + sum of t_k spans[k], |t_k| <= 1}, spans [k, 2].
+        """Occupies the cells that touch {centre + sum of t_k spans[k], |t_k| <= 1}, spans [k, 2].
 
-        That is a segment, or a box's shadow; two convex shapes are apart exactly when the normal of some
+        That set is a segment or a box's shadow. Two convex shapes are apart exactly when the normal of some
         edge separates them (separating axes).
         """
         reach = np.abs(spans).sum(axis=0)

@@ -16,8 +16,8 @@ from specshield.errors import MapError
 from specshield.world import checks
 from specshield.world.simple import crossing_edges
 
-MAX_VERTICES = 1000
-MAX_MEMBERS = 1000
+MAX_VERTICES = 1000  # of a polygon
+MAX_MEMBERS = 1000  # of a union
 CIRCLE, RECTANGLE, POLYGON = 0, 1, 2
 
 Point = tuple[float, float]
@@ -58,7 +58,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Polygon:
-    """vertices (x, y) in metres, at least 3, in either sense; edges may not touch or cross each other."""
+    """At least 3 vertices (x, y) in metres, in either sense of turning. Edges may not touch or cross."""
 
     vertices: tuple[Point, ...]
 
@@ -76,8 +76,11 @@ class Polygon:
 
 @dataclass(frozen=True)
 class Union:
-    """Everything inside any member. Its signed distance is the largest of its members': exact outside and
-    inside members that touch no other, a lower bound of the true depth where they overlap or touch."""
+    """Every point that is inside some member. Its signed distance is the largest of its members'.
+
+    That is exact outside, and inside members that touch no other; where members overlap or touch it is a
+    lower bound on the true depth.
+    """
 
     members: tuple[Circle | Rectangle | Polygon, ...]
 
@@ -160,7 +163,7 @@ def region_distance(regions: PackedRegions, i: int, x: float, y: float) -> float
 
 @leaf
 def _polygon_distance(data: NDArray[np.float64], begin: int, end: int, x: float, y: float) -> float:
-    """Nearest edge for the size, the parity of edges crossed going right for the sign."""
+    """The nearest edge gives the size; the sign is positive if a ray to the right crosses an odd number."""
     inside = False
     nearest = np.inf
     x1, y1 = data[end - 2], data[end - 1]
@@ -201,7 +204,7 @@ def region_from_json(spec: Any, path: str) -> Region:
     }
     if not isinstance(kind, str) or kind not in fields:
         raise MapError(
-            f"{path} is no known kind of region",
+            f"{path} is not a known kind of region",
             path=f"{path}.type",
             got=kind,
             expected="one of " + ", ".join(fields),
@@ -229,7 +232,10 @@ def _union_from_json(members: Any, path: str) -> Union:
         where = f"{path}.members[{i}]"
         if isinstance(spec, Mapping) and spec.get("type") == "union":
             raise MapError(
-                "unions do not nest", path=where, got="union", expected="circle, rectangle or polygon"
+                "a union cannot be a member of a union",
+                path=where,
+                got="union",
+                expected="circle, rectangle or polygon",
             )
         part = region_from_json(spec, where)
         assert not isinstance(part, Union)

@@ -1,4 +1,4 @@
-"""Whether a polygon is simple: no two of its edges touch, but for neighbours at the vertex they share."""
+"""Whether a polygon is simple: no two edges touch, except neighbours at the vertex that they share."""
 
 from __future__ import annotations
 
