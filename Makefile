@@ -1,14 +1,17 @@
 # The newcomer's commands: make demo, make test. Each sets up what it needs in .venv.
-PYTHON ?= $(shell command -v python3.11 || command -v python3)
+# Any Python from 3.11 on.
+PYTHON ?= $(shell for name in python3.11 python3 python3.12 python3.13 python3.14; do \
+  $$name -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && command -v $$name && break; done)
 BIN := .venv/bin
 # A clone shares no compiled kernels with another, and keeps its own between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
 
-.PHONY: install demo run test lint lines bench results openapi clean
+.PHONY: install demo run test wheel-check lint lines bench results openapi clean
 
 install: .venv/.dev
 
 .venv/bin/python:
+	@test -n "$(PYTHON)" || { echo "specshield needs Python 3.11 or later: make PYTHON=/path/to/python3.12"; exit 1; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
 
@@ -28,6 +31,10 @@ run: .venv/.server
 
 test: .venv/.dev
 	$(BIN)/python -m pytest
+
+# The wheel, in an empty folder and a new environment, with no compiled kernels: what a newcomer has.
+wheel-check: .venv/bin/python
+	$(BIN)/python .ci/wheel.py
 
 lint: .venv/.dev
 	$(BIN)/ruff check app evaluation tests benchmarks examples

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from benchmarks import cold, decisions, report, service, sweep, synthesis, timing
-from specshield.sim.cases import REPOSITORY, case_names
+from specshield.sim.cases import case_names
 
 QUICK = {"n": 100, "episodes": 2, "plain": 4, "repeats": 3, "sweep": 100}
 FULL = {"n": 1000, "episodes": 20, "plain": 30, "repeats": 3, "sweep": 300}
@@ -30,7 +30,9 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=5.0, help="of each in the race")
     parser.add_argument("--rate", type=float, default=0.95, help="satisfaction rate that wins the race")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=REPOSITORY / "docs", help="folder to write to")
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parents[1] / "docs", help="folder to write to"
+    )
     args = parser.parse_args()
     folder = args.out / "benchmarks"
     folder.mkdir(parents=True, exist_ok=True)

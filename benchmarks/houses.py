@@ -26,13 +26,12 @@ from specshield.policy.methods import load_policy
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body
-from specshield.sim.cases import REPOSITORY
 from specshield.task import make_task
 from specshield.world.map_server import load_map
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.procthor import load_house
 
-DATA = REPOSITORY.parent / "shared" / "data"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SHAPES = {
     "in turn, G throughout": "F[0,80] A and F[80,160] B and G[0,160] not C",
     "a G that begins late": "F[0,120] A and G[60,160] not C",

@@ -10,7 +10,8 @@ import numpy as np
 from benchmarks.timing import summary
 from specshield.client import ShieldClient
 from specshield.policy.dqn.environment import free_poses
-from specshield.sim.cases import MAPS, Case, load_case
+from specshield.shipped import MAPS
+from specshield.sim.cases import Case, load_case
 from specshield.sim.episodes import with_shield
 from specshield.sim.learned.model import load_learned
 from specshield.sim.service import own_server

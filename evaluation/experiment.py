@@ -22,7 +22,8 @@ from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body
 from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
-from specshield.sim.cases import MODELS, Case, case_name, load_case, shipped
+from specshield.shipped import MODELS
+from specshield.sim.cases import Case, case_name, load_case, shipped
 from specshield.sim.learned.model import FOLDER, WEIGHTS, read
 from specshield.sim.model import FoundationModel
 from specshield.task import Task

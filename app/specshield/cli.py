@@ -40,6 +40,8 @@ def main() -> None:
 
 def run(commands: Iterable[Callable[..., None]]) -> None:
     """A command line with these commands. What can be expected to go wrong is told in one line."""
+    if sys.version_info < (3, 11):
+        sys.exit(f"This command needs Python 3.11 or later; this is {sys.version.split()[0]}")
     if typer is None:
         sys.exit(NEEDS_SERVER)
     app = typer.Typer(
@@ -87,7 +89,7 @@ def serve(
         embedded.join()  # and so is why it does not start
     options: dict[str, Any] = {
         "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
-        "timeout_graceful_shutdown": 5,
+        "timeout_graceful_shutdown": 5, "log_config": _log_config(),
     }  # fmt: skip
     if workers == 1:  # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up
         from specshield.service.app import create_app
@@ -160,6 +162,14 @@ def _check_address(host: str, port: int) -> None:
             f"the server cannot listen on {host} at port {port}: {error.strerror}",
             expected="an address of this machine and a free port; --port 0 takes any that is free",
         ) from None
+
+
+def _log_config() -> dict[str, Any]:
+    """uvicorn's, and the lines of specshield's own log in the same form."""
+    from uvicorn.config import LOGGING_CONFIG
+
+    own = {"handlers": ["default"], "level": "INFO", "propagate": False}
+    return {**LOGGING_CONFIG, "loggers": {**LOGGING_CONFIG["loggers"], "specshield": own}}
 
 
 def _settings() -> Settings:

@@ -11,21 +11,35 @@ import hashlib
 import os
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
 njit: Any = numba.njit  # its types leave out the option below
 config: Any = numba.config
+unliteral: Any = numba.types.unliteral
 F = TypeVar("F", bound=Callable[..., Any])
 PACKAGE = Path(__file__).parent
 IMPORTED = re.compile(
     r"^ *(?:from|import) +(specshield[\w.]*)(?: +import +(\([^)]*\)|[^\n]*))?", re.MULTILINE
 )
-BASE = config.CACHE_DIR or (str(PACKAGE / "__pycache__") if os.access(PACKAGE, os.W_OK) else "")
+
+
+def _base() -> Path:
+    """Where kernels are kept: NUMBA_CACHE_DIR, else the package, else the user's folder of caches."""
+    if config.CACHE_DIR:
+        return Path(config.CACHE_DIR)
+    if os.access(PACKAGE, os.W_OK):
+        return PACKAGE / "__pycache__"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "specshield"
+
+
+BASE = _base()
 
 
 def kernel(function: F) -> F:
@@ -59,6 +73,25 @@ def merged(function: F) -> F:
     return compiled
 
 
+def mark(name: str) -> Path | None:
+    """A file to be made once everything called `name` is compiled: another where the sources, the processor
+    or numba are others. None where no kernel can be kept.
+    """
+    made_of = [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(PACKAGE.rglob("*.py"))]
+    made_of += [numba.__version__, sys.version, get_host_cpu_name(), get_host_cpu_features().flatten()]
+    digest = hashlib.sha256("".join(made_of).encode()).hexdigest()[:16]
+    try:
+        BASE.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return BASE / f"{name}-{digest}" if os.access(BASE, os.W_OK) else None
+
+
+def on_disk() -> int:
+    """How many kernels are kept."""
+    return sum(1 for _ in BASE.rglob("*.nbi"))
+
+
 def _leaf(function: F, **options: bool) -> F:
     fast = {"nogil": True, "error_model": "numpy", **options}
     try:
@@ -69,13 +102,21 @@ def _leaf(function: F, **options: bool) -> F:
 
 
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Compiles a function once for each combination of types it is called with.
+
+    A number that is written in a call counts as any other of its type. Left alone, numba compiles the callee
+    once more for each such number, which took a sixth of all the time that compiling takes.
+    """
     before = config.CACHE_DIR
-    if BASE and function.__module__.startswith("specshield."):
+    if function.__module__.startswith("specshield."):
         config.CACHE_DIR = _folder(function.__module__) or before
     try:
-        return njit(cache=True, **options)(function)
+        compiled = njit(cache=True, **options)(function)
     finally:
         config.CACHE_DIR = before
+    template = compiled.get_call_template
+    compiled.get_call_template = lambda args, kws: template([unliteral(arg) for arg in args], kws)
+    return compiled
 
 
 @cache
@@ -88,7 +129,7 @@ def _folder(module: str) -> str | None:
             found.add(file)
             to_see += _read(file)[1]
     digest = hashlib.sha256(b"".join(_read(file)[0] for file in sorted(found))).hexdigest()[:16]
-    own = Path(BASE) / module / digest
+    own = BASE / module / digest
     if not own.exists():
         for old in own.parent.glob("*"):
             shutil.rmtree(old, ignore_errors=True)

@@ -26,6 +26,7 @@ SpecshieldError
 ├── Unauthorized                a missing or wrong API key
 ├── LimitReached                too many maps, policies or sessions kept; delete some
 ├── TrainingUnavailable         no worker is there to train
+├── Starting                    the server is not ready yet; ask again after Retry-After
 ├── StoreError                  the trajectory store cannot be reached
 ├── ServerError                 the server failed; what it knows is in its log
 └── TransportError              the client could not reach the server
@@ -181,6 +182,10 @@ class LimitReached(SpecshieldError):
 
 class TrainingUnavailable(SpecshieldError):
     type = "training-unavailable"
+
+
+class Starting(SpecshieldError):
+    type = "starting"
 
 
 class StoreError(SpecshieldError):

@@ -25,7 +25,8 @@ from evaluation.apartments import APARTMENTS
 from evaluation.model.floor_plans import House, random_house
 from evaluation.model.measure import house_case, success
 from specshield.policy.tensors import replace_file
-from specshield.sim.cases import MODELS, case_names, load_case
+from specshield.shipped import MODELS
+from specshield.sim.cases import case_names, load_case
 from specshield.sim.learned.model import CARD, FOLDER, WEIGHTS, LearnedModel, read, target_of
 from specshield.sim.learned.network import KINDS, TEMPERATURE
 from specshield.sim.progress import StatusLine, duration

@@ -1,6 +1,7 @@
 """The calls as generators: what they send, when they try again, what they make of the answers."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from client_script import SESSION, answer, drive, lost, problem
@@ -206,3 +207,38 @@ def test_an_answer_that_lacks_a_field_is_a_server_error():
     error, _, _ = drive(calls.get_policy("p"), answer({"id": "p"}))
     assert type(error) is errors.ServerError
     assert "status" in error.message
+
+
+def starting(retry_after):
+    reply = problem(503, "starting")
+    return replace(reply, headers={**reply.headers, "retry-after": retry_after})
+
+
+def test_a_starting_server_is_asked_again_when_it_says_so_and_no_try_is_counted():
+    policy, sent, waits = drive(calls.get_policy("p"), *[starting("0.3")] * 6, answer(POLICY))
+    assert policy.id == "p"
+    assert len(sent) == 7  # more than the tries that lost answers get
+    assert waits == [0.3] * 6
+
+
+def test_a_server_that_starts_for_longer_than_a_call_may_take_is_said_to():
+    error, sent, waits = drive(calls.get_policy("p"), *[starting("0.7")] * 3)
+    assert type(error) is errors.Starting
+    assert len(sent) == 3
+    assert waits == [0.7, 0.7]  # a third pause would begin a try later than four timeouts of 0.5 s
+
+
+def test_waiting_until_ready_outlasts_a_server_that_is_away_and_one_that_starts():
+    outcomes = [lost(0.01), starting("1"), answer({"status": "ok"})]
+    result, sent, waits = drive(calls.wait_until_ready(10.0), *outcomes)
+    assert result is None
+    assert {(request.method, request.path) for request in sent} == {("GET", "/readyz")}
+    assert waits == [calls.READY_EVERY] * 2
+
+
+def test_waiting_until_ready_ends_and_says_how_far_the_server_was():
+    error, _, _ = drive(calls.wait_until_ready(0.5), lost(0.01), starting("1"))
+    assert type(error) is errors.TransportTimeout
+    assert error.message == "not ready after 0 s: starting"
+    error, _, _ = drive(calls.wait_until_ready(0.5), problem(404, "not-found"))
+    assert type(error) is errors.NotFound

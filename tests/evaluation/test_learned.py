@@ -12,7 +12,7 @@ from evaluation.model.transformer import Transformer, export
 from specshield.errors import NotFound, PolicyError
 from specshield.policy.tensors import read_tensors
 from specshield.robot import STRETCH
-from specshield.sim.cases import MODELS
+from specshield.shipped import MODELS
 from specshield.sim.learned.model import CARD, FOLDER, WEIGHTS, load_learned, target_of
 from specshield.sim.learned.network import (
     FEATURES,

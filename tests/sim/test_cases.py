@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from specshield import errors
-from specshield.sim.cases import MAPS, case_name, load_case, shipped
+from specshield.shipped import MAPS
+from specshield.sim.cases import case_name, load_case, shipped
 from specshield.stl import parse
 
 

@@ -53,6 +53,14 @@ class AsyncShieldClient:
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
+    async def wait_until_ready(self, timeout: float = 120.0) -> None:
+        """Return when the server is ready to decide: its first start takes about half a minute.
+
+        A server that cannot be reached yet is waited for too. Raises TransportTimeout after `timeout` [s],
+        which says how far the server was.
+        """
+        await self._run(calls.wait_until_ready(timeout))
+
     async def close(self) -> None:
         await self._http.aclose()
 

@@ -13,11 +13,14 @@ from specshield.client.core import Flow, Wait, call, deliver, erase
 from specshield.client.models import Map, Policy, SessionInfo, Spec, build
 from specshield.client.wire import (
     Content,
+    Failure,
     Numbers,
+    Reply,
     Request,
     check,
     content,
     encode,
+    error_of,
     get,
     json_object,
     path,
@@ -25,6 +28,23 @@ from specshield.client.wire import (
     post,
 )
 from specshield.errors import InputError, SessionExists, StoreError, TransportError, TransportTimeout
+
+READY_EVERY = 0.25  # s between two questions whether the server is ready
+
+
+def wait_until_ready(timeout: float) -> Flow[None]:
+    """Ask until the server is ready, also one that cannot be reached yet."""
+    seconds = 0.0
+    while True:
+        outcome = yield Request("GET", "/readyz")
+        seconds += outcome.seconds
+        if isinstance(outcome, Reply) and outcome.status not in (502, 503, 504):
+            return check(outcome)
+        error = outcome.error if isinstance(outcome, Failure) else error_of(outcome)
+        if seconds + READY_EVERY > timeout:
+            raise TransportTimeout(f"not ready after {seconds:.0f} s: {error}") from error
+        yield Wait(READY_EVERY)
+        seconds += READY_EVERY
 
 
 def validate(

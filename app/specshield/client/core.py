@@ -6,7 +6,9 @@ A shell (sync.py, aio.py) performs a `Request` and sends its `Reply` or `Failure
 Retries: a lost answer, 502, 503 or 504 is followed by the same bytes again, at most `tries` times,
 after 0.05 s, 0.1 s, 0.2 s, ..., and no try starts later than four timeouts after the first. All that
 is repeated is safe to repeat: steps are locked by t and content, maps and policies are addressed by
-content, and a session is created under an id the client chose.
+content, and a session is created under an id the client chose. A server that says it is starting has
+done nothing yet: it is asked again when it says so (Retry-After), within the same four timeouts, and such
+an answer is not counted as a try.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from typing import Any, TypeVar
 
 from specshield.client.models import Page, build
 from specshield.client.wire import Failure, Reply, Request, check, error_of, get, json_object
-from specshield.errors import NotFound, TrainingUnavailable
+from specshield.errors import NotFound, SpecshieldError, Starting, TrainingUnavailable
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
@@ -48,8 +50,12 @@ def deliver(request: Request) -> Flow[Delivery]:
     tries, seconds = 0, 0.0
     while True:
         outcome = yield request
-        tries, seconds = tries + 1, seconds + outcome.seconds
-        wait = BACKOFF * 2 ** (tries - 1)
+        seconds += outcome.seconds
+        if isinstance(outcome, Reply) and isinstance(_unavailable(outcome), Starting):
+            wait = _asked_for(outcome)
+        else:
+            tries += 1
+            wait = BACKOFF * 2 ** (tries - 1)
         if not _passing(outcome) or tries == request.tries or seconds + wait > PATIENCE * outcome.timeout:
             if isinstance(outcome, Failure):
                 outcome.error.details.update(tries=tries, seconds=round(seconds, 3))
@@ -63,7 +69,21 @@ def _passing(outcome: Reply | Failure) -> bool:
     """Whether the same request may fare better in a moment."""
     if isinstance(outcome, Failure):
         return True
-    return outcome.status in (502, 503, 504) and not isinstance(error_of(outcome), TrainingUnavailable)
+    error = _unavailable(outcome)
+    return error is not None and not isinstance(error, TrainingUnavailable)
+
+
+def _unavailable(reply: Reply) -> SpecshieldError | None:
+    """The error of a reply that says the service is not there now; None for any other reply."""
+    return error_of(reply) if reply.status in (502, 503, 504) else None
+
+
+def _asked_for(reply: Reply) -> float:
+    """The pause that a starting server asks for [s]."""
+    try:
+        return max(BACKOFF, float(reply.headers.get("retry-after", "")))
+    except ValueError:  # none, or a date
+        return 1.0
 
 
 def call(request: Request) -> Flow[dict[str, Any]]:

@@ -55,6 +55,14 @@ class ShieldClient:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def wait_until_ready(self, timeout: float = 120.0) -> None:
+        """Return when the server is ready to decide: its first start takes about half a minute.
+
+        A server that cannot be reached yet is waited for too. Raises TransportTimeout after `timeout` [s],
+        which says how far the server was.
+        """
+        self._run(calls.wait_until_ready(timeout))
+
     def close(self) -> None:
         self._http.close()
 

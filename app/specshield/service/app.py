@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import multiprocessing
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -23,13 +22,13 @@ from specshield.service.routes import maps, policies, sessions, specs, system
 from specshield.service.schemas.base import Problem
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
+from specshield.service.startup import Startup, prepare
 from specshield.service.state import Server, problem_documents
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
 from specshield.service.storage.store import Store
 from specshield.service.training.children import TrainingWorker, tend, wants_worker
 from specshield.service.training.jobs import Jobs
-from specshield.service.warmup import warm_up
 
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
@@ -47,7 +46,6 @@ TAGS = [
     {"name": "sessions", "description": "Episodes: one robot, one specification, one decision a step."},
     {"name": "system", "description": "Life, readiness, metrics."},
 ]
-log = logging.getLogger("specshield")
 
 
 def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None = None) -> FastAPI:
@@ -90,11 +88,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     store, library = Store(url, settings.store_timeout, settings.session_ttl), Maps(settings)
     known = Policies(settings, library)
     worker = TrainingWorker(settings) if wants_worker(settings) else None
-    server = Server(
-        settings, store, library, known, Sessions(settings, store, known), Jobs(url, settings), worker
-    )
+    sessions, startup = Sessions(settings, store, known), Startup()
+    server = Server(settings, store, library, known, sessions, Jobs(url, settings), worker, startup)
     app.state.server = server
-    tasks = [asyncio.create_task(tend(embedded, worker)), asyncio.create_task(_warm(server))]
+    tasks = [asyncio.create_task(tend(embedded, worker)), asyncio.create_task(prepare(startup))]
     try:
         yield
     finally:
@@ -107,15 +104,6 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         await store.aclose()
         if embedded is not None:
             embedded.leave()
-
-
-async def _warm(server: Server) -> None:
-    try:
-        await asyncio.to_thread(warm_up)
-        server.ready = True
-    except Exception as error:
-        log.exception("warming up")
-        server.failure = f"the kernels cannot be compiled: {type(error).__name__}"
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
@@ -144,6 +132,9 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         for path, methods in schema["paths"].items():  # what the middleware may answer
             for operation in methods.values():
                 said = {"_401": "The server asks for a key, and this is not it."} if guarded(path) else {}
+                if path.startswith("/v1/"):
+                    said["_503"] = operation["responses"].get("503", {}).get("description", "")
+                    said["_503"] = f"{said['_503']} `starting`: the server is not ready yet.".strip()
                 if "requestBody" in operation:
                     said["_413"] = "The body is over the limit."
                 added = problem_documents(**said)

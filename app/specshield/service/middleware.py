@@ -11,7 +11,7 @@ import time
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from specshield.errors import BodyTooLarge, Unauthorized
+from specshield.errors import BodyTooLarge, Starting, Unauthorized
 from specshield.service import metrics, problems
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -57,7 +57,9 @@ class Observe:
 
 
 class Guard:
-    """The API key, where one is asked for, and the size of bodies, also of chunked ones."""
+    """The API key, where one is asked for, whether the server is ready, and the size of bodies, also of
+    chunked ones.
+    """
 
     def __init__(self, app: ASGIApp, api_key: str | None, max_body: int, max_upload: int) -> None:
         self.app, self._max_body, self._max_upload = app, max_body, max_upload
@@ -74,6 +76,10 @@ class Guard:
                 error = Unauthorized("an API key is needed", path="Authorization", expected="Bearer <key>")
                 await problems.response(error)(scope, receive, send)
                 return
+        starting = scope["app"].state.server.startup.problem() if path.startswith("/v1/") else None
+        if isinstance(starting, Starting):
+            await problems.response(starting)(scope, receive, send)
+            return
         limit = self._max_upload if path.rstrip("/") in UPLOADS else self._max_body
         too_large = problems.response(
             BodyTooLarge("the body is too large", expected=f"at most {limit} bytes", limit=limit)

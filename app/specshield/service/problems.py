@@ -29,6 +29,7 @@ STATUS: Mapping[type[SpecshieldError], int] = {
     errors.Unauthorized: 401,
     errors.LimitReached: 429,
     errors.TrainingUnavailable: 503,
+    errors.Starting: 503,
     errors.StoreError: 503,
     SpecshieldError: 500,
 }

@@ -9,9 +9,8 @@ from pydantic import AliasChoices, Field, SecretStr, ValidationError, field_vali
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from redis import ConnectionPool
 
+from specshield import shipped
 from specshield.errors import InputError
-
-REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 class Settings(BaseSettings):
@@ -24,11 +23,9 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         default=Path("data"), description="Uploaded maps, trained policies and the embedded store."
     )
-    models_dir: Path = Field(
-        default=REPOSITORY / "models", description="Policies there at start, one folder each."
-    )
+    models_dir: Path = Field(default=shipped.MODELS, description="Policies there at start, one folder each.")
     maps_dir: Path = Field(
-        default=REPOSITORY / "maps", description="Maps there at start, <name>.yaml beside its image."
+        default=shipped.MAPS, description="Maps there at start, <name>.yaml beside its image."
     )
     redis_url: str | None = Field(
         default=None,

@@ -11,6 +11,7 @@ from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
+from specshield.service.startup import Startup
 from specshield.service.storage.store import Store
 from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import Jobs
@@ -18,7 +19,7 @@ from specshield.service.training.jobs import Jobs
 
 @dataclass
 class Server:
-    """ready: the kernels are compiled; failure: why not. worker: this server's own, if it has one."""
+    """startup: how far this server has come. worker: this server's own, if it has one."""
 
     settings: Settings
     store: Store
@@ -27,8 +28,7 @@ class Server:
     sessions: Sessions
     jobs: Jobs
     worker: TrainingWorker | None
-    ready: bool = False
-    failure: str | None = None
+    startup: Startup
 
 
 def _server(request: Request) -> Server:

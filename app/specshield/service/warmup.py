@@ -1,6 +1,17 @@
-"""Compiles what a decision needs, on a world of a few cells, before the server says it is ready."""
+"""Compiles what a decision needs, on a world of a few cells, before the server says it is ready.
+
+    python -m specshield.service.warmup PART     # compiles one part, for `startup`; the disk keeps it
+
+What only a planner's or a look-ahead session needs is compiled when the first of them is made.
+"""
 
 from __future__ import annotations
+
+import gc
+import os
+import sys
+import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,6 +24,7 @@ from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.shield import episode
 from specshield.shield.decision import make_shield
+from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -23,21 +35,21 @@ REGIONS = {
     "C": {"type": "polygon", "vertices": [[1.8, 1.8], [1.9, 1.8], [1.9, 1.9]]},
 }
 START = (1.0, 1.0, 0.0)
+# What can be compiled side by side, what takes longest first. Each gives the policy to decide with.
+PARTS: dict[str, Callable[[Task], Proposer]] = {
+    "reachability": lambda task: synthesise(task),
+    "dqn": lambda task: Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task))),
+}
 
 
-def warm_up() -> None:
-    """A minute at the very first start of an installation; afterwards the kernels come from numba's cache.
-
-    What only a planner's or a look-ahead session needs is compiled when the first of them is made.
-    """
+def warm_up(part: str) -> None:
+    """Decides twice with this part's policy: compiles its kernels, or takes them from the disk."""
     task = _task()
-    learned = Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))
+    shield = make_shield([PARTS[part](task)])
     logits = np.zeros(len(STRETCH.actions))
-    for policy in (learned, synthesise(task)):
-        shield = make_shield([policy])
-        episode.start(shield, START)
-        first = episode.decide(shield, [START], logits)
-        episode.decide(shield, [START, first.next_poses[0].tolist()], logits, carry=first.carry)
+    episode.start(shield, START)
+    first = episode.decide(shield, [START], logits)
+    episode.decide(shield, [START, first.next_poses[0].tolist()], logits, carry=first.carry)
 
 
 def _task() -> Task:
@@ -59,3 +71,16 @@ def _weights(task: Task) -> dict[str, np.ndarray]:
         weights[f"w{i + 1}"] = np.zeros((sizes[i], sizes[i + 1]), np.float32)
         weights[f"b{i + 1}"] = np.zeros(sizes[i + 1], np.float32)
     return weights
+
+
+def _end_with_parent() -> None:
+    """Standard input is a pipe from the server: it reaches its end when the server is gone."""
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    gc.set_threshold(100_000, 50, 50)  # compiling makes millions of small objects: a tenth of its time
+    warm_up(sys.argv[1])

@@ -17,14 +17,11 @@ from specshield.policy.methods import load_policy
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, make_body
 from specshield.shield.proposal import Proposer
+from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task
 from specshield.world.geodesic import geodesic_distance
 from specshield.world.map_server import load_map
 from specshield.world.regions import Region, region_from_json
-
-REPOSITORY = Path(__file__).resolve().parents[3]
-MAPS = REPOSITORY / "maps"
-MODELS = REPOSITORY / "models"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +84,10 @@ def load_case(name: str, folder: Path = MAPS) -> Case:
     name, names = case_name(name), case_names(folder)
     if name not in names:
         raise NotFound(
-            f"there is no case {name!r}", path="case", got=name, expected=f"one of {', '.join(names)}"
+            f"there is no case {name!r} in {folder}",
+            path="case",
+            got=name,
+            expected=f"one of {', '.join(names)}" if names else "a folder with case1.regions.json",
         )
     grid = load_map((folder / f"{name}.yaml").read_text(), (folder / f"{name}.pgm").read_bytes())
     beside = json.loads((folder / f"{name}.regions.json").read_text())

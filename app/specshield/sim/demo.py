@@ -22,8 +22,8 @@ def run_demo(runs: int, seed: int, out: Path) -> int:
     Returns the exit status: 1 if an episode with the shield broke its rule.
     """
     began, status = time.monotonic(), StatusLine()
-    status.say("starting the service (its first start compiles: about a minute) ...")
-    with own_server() as url, ShieldClient(url, timeout=PATIENCE) as client:
+    status.say("starting the service ...")
+    with own_server(say=status.say) as url, ShieldClient(url, timeout=PATIENCE) as client:
         campaigns = [_campaign(client, load_case(name), runs, seed, status) for name in case_names()]
     for campaign in campaigns:
         first, beside = campaign.shielded[0], campaign.unshielded[0]

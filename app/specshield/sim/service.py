@@ -10,21 +10,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
 
-READY_WITHIN = 300.0  # [s] the first start of an installation compiles the kernels
-
 
 @contextmanager
-def own_server(worker: bool = False) -> Iterator[str]:
+def own_server(worker: bool = False, say: Callable[[str], object] = lambda text: None) -> Iterator[str]:
     """Starts `specshield serve` on a free port, its data in a temporary folder; yields its address.
 
-    worker: whether it makes policies too. Raises RuntimeError with the server's log where it does not come
-    up.
+    worker: whether it makes policies too. say: is told how far the server is while it starts. Raises
+    RuntimeError with the server's log where it does not come up.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
         log = Path(folder) / "server.log"
@@ -39,7 +37,7 @@ def own_server(worker: bool = False) -> Iterator[str]:
                 preexec_fn=follow_parent,
             )
         try:
-            _wait_until_ready(url, server, log)
+            _wait_until_ready(url, server, log, say)
             yield url
         finally:
             server.terminate()
@@ -58,24 +56,32 @@ def follow_parent() -> None:
 
 def _environment(folder: Path, worker: bool) -> dict[str, str]:
     """This process's, without what would join the server to another's store or lock it."""
+    shipped = ("SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR")
     kept = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith("SPECSHIELD_") and name != "REDIS_URL"
+        if name in shipped or (not name.startswith("SPECSHIELD_") and name != "REDIS_URL")
     }
     own = {"SPECSHIELD_DATA_DIR": str(folder / "data"), "SPECSHIELD_WORKER": "true" if worker else "false"}
     return {**kept, **own}
 
 
-def _wait_until_ready(url: str, server: subprocess.Popen[bytes], log: Path) -> None:
-    deadline = time.monotonic() + READY_WITHIN
-    while time.monotonic() < deadline and server.poll() is None:
+def _wait_until_ready(
+    url: str, server: subprocess.Popen[bytes], log: Path, say: Callable[[str], object]
+) -> None:
+    """However long the server takes, unless it ends or says that it cannot become ready."""
+    status = 0
+    while server.poll() is None and status != 500:
         try:
-            if httpx.get(f"{url}/readyz", timeout=2.0).status_code == 200:
-                return
+            answer = httpx.get(f"{url}/readyz", timeout=20.0)
         except httpx.TransportError:
-            pass
-        time.sleep(0.05)
+            time.sleep(0.05)
+            continue
+        status = answer.status_code
+        if status == 200:
+            return
+        say(answer.json()["detail"])
+        time.sleep(0.1)
     raise RuntimeError(f"the server did not come up:\n{log.read_text(errors='replace')[-4000:]}")
 
 

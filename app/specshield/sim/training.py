@@ -12,7 +12,8 @@ from typing import Any
 from specshield.policy.methods import DEFAULT, METHODS, Run
 from specshield.policy.options import read_options
 from specshield.policy.tensors import replace_file
-from specshield.sim.cases import MODELS, load_case
+from specshield.shipped import MODELS
+from specshield.sim.cases import load_case
 from specshield.sim.progress import StatusLine, duration
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from fastapi import APIRouter, Response
 
-from specshield.errors import StoreError
 from specshield.service import metrics
 from specshield.service.schemas.base import Health
 from specshield.service.state import ServerState, problems
@@ -19,15 +18,20 @@ async def livez() -> Health:
 
 
 @router.get(
-    "/readyz", summary="Is it ready?", responses=problems(_503="The store is away, or it is still starting.")
+    "/readyz",
+    summary="Is it ready?",
+    responses=problems(_503="`starting`: it says how far it is; or the store is away."),
 )
 async def readyz(server: ServerState) -> Health:
-    """Whether it can decide: the store answers, the kernels are compiled (seconds, at the first start)."""
+    """Whether it can decide: the store answers, and the kernels are compiled.
+
+    The first start of an installation compiles them, in about half a minute; `kernels` says how many of how
+    many are done. Until then every path under /v1 answers 503 `starting`, with Retry-After.
+    """
     await server.store.ping()
-    if server.failure is not None:
-        raise StoreError(server.failure)
-    if not server.ready:
-        raise StoreError("still starting: compiling the kernels")
+    problem = server.startup.problem()
+    if problem is not None:
+        raise problem
     return Health(status="ok")
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from specshield.errors import NotFound, PolicyError
 from specshield.policy.tensors import read_tensors
-from specshield.sim.cases import MODELS
+from specshield.shipped import MODELS
 from specshield.sim.learned.network import KINDS, NOTHING, Array, Network, check, decoded, features
 from specshield.sim.learned.reckoning import Reckoning
 from specshield.sim.robot import SimulatedRobot

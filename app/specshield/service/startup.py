@@ -1,0 +1,149 @@
+"""From a server's first moment until it is ready: what it does meanwhile, and how it tells how far it is.
+
+    python -m specshield.service.startup     # does so without a server: for an image, say
+
+The first start of an installation compiles the kernels, in a process for each part, and they stay on the
+disk. Any later start takes them from there. Of several server processes one compiles, the others wait for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import logging
+import os
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from specshield import compiled
+from specshield.errors import ServerError, SpecshieldError, Starting
+from specshield.service import warmup
+
+KERNELS = 135  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name '*.nbi' | wc -l`
+TAKES = 30  # [s] that a first start takes on two cores at most: `make wheel-check` prints what it took
+TELL_EVERY = 5.0  # [s] between two lines of the log
+CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
+log = logging.getLogger("specshield")
+
+
+@dataclass
+class Startup:
+    """How far a server has come.
+
+    failure: why it will not be ready. before: the kernels on the disk when compiling began; None where none
+    has to be compiled. parts: those compiled since.
+    """
+
+    ready: bool = False
+    failure: str | None = None
+    before: int | None = None
+    parts: list[str] = field(default_factory=list)
+
+    def problem(self) -> SpecshieldError | None:
+        """What a request is told that cannot be answered yet; None once the server is ready."""
+        if self.ready:
+            return None
+        if self.failure is not None:
+            return ServerError(self.failure)
+        expected = "a server that is ready: ask again, or wait until /readyz answers 200"
+        if self.before is None:
+            return Starting("the server is starting", expected=expected)
+        return Starting(
+            f"the server is starting: it has compiled {self.compiled()} of about {KERNELS} kernels, which "
+            f"takes about {TAKES} s at the first start of an installation",
+            expected=expected,
+            kernels={"compiled": self.compiled(), "expected": KERNELS},
+            parts={part: "done" if part in self.parts else "compiling" for part in warmup.PARTS},
+        )
+
+    def compiled(self) -> int:
+        """The kernels that were compiled since the start."""
+        return min(compiled.on_disk() - (self.before or 0), KERNELS)
+
+
+async def prepare(startup: Startup) -> None:
+    """Returns when the server is ready, or cannot become it."""
+    try:
+        mark = compiled.mark("ready")
+        if mark is not None and not mark.exists():
+            await _compile(startup, mark)
+        for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here
+            await asyncio.to_thread(warmup.warm_up, part)
+        startup.ready = True
+    except Exception as error:
+        log.exception("the kernels cannot be compiled")
+        startup.failure = (
+            f"the kernels cannot be compiled: {type(error).__name__}; the server's log says more"
+        )
+
+
+async def _compile(startup: Startup, mark: Path) -> None:
+    startup.before = compiled.on_disk()
+    telling = asyncio.create_task(_tell(startup))
+    free = asyncio.Semaphore(os.cpu_count() or 1)
+    try:
+        async with _one_at_a_time(mark.with_suffix(".lock")):
+            if mark.exists():  # another process has done it meanwhile
+                return
+            if all(await asyncio.gather(*(_compile_part(part, startup, free) for part in warmup.PARTS))):
+                mark.touch()
+    finally:
+        telling.cancel()
+
+
+async def _compile_part(part: str, startup: Startup, free: asyncio.Semaphore) -> bool:
+    """Whether the process that compiles this part came to its end."""
+    async with free:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "specshield.service.warmup", part, stdin=asyncio.subprocess.PIPE
+        )
+        try:
+            done = await process.wait() == 0
+        finally:
+            with contextlib.suppress(ProcessLookupError):  # it has ended already
+                process.kill()
+    if done:
+        startup.parts.append(part)
+    return done
+
+
+async def _tell(startup: Startup) -> None:
+    log.info(
+        "compiling the kernels: the first start of an installation takes about %d s on two cores, and longer "
+        "where others use them too",
+        TAKES,
+    )
+    while True:
+        await asyncio.sleep(TELL_EVERY)
+        log.info("compiled %d of about %d kernels", startup.compiled(), KERNELS)
+
+
+@asynccontextmanager
+async def _one_at_a_time(path: Path) -> AsyncIterator[None]:
+    """Holds the lock of this file, which ends with the process that holds it."""
+    lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                await asyncio.sleep(CHECK_EVERY)
+        yield
+    finally:
+        os.close(lock)
+
+
+def main() -> None:
+    logging.basicConfig(format="%(message)s", level=logging.INFO)
+    startup = Startup()
+    asyncio.run(prepare(startup))
+    sys.exit(startup.failure)
+
+
+if __name__ == "__main__":
+    main()

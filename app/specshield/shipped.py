@@ -1,0 +1,24 @@
+"""Where the maps and models that come with specshield are.
+
+A repository has maps/ and models/ beside app/; a wheel has them inside the package. SPECSHIELD_MAPS_DIR and
+SPECSHIELD_MODELS_DIR name other folders.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parent
+
+
+def _folder(name: str) -> Path:
+    chosen = os.environ.get(f"SPECSHIELD_{name.upper()}_DIR")
+    if chosen:
+        return Path(chosen).resolve()
+    installed = PACKAGE / name
+    return installed if installed.is_dir() else PACKAGE.parents[1] / name
+
+
+MAPS = _folder("maps")
+MODELS = _folder("models")

@@ -1,0 +1,69 @@
+"""A server that is not ready yet: what it says, whom it keeps waiting, and that it leaves nothing behind."""
+
+import fcntl
+import os
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+
+from specshield import compiled
+from specshield.client import ShieldClient
+from specshield.errors import Starting
+from tests.serving import serving, wait_for
+
+
+@pytest.fixture
+def held(tmp_path):
+    """A folder of kernels with none in it, and the lock that a server needs to compile them."""
+    kernels = tmp_path / "kernels"
+    kernels.mkdir()
+    lock = os.open(kernels / f"{compiled.mark('ready').name}.lock", os.O_RDWR | os.O_CREAT)
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    yield kernels, lock
+    os.close(lock)
+
+
+def alive(url):
+    try:
+        return httpx.get(f"{url}/livez").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def compiling(folder):
+    """The processes that compile into it."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (process / "cmdline").read_bytes()
+            environment = (process / "environ").read_bytes()
+        except OSError:
+            continue
+        if b"specshield.service.warmup" in command and str(folder).encode() in environment:
+            found.append(process)
+    return found
+
+
+def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_path, held):
+    kernels, lock = held
+    with serving(tmp_path / "data", ready=False, NUMBA_CACHE_DIR=str(kernels)) as server:
+        wait_for(lambda: alive(server.url), 60.0)
+        for path in ("/readyz", "/v1/policies", "/v1/sessions/none"):
+            answer = httpx.get(f"{server.url}{path}")
+            assert answer.status_code == 503
+            assert answer.headers["retry-after"] == "1"
+            told = answer.json()
+            assert told["type"] == "starting"
+        for path in ("/livez", "/metrics", "/docs", "/openapi.json"):
+            assert httpx.get(f"{server.url}{path}").status_code == 200, path
+        assert told["kernels"]["compiled"] == 0 < told["kernels"]["expected"]
+        assert told["parts"] == {"reachability": "compiling", "dqn": "compiling"}
+        with ShieldClient(server.url, timeout=0.1) as client, pytest.raises(Starting):
+            client.policies.get("case1")
+        fcntl.flock(lock, fcntl.LOCK_UN)
+        wait_for(lambda: len(compiling(kernels)) == min(2, os.cpu_count()), 60.0)
+        server.kill()
+        wait_for(lambda: not compiling(kernels), 60.0)
+    assert re.search(r"INFO: +compiling the kernels: .* takes about \d+ s", server.log.read_text())
