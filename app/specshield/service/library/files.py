@@ -25,7 +25,7 @@ def ids(folder: Path) -> list[str]:
 
 
 def check_writable(folder: Path, name: str) -> None:
-    """Raises InputError where the folder, which is there or is made, takes no files. name: of its setting."""
+    """Makes the folder if need be. Raises InputError, by its setting's `name`, where no file can be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -48,7 +48,7 @@ def to_json(value: Any) -> bytes:
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """All of it on disk, or nothing. A folder that is there already (the same content) stays."""
+    """Writes all of the files, or none. A folder that is there already has the same content, and stays."""
     draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".draft-"))
     try:
         for name, content in files.items():
@@ -63,7 +63,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Replaces the file, whole."""
+    """Replaces the file as a whole: a reader sees the old one or the new one."""
     draft = path.with_name(f".draft-{path.name}")
     _write(draft, content)
     os.replace(draft, path)
@@ -71,7 +71,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Gone at once for others, then erased."""
+    """Takes the folder out of the others' sight at once, then erases it."""
     grave = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".deleted-"))
     if folder.is_dir():
         os.rename(folder, grave / folder.name)
@@ -88,7 +88,7 @@ def check_room(folder: Path, limit: int, what: str) -> None:
 
 
 def page(keys: Sequence[str], after: str | None, limit: int) -> tuple[list[str], str | None]:
-    """Up to `limit` of the keys in order, those after `after`; the one to go on after, None at the end."""
+    """The first `limit` keys after `after`, in order, and the `after` of the next page, None on the last."""
     rest = sorted(key for key in keys if after is None or key > after)
     return rest[:limit], rest[limit - 1] if len(rest) > limit else None
 
@@ -106,7 +106,7 @@ def rfc3339(seconds: float) -> str:
 
 
 class Recent(Generic[V]):
-    """The values used last, up to a number of them. Threads may share it; two may make one value at once."""
+    """Keeps the values that were used last. Threads may share it; two of them may make one value at once."""
 
     def __init__(self, room: int) -> None:
         self._room, self._values, self._lock = room, OrderedDict[Hashable, V](), threading.Lock()
@@ -124,7 +124,7 @@ class Recent(Generic[V]):
         return value
 
     def peek(self, key: Hashable) -> V | None:
-        """The value, if it is kept; it has been used then."""
+        """The value, if it is kept. Asking counts as a use of it."""
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)

@@ -52,7 +52,7 @@ class Map:
 
 
 class Maps:
-    """Blocking: files are read and written."""
+    """The calls block: they read and write files."""
 
     def __init__(self, settings: Settings) -> None:
         self._folder, self._limit = settings.data_dir / "maps", settings.max_maps
@@ -77,7 +77,7 @@ class Maps:
         )
 
     def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region]) -> Map:
-        """The map of this content: the one there is, or a new one. Raises LimitReached."""
+        """Keeps a map, unless there is one of this content already. Raises LimitReached."""
         id = _id(grid, rooms)
         try:
             return self.get(id)
@@ -90,7 +90,7 @@ class Maps:
         return self._recent.get(id, lambda: made)
 
     def page(self, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
-        """As JSON, since that is there without reading the cells."""
+        """One page of maps, as JSON, which can be had without reading the cells."""
         keys, following = files.page([*self._named, *files.ids(self._folder)], after, limit)
         return [self._shown(key) for key in keys], following
 

@@ -40,7 +40,7 @@ class Description:
 
 @dataclass(frozen=True)
 class Record:
-    """card: the trained policy's, None where there is none yet."""
+    """A policy that is known here. card: None until it is made."""
 
     id: str
     about: Description
@@ -51,7 +51,7 @@ class Record:
 
 
 class Policies:
-    """Blocking: files are read and written. A key is an id, or the name of one that came with the server."""
+    """The calls block on files. A key is an id, or the name of a policy that came with the server."""
 
     def __init__(self, settings: Settings, maps: Maps) -> None:
         self._maps, self._models, self._limit = maps, settings.models_dir, settings.max_policies
@@ -124,11 +124,11 @@ class Policies:
             return None
 
     def add(self, about: Description, task: Task) -> Record:
-        """A policy still to be trained, or the one there is. Raises LimitReached."""
+        """Notes a policy that is still to be made, unless there is one already. Raises LimitReached."""
         return self._add(Record(_id(about, task), about, task.horizon), {})
 
     def add_card(self, about: Description, card: Mapping[str, Any], weights: bytes) -> Record:
-        """A policy trained elsewhere, checked whole before it is kept. Raises PolicyError."""
+        """Keeps a policy that was made elsewhere, once all of it is checked. Raises PolicyError."""
         try:
             about = self.resolve(about)
             task = self.task(about)
@@ -160,7 +160,7 @@ class Policies:
         return found
 
     def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
-        """What a training made; the card last: it makes the policy ready. NotFound if it was deleted."""
+        """Keeps what a run made. The card comes last: it makes the policy ready. NotFound if it was deleted."""
         folder = self._folder / id
         if not folder.is_dir():
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)

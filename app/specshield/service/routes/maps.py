@@ -77,7 +77,7 @@ def _add(server: Server, name: Any, members: dict[str, Any], files: bool) -> Map
 
 @router.get("", response_model=MapList, summary="List the maps", responses=problems())
 async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """In order of name and id."""
+    """The maps, in order of name and id."""
     found, following = await asyncio.to_thread(server.maps.page, cursor, limit)
     return {"items": found, "next": following}
 

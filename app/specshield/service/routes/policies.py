@@ -143,7 +143,7 @@ def _show(server: Server, record: Record) -> dict[str, Any]:
     "", response_model=PolicyList, summary="List the policies", responses=problems(_503="The store is away.")
 )
 async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """In order of name and id."""
+    """The policies, in order of name and id."""
 
     def show() -> dict[str, Any]:
         found, following = server.policies.page(cursor, limit)

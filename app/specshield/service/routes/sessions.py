@@ -54,7 +54,7 @@ async def create(request: SessionRequest, server: ServerState) -> Any:
     "", response_model=SessionList, summary="List the sessions", responses=problems(_503="The store is away.")
 )
 async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """In order of id; ids that the server makes up are in order of time."""
+    """The sessions, in order of id; ids that the server makes up are in order of time."""
     found, following = await server.sessions.page(cursor, limit)
     return {"items": found, "next": following}
 
@@ -63,13 +63,13 @@ async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 10
     "/{session_id}", response_model=SessionResponse, summary="Read a session", responses=problems(**GONE)
 )
 async def read(session_id: SessionId, server: ServerState) -> Any:
-    """Where it stands; `next_t` is the step to ask for."""
+    """Where the session stands; `next_t` is the step to ask for."""
     return await server.sessions.read(session_id)
 
 
 @router.delete("/{session_id}", status_code=204, summary="Erase a session", responses=problems(**GONE))
 async def delete(session_id: SessionId, server: ServerState) -> Response:
-    """Its trajectory and answers with it."""
+    """Erases the session with its trajectory and its answers."""
     await server.sessions.delete(session_id)
     return Response(status_code=204)
 

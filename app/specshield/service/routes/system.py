@@ -13,7 +13,7 @@ router = APIRouter(tags=["system"])
 
 @router.get("/livez", summary="Is it alive?")
 async def livez() -> Health:
-    """Whether the process answers at all; asks nothing else."""
+    """Whether the process answers at all. It asks neither the store nor the kernels."""
     return Health(status="ok")
 
 
@@ -42,5 +42,5 @@ async def readyz(server: ServerState) -> Health:
     responses={200: {"content": {"text/plain": {}}, "description": "Prometheus text format."}},
 )
 async def show() -> Response:
-    """For Prometheus."""
+    """Counters and times, for Prometheus."""
     return Response(metrics.exposition(), media_type=metrics.MEDIA_TYPE)

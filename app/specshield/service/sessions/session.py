@@ -25,7 +25,7 @@ DIGEST = 32  # bytes that stand before each stored answer: of the request that i
 
 @dataclass(frozen=True)
 class State:
-    """What changes in a session. length: poses stored. next_t: the step after the last one decided."""
+    """What changes in a session. length: of the stored poses. next_t: the step after the last decided one."""
 
     length: int
     next_t: int
@@ -93,7 +93,7 @@ def describe(config: Mapping[str, Any], state: State) -> dict[str, Any]:
 
 
 def check_step(session: Session, request: StepRequest) -> None:
-    """What a step not decided before has to be."""
+    """Raises what is wrong with asking for a step that was not decided before."""
     state, t, last = session.state, request.t, session.config["max_steps"]
     if state.finished:
         raise over(session, t)
@@ -119,7 +119,7 @@ def check_step(session: Session, request: StepRequest) -> None:
 
 
 def replay(session: Session, request: StepRequest, digest: bytes) -> bytes:
-    """The stored answer, for the same request."""
+    """The stored answer. Raises StepConflict where it answered another request."""
     assert session.step is not None
     if session.step[:DIGEST] != digest:
         raise StepConflict(
@@ -134,7 +134,7 @@ def replay(session: Session, request: StepRequest, digest: bytes) -> bytes:
 
 
 def digest_of(request: StepRequest) -> bytes:
-    """Of what makes two requests one: x_t, logits, main_task_done and signals, as float64."""
+    """The digest of what makes two requests the same: x_t, logits, main_task_done and signals, as float64."""
     logits = None if request.logits is None else [-math.inf if v is None else v + 0.0 for v in request.logits]
     signals = sorted((request.signals or {}).items())
     content = repr([[float(v) + 0.0 for v in request.poses[-1]], logits, request.main_task_done, signals])

@@ -220,7 +220,7 @@ class Sessions:
         raise _contended(id)
 
     def _verdict(self, session: Session) -> tuple[str, tuple[float, float]]:
-        """Asks no policy: those of a session that is over may be gone."""
+        """Needs no policy, since those of a session that is over may have been deleted."""
         config = session.config
         task = self._policies.task(Description(config["map_id"], config["robot"], config["spec"], "", 0, {}))
         body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
@@ -252,7 +252,7 @@ class Sessions:
         return found
 
     async def _append(self, session: Session, state: State, t: int | None, step: bytes) -> bool:
-        """Only what is new is written; row 0 again with the first step, which brings its signals."""
+        """Writes only what is new, and row 0 once more with the first step, which brings its signals."""
         first = min(session.state.length, len(session.rows) - 1)
         offset = first * 8 * session.rows.shape[1]
         change = Change(files.to_json(asdict(state)), pack(session.rows[first:]), offset, t, step)

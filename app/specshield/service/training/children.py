@@ -21,7 +21,7 @@ log = logging.getLogger("specshield")
 
 
 class TrainingWorker:
-    """At most one a data folder, however many servers there are: it holds a lock while it lives.
+    """There is at most one for a data folder, however many servers share it: it holds a lock while it lives.
 
     methods: those that the worker makes policies by; none where it is another server's.
     """
@@ -68,7 +68,7 @@ def wants_worker(settings: Settings) -> bool:
 
 
 async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None) -> None:
-    """Start again whatever has died, until cancelled."""
+    """Starts the store and the worker again when they have died, until it is cancelled."""
     while True:
         try:
             if embedded is not None and not embedded.joined():

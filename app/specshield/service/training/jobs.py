@@ -30,7 +30,7 @@ return 1
 
 @dataclass(frozen=True)
 class Training:
-    """status: queued, training or failed. eta_s: estimate of the time left [s]."""
+    """How a run stands. status: queued, training or failed. eta_s: estimate of the time left [s]."""
 
     status: str
     progress: float = 0.0
@@ -76,7 +76,7 @@ class Jobs:
         self._try(enqueue)
 
     def get(self, id: str) -> Training:
-        """How the training of a policy stands; one never heard of has failed."""
+        """How the training of a policy stands. One that the store knows nothing of counts as failed."""
         found, alive = self._try(lambda: (self.redis.hgetall(_key(id)), self.redis.exists(_alive(id))))
         state = {name.decode(): value.decode() for name, value in found.items()}
         status, error = state.get("status", "failed"), state.get("error") or None
@@ -91,7 +91,7 @@ class Jobs:
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 
     def cancel(self, id: str) -> None:
-        """The run, if it has begun, stops within a second or so; if not, when its turn comes."""
+        """Cancels the run. One that has begun stops within about a second, a queued one at its turn."""
         fields = {"attempt": "", "status": "failed", "error": "cancelled", "eta_s": ""}
         self._try(lambda: self.redis.hset(_key(id), mapping=fields))
 

@@ -154,7 +154,7 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: thr
 
 @contextmanager
 def _regularly(action: Callable[[], object]) -> Iterator[None]:
-    """Several times within SIGN_OF_LIFE, in a thread, as long as the block lasts."""
+    """Repeats the action in a thread while the block lasts, several times within SIGN_OF_LIFE."""
     over = threading.Event()
 
     def repeat() -> None:
