@@ -25,7 +25,7 @@ def ids(folder: Path) -> list[str]:
 
 
 def check_writable(folder: Path, name: str) -> None:
-    """Makes the folder if need be. Raises InputError, by its setting's `name`, where no file can be written."""
+    """Makes the folder if need be. Raises InputError, with its setting's name, where it takes no files."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -160,7 +160,7 @@ class Policies:
         return found
 
     def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
-        """Keeps what a run made. The card comes last: it makes the policy ready. NotFound if it was deleted."""
+        """Keeps what a run made. The card comes last: it makes the policy ready. Raises NotFound."""
         folder = self._folder / id
         if not folder.is_dir():
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
