@@ -74,7 +74,7 @@ def _panel(case: Case, name: str, records: Sequence[Record]) -> Image.Image:
     """The runs of one method: blue where the rule is kept, orange where it is not, grey after its horizon."""
     canvas = Canvas(case.task, SCALE, above=TITLE)
     canvas.walls()
-    canvas.regions(9)
+    canvas.regions(10)
     for record in records:
         canvas.way(record.poses, BLUE if record.satisfied else ORANGE, 1.2)
         canvas.dot(record.poses[0], 2.5, INK, INK)

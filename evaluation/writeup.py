@@ -61,10 +61,10 @@ MODELS = {
   shield does. It probably bears being steered better than a model that never was.""",
 }
 NOT_THE_SAME = """\
-The paper's figures are of other models, maps and simulators; only the shapes of the rules and the number of
-runs are the same. The maps here are drawn, and their regions placed, so that a robot that only seeks its
-target breaks the rule. A region holds when the robot's origin is in it, as in the paper: a rule to stay out
-of a region does not keep the whole body out of it."""
+The paper's figures are of other models, maps and simulators; only the shapes of the rules are the same. The
+maps here are drawn, and their regions placed, so that a robot that only seeks its target breaks the rule. A
+region holds when the robot's origin is in it, as in the paper: a rule to stay out of a region does not keep
+the whole body out of it."""
 WHY_NEXT_STEP = """\
 Next-step methods notice a window at its last step only: when the place to visit is further away than one
 step, no action is left that reaches it in time. HCD keeps a G. What RCD adds to the logits leads straight
@@ -131,6 +131,10 @@ def _sections(
     yield "The models know no rule:"
     used = dict.fromkeys(_model(results) for results in found.values())
     yield "\n".join(f"- **{name}**: {MODELS[name]}" for name in used)
+    yield (
+        "In the pictures of ways, blue runs kept the rule and orange ones did not; what came after the "
+        "rule's horizon is grey."
+    )
     for kept, results in told.items():
         yield f"## {_title(results)}: method by method"
         yield _about(results)
