@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from specshield.client import Decision, Session, ShieldClient, Verdict
-from specshield.errors import NotFound, ServerError, StoreError, TransportError
+from specshield.errors import NotFound, ServerError, Starting, StoreError, TransportError
 from specshield.sim.cases import load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import Pose, SimulatedRobot
@@ -31,7 +31,12 @@ from specshield.sim.robot import Pose, SimulatedRobot
 T = TypeVar("T")
 POLICY = "case1"  # the rule: visit a charger within 60 steps, and again between steps 80 and 140
 START = (4.5, 5.0, 0.0)  # x [m], y [m], theta [rad]
-AWAY = (TransportError, StoreError, ServerError)  # what a call raises while the service cannot answer
+AWAY = (
+    TransportError,
+    Starting,
+    StoreError,
+    ServerError,
+)  # what a call raises while the service cannot answer
 PAUSE = 0.5  # [s] between two tries where there is nothing to do but wait
 NOTES = Path("robot_loop.json")
 
