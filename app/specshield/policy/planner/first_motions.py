@@ -15,7 +15,8 @@ from specshield.robot.dynamics import IMPOSSIBLE, motion_count, undo_motion
 from specshield.rule.values import REGIONS, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE
 
-# Of the effort of one plan, what a first motion may cost that the plan does not begin with. By hand.
+# The share of one plan's effort that a first motion may cost which the plan does not begin with; chosen by
+# hand, nothing measured.
 SHARE = 0.25
 
 Floats = NDArray[np.float64]
