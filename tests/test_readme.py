@@ -93,7 +93,7 @@ def test_commands_that_pages_name_are_there():
         for module in re.findall(r"-m ((?:benchmarks|evaluation)[\w.]*)", text):
             path = ROOT.joinpath(*module.split("."))
             assert path.with_suffix(".py").exists() or path.is_dir(), f"{page.name}: {module}"
-        for target in re.findall(r"`make (\w+)", text):
+        for target in re.findall(r"`make ([\w-]+)", text):
             assert re.search(rf"^{target}:", make, re.MULTILINE), f"{page.name}: make {target}"
         for file in re.findall(r"`((?:examples|tests|evaluation|benchmarks|app|docs)/[\w/.-]+)`", text):
             assert (ROOT / file).exists() or (page.parent / file).exists(), f"{page.name}: {file}"
