@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from specshield.compiled import kernel, leaf
 from specshield.lookahead.lattice import Planes
 from specshield.lookahead.surrogate import StandIn
-from specshield.policy.lattice import coordinates
+from specshield.policy.lattice import coordinates, corner
 from specshield.robot.dynamics import Body, displacement
 
 Singles = NDArray[np.float32]
@@ -259,18 +259,17 @@ def _at(body: Body, planes: Planes, table: NDArray[np.uint16], x: float, y: floa
     """Bilinear in a table [H, rows]."""
     headings = table.shape[0]
     v, u, h = coordinates(body, planes.pitch, headings, x, y, theta)
-    j, i, low = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
-    q, p, f = v - j, u - i, h - low
-    total, weights = 0.0, 0.0
-    for dj in range(2):
-        for di in range(2):
-            c = (j + dj + planes.pad) * planes.width + i + di + planes.pad
-            if c < 0 or c >= planes.row.shape[0] or planes.row[c] < 0:
-                continue
-            for dh in range(2):
-                w = (q if dj else 1.0 - q) * (p if di else 1.0 - p) * (f if dh else 1.0 - f)
-                code = table[(low + dh) % headings, planes.row[c]]
-                if w > 1e-6 and code != NO_CODE:
-                    total += w * code / CODES
-                    weights += w
+    low = int(np.floor(h))
+    f, total, weights = h - low, 0.0, 0.0
+    for n in range(4):
+        j, i, across = corner(v, u, n)
+        c = (j + planes.pad) * planes.width + i + planes.pad
+        if c < 0 or c >= planes.row.shape[0] or planes.row[c] < 0:
+            continue
+        for dh in range(2):
+            w = across * (f if dh else 1.0 - f)
+            code = table[(low + dh) % headings, planes.row[c]]
+            if w > 1e-6 and code != NO_CODE:
+                total += w * code / CODES
+                weights += w
     return float(total / weights + TIGHT * (1.0 - weights)) if weights > 1e-3 else float(UNKEEPABLE)

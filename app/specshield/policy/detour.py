@@ -1,6 +1,7 @@
-"""From a first motion onto a way that is known: by undoing it, or from the same place as another's.
+"""From a first motion onto a way that is already known: by undoing the motion, or because another motion led
+to the same place.
 
-Near a wall many motions end in the same pose; arcs of one length end in the same place, turned differently.
+Near a wall many motions end in the same pose. Arcs of one length end in the same place, turned differently.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ from numpy.typing import NDArray
 from specshield.compiled import leaf
 from specshield.robot.dynamics import IMPOSSIBLE, Body, turn_by, wrap
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
 
 @leaf
-def find_twins(poses: NDArray[np.float64], twin: NDArray[np.int64]) -> None:
-    """The first motion that ends in the very same pose, often itself, of each. poses (M, n, 3), twin (M,)."""
+def find_twins(poses: Floats, twin: Ints) -> None:
+    """For each motion, the first one that ends in the same pose, or itself. poses (M, n, 3), twin (M,)."""
     for m in range(poses.shape[0]):
         twin[m] = 0
         while twin[m] < m and not _same(poses, twin[m], m):
@@ -22,7 +26,7 @@ def find_twins(poses: NDArray[np.float64], twin: NDArray[np.int64]) -> None:
 
 
 @leaf
-def _same(poses: NDArray[np.float64], a: int, b: int) -> bool:
+def _same(poses: Floats, a: int, b: int) -> bool:
     same = True
     for i in range(3):
         same = same and poses[a, 0, i] == poses[b, 0, i]
@@ -30,8 +34,8 @@ def _same(poses: NDArray[np.float64], a: int, b: int) -> bool:
 
 
 @leaf
-def copy_way(motions: NDArray[np.int64], poses: NDArray[np.float64], source: int, target: int) -> None:
-    """What follows one first motion becomes what follows another. motions (M, n), poses (M, n, 3)."""
+def copy_way(motions: Ints, poses: Floats, source: int, target: int) -> None:
+    """Copies what follows the first motion `source` to `target`. motions (M, n), poses (M, n, 3)."""
     for i in range(1, motions.shape[1]):
         motions[target, i] = motions[source, i]
         for k in range(3):
@@ -39,20 +43,13 @@ def copy_way(motions: NDArray[np.int64], poses: NDArray[np.float64], source: int
 
 
 @leaf
-def find_sibling(
-    body: Body,
-    poses: NDArray[np.float64],
-    known: NDArray[np.int64],
-    motion: int,
-    waits: bool,
-    out: NDArray[np.int64],
-) -> None:
-    """How to come onto the way of one of the motions `known` that ends where `motion` does. out (3,): that
-    motion, -1 where there is none; the turn to make, -1 where the heading fits; after how many motions of
-    its way the robot is then on it: where that begins by turning, the turns are made at once. A robot that
-    cannot wait (`waits`) has to come onto it no sooner than the other.
+def find_sibling(body: Body, poses: Floats, known: Ints, motion: int, waits: bool, out: Ints) -> None:
+    """How to come onto the way of one of the motions `known` that ends at the place where `motion` does.
 
-    poses (M, n, 3): after each motion first.
+    Writes into out (3,): that other motion, -1 where there is none; the turn to make, NOT_NEEDED where the
+    heading fits; and after how many motions of its way the robot is then on it. Where that way begins with
+    turns, they are made at once. A robot that cannot wait (`waits` is false) may not be there sooner than the
+    other. poses (M, n, 3): of each motion's way.
     """
     out[0] = -1
     for k in range(known.shape[0]):
@@ -68,14 +65,12 @@ def find_sibling(
 
 
 @leaf
-def join(
-    turn: int, move: int, base: NDArray[np.int64], at: int, wait: int, motions: NDArray[np.int64]
-) -> None:
-    """Writes what follows motions[0] (T - t,): `turn` and `move` (-1: none is needed), which lead to where
-    `base` (T - t,) is after its first `at` motions, then the rest of `base`.
+def join(turn: int, move: int, base: Ints, at: int, wait: int, motions: Ints) -> None:
+    """Writes what follows the first of motions (T - t,): `turn` and `move` (or NOT_NEEDED), which lead to
+    where `base` (T - t,) is after its first `at` motions, then the rest of `base`.
 
-    The steps lost are made up for where `base` waits, those gained are waited for. wait: -1 for a robot that
-    cannot, which may not gain any.
+    Steps that are lost are made up for by leaving out waits of `base`; steps that are gained are waited for.
+    wait: the motion that waits, -1 for a robot that cannot; it may not gain any.
     """
     n, steps, behind = 1, motions.shape[0], 1 - at
     for extra in (turn, move):

@@ -1,9 +1,8 @@
-"""The lattice that reachability is computed on: poses at the crossings of x, y and heading, and where f
-leads from each.
+"""The lattice that tables are computed on: poses at the crossings of x, y and heading, where f leads from
+each of them, and what a table says between them.
 
-f leaves the lattice at once (6 degree headings, 0.2 m moves, contact), so values off it are interpolated,
-and what the
-tables say is a proposal: only exact simulation certifies.
+f leaves the lattice at once (turns of 6 degrees, moves of 0.2 m, contact), so values off it are interpolated.
+What a table says is therefore only a suggestion: the exact simulation certifies.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from specshield.compiled import inlined, kernel, leaf
 from specshield.robot.dynamics import (
     TOUCH,
     Body,
+    displacement,
     displacements,
     free_distance,
     in_collision,
@@ -29,36 +29,64 @@ from specshield.robot.dynamics import (
 from specshield.rule.progress import STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
+from specshield.task import Task
+
+Ints = NDArray[np.int64]
+Bits = NDArray[np.uint8]
+Singles = NDArray[np.float32]
+
 
 MAX_HEADINGS = 120
+USUAL_HEADINGS = 72  # where no number of headings up to MAX_HEADINGS fits every turn: 5 degrees each
+STEP_CODES = 64.0  # codes of a step in a table of steps
+INVALID = 65535  # the code of a pose that is in collision or breaks what the table keeps
+NO_TIME = -1.0  # in place of a step, where there is none
+SHORTEST_MOVE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere (chosen by hand)
 
 
 class Lattice(NamedTuple):
     """Poses [ny, nx, H] in the grid frame, spaced `pitch` [m] and 2 pi / H.
 
-    valid: the footprint is free. far_u, far_v [ny, nx, H, D]: where each of the D translating motions leads,
-    in cells of the lattice (-1: nowhere else); far_h: with which heading. turns [ny, nx, H, R]: whether each
-    turn is possible; shift [R]: by how many headings. reach: the longest move, in cells, rounded up.
+    valid: the footprint is free. far_u, far_v [ny, nx, H, D]: where each of the D moving motions leads, in
+    lattice coordinates, -1 where it leads nowhere else; far_h: the heading it ends in, rounded. turns
+    [ny, nx, H, R]: whether each of the R turns on the spot is possible; shift [R]: by how many headings.
+    reach: the longest move, in cells, rounded up.
     """
 
     pitch: float
     headings: int
-    valid: NDArray[np.uint8]
-    far_u: NDArray[np.float32]
-    far_v: NDArray[np.float32]
+    valid: Bits
+    far_u: Singles
+    far_v: Singles
     far_h: NDArray[np.int16]
-    turns: NDArray[np.uint8]
-    shift: NDArray[np.int64]
+    turns: Bits
+    shift: Ints
     reach: int
 
 
 def heading_count(rotations: list[float]) -> int:
-    """The fewest headings that every rotation is a multiple of; at least 4, at most MAX_HEADINGS."""
+    """The fewest headings, 4 to MAX_HEADINGS, that every rotation is a multiple of; else USUAL_HEADINGS."""
     for n in range(4, MAX_HEADINGS + 1):
         unit = 2.0 * math.pi / n
         if all(abs(r / unit - round(r / unit)) < 1e-6 for r in rotations):
             return n
-    return 72
+    return USUAL_HEADINGS
+
+
+def lattice_shape(task: Task, pitch: float) -> tuple[int, int, int]:
+    """Rows, columns and headings of the lattice for a task."""
+    height, width = (
+        max(math.ceil(n * task.grid.resolution / pitch - 1e-9), 1)
+        for n in (task.grid.height, task.grid.width)
+    )
+    return height, width, heading_count([turn for _, turn in task.robot.motions if turn != 0.0])
+
+
+def number_cells(used: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """The row that each cell in use has in a table, -1 for the others. used, result [ny, nx]."""
+    cell = np.full(used.shape, -1, np.int32)
+    cell[used] = np.arange(int(used.sum()))
+    return cell
 
 
 def make_lattice(body: Body, pitch: float) -> Lattice:
@@ -109,10 +137,91 @@ def coordinates(
     return v, u, h if h >= 0.0 else h + headings
 
 
+@inlined
+def corner(v: float, u: float, n: int) -> tuple[int, int, float]:
+    """Row and column of the nth (0 to 3) of the crossings about a place (v, u), and its bilinear weight."""
+    j, i = int(np.floor(v)), int(np.floor(u))
+    q, p = v - j, u - i
+    wj, wi = q if n >> 1 else 1.0 - q, p if n & 1 else 1.0 - p
+    return j + (n >> 1), i + (n & 1), wj * wi
+
+
+@inlined
+def interpolate(
+    cell: NDArray[np.int32], code: NDArray[np.uint16], zero: float, largest: int, nothing: float, v: float,
+    u: float, h: float,
+) -> float:  # fmt: skip
+    """A table of steps at lattice coordinates: linear in x, y and heading over the corners that are valid.
+
+    cell [ny, nx]: the row of each cell in `code` [cells, H], -1 if none. Codes are zero + STEP_CODES * steps,
+    or INVALID; what is above `largest` counts as that. nothing: the result where no corner is valid.
+    """
+    ny, nx = cell.shape
+    k = int(np.floor(h))
+    f = h - k
+    low, high = k % code.shape[1], (k + 1) % code.shape[1]
+    total, weights = 0.0, 0.0
+    for n in range(4):
+        j, i, across = corner(v, u, n)
+        if j < 0 or j >= ny or i < 0 or i >= nx or across == 0.0 or cell[j, i] < 0:
+            continue
+        row = cell[j, i]
+        w, found = across * (1.0 - f), code[row, low]
+        if w >= 1e-9 and found != INVALID:
+            total += w * (min(int(found), largest) - zero)
+            weights += w
+        w, found = across * f, code[row, high]
+        if w >= 1e-9 and found != INVALID:
+            total += w * (min(int(found), largest) - zero)
+            weights += w
+    return total / (STEP_CODES * weights) if weights > 1e-6 else nothing
+
+
+@leaf
+def bilinear(valid: Bits, table: Singles, v: float, u: float, h: int) -> float:
+    """A table [ny, nx, H] at a place and one heading, over the corners whose pose is valid; NO_TIME where
+    none is.
+    """
+    ny, nx = table.shape[0], table.shape[1]
+    total, weights = 0.0, 0.0
+    for n in range(4):
+        j, i, w = corner(v, u, n)
+        if j < 0 or j >= ny or i < 0 or i >= nx or w == 0.0 or not valid[j, i, h]:
+            continue
+        total += w * table[j, i, h]
+        weights += w
+    return total / weights if weights > 1e-6 else NO_TIME
+
+
+@inlined
+def coordinates_ahead(
+    body: Body, pitch: float, headings: int, x: float, y: float, theta: float
+) -> tuple[float, float, float, float, float]:
+    """A pose's lattice coordinates (v, u, h), and the cells that a metre ahead leads along v and u."""
+    v, u, h = coordinates(body, pitch, headings, x, y, theta)
+    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
+    return v, u, h, math.sin(grid_theta) / pitch, math.cos(grid_theta) / pitch
+
+
+@inlined
+def heading_after(headings: int, h: float, angle: float) -> float:
+    """The heading in [0, H) after a turn [rad]."""
+    w = h + angle * headings / (2.0 * math.pi)
+    return w if w >= 0.0 else w + headings
+
+
+@inlined
+def leads_back(body: Body, last: int, motion: int) -> bool:
+    """Whether a motion goes or turns the other way than the one before; `last` is -1 for none."""
+    if last < 0:
+        return False
+    before, turn = displacement(body, last)
+    d, angle = displacement(body, motion)
+    return bool(d * before < 0.0 or angle * turn < 0.0)
+
+
 @kernel
-def _simulate_all(
-    body: Body, lattice: Lattice, moving: NDArray[np.int64], turning: NDArray[np.int64]
-) -> None:
+def _simulate_all(body: Body, lattice: Lattice, moving: Ints, turning: Ints) -> None:
     ny, nx, headings = lattice.valid.shape
     turns_within = swing_radius(body) + TOUCH
     moves_within = turns_within + longest_motions(body)[0]
@@ -144,7 +253,7 @@ def _simulate_all(
 
 
 @kernel
-def holds_at(body: Body, rules: Rules, lattice: Lattice) -> NDArray[np.uint8]:
+def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bits:
     """Where each obligation's predicate holds, [K, ny, nx, H]; 0 where the pose is not valid."""
     ny, nx, headings = lattice.valid.shape
     out = np.zeros((rules.kind.shape[0], ny, nx, headings), np.uint8)

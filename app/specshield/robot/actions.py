@@ -86,29 +86,10 @@ def _stretch() -> Robot:
         "ls": (0.0, nudge),
         "rs": (0.0, -nudge),
     }
-    tokens = [
-        "m",
-        "r",
-        "l",
-        "b",
-        "end",
-        "sub_done",
-        "ls",
-        "rs",
-        "p",
-        "zm",
-        "zp",
-        "yp",
-        "ym",
-        "wp",
-        "wm",
-        "yms",
-        "zms",
-        "zps",
-        "yps",
-        "d",
-    ]
-    actions = tuple(Action(name, *moves.get(name, (0.0, 0.0)), terminal=name == "end") for name in tokens)
+    tokens = "m r l b end sub_done ls rs p zm zp yp ym wp wm yms zms zps yps d"
+    actions = tuple(
+        Action(name, *moves.get(name, (0.0, 0.0)), terminal=name == "end") for name in tokens.split()
+    )
     return Robot("stretch", radius=0.1855, offset=(-0.109, 0.0), on_contact="stop", actions=actions)
 
 

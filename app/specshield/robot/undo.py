@@ -12,6 +12,9 @@ from specshield.robot.actions import Robot
 from specshield.robot.body import Body, wrap
 from specshield.robot.unicycle import step
 
+Floats = NDArray[np.float64]
+
+
 SAME_ANGLE = 1e-9  # [rad] angles that differ by less are the same: far above rounding, far below any turn
 SAME_POSE = 1e-6  # [m, rad] poses that differ by less are the same: ten times what a contact leaves (SKIN)
 NOT_NEEDED, IMPOSSIBLE = -1, -2  # in place of a motion
@@ -42,7 +45,7 @@ def move_back(body: Body, motion: int, moved: float) -> int:
 
 
 @leaf
-def undo_motion(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float64]) -> int:
+def undo_motion(body: Body, pose: Floats, reached: Floats) -> int:
     """The motion that leads from `reached` (3,) back to `pose` (3,), contact included; NOT_NEEDED where the
     two are the same, IMPOSSIBLE where no motion does it.
     """
@@ -56,7 +59,7 @@ def undo_motion(body: Body, pose: NDArray[np.float64], reached: NDArray[np.float
 
 
 @leaf
-def _is_near(x: float, y: float, theta: float, pose: NDArray[np.float64]) -> bool:
+def _is_near(x: float, y: float, theta: float, pose: Floats) -> bool:
     turn = abs(theta - pose[2])
     near = min(turn, 2.0 * math.pi - turn) < SAME_POSE
     return bool(abs(x - pose[0]) + abs(y - pose[1]) < SAME_POSE and near)

@@ -15,6 +15,8 @@ from specshield.compiled import inlined, leaf
 from specshield.robot.body import Body, centre, wrap
 from specshield.robot.contact import TOUCH, can_turn, room_around, way_ahead
 
+Floats = NDArray[np.float64]
+
 
 @leaf
 def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[float, float, float]:
@@ -65,9 +67,7 @@ def _end(
 
 
 @leaf
-def simulate(
-    body: Body, pose: NDArray[np.float64], motions: NDArray[np.int64], out: NDArray[np.float64]
-) -> None:
+def simulate(body: Body, pose: Floats, motions: NDArray[np.int64], out: Floats) -> None:
     """The trajectory of a list of motions. pose (3,), motions (n,), out (n, 3): the poses after each."""
     x, y, theta = pose[0], pose[1], pose[2]
     for k in range(motions.shape[0]):
@@ -76,7 +76,7 @@ def simulate(
 
 
 @inlined
-def successors(body: Body, pose: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def successors(body: Body, pose: Floats, out: Floats) -> None:
     """The pose after each motion: `step`, with what the motions share done once. pose (3,), out (M, 3)."""
     x, y, theta = pose[0], pose[1], pose[2]
     cos, sin = math.cos(theta), math.sin(theta)

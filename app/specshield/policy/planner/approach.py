@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf, merged
+from specshield.policy.lattice import SHORTEST_MOVE
 from specshield.policy.planner.due_dates import read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
 from specshield.policy.planner.literals import PREDICATE
@@ -18,7 +19,6 @@ from specshield.robot.dynamics import displacement, motion_count, step
 # Chosen by hand; nothing measured.
 STUCK_AFTER = 6  # [steps] without a gain after which a descent is stuck
 GAIN = 0.25  # [steps] nearer than ever before: what counts as a gain
-SHORTEST_MOVE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere
 DETOURS = 4  # beams out of places where one descent is stuck
 DETOUR_LENGTH = 24  # [steps] of such a beam, at most
 DETOUR_GAIN = 2.0  # [steps] nearer than where the descent was stuck: what such a beam has to reach

@@ -5,23 +5,33 @@ They are computed on the lattice, by the sweeps of reachability.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf
-from specshield.policy.lattice import Lattice, coordinates, pose_of
-from specshield.policy.reachability.latest import NEVER, sweep
+from specshield.policy.lattice import (
+    INVALID,
+    NO_TIME,
+    STEP_CODES,
+    Lattice,
+    coordinates,
+    coordinates_ahead,
+    heading_after,
+    interpolate,
+    leads_back,
+    pose_of,
+)
+from specshield.policy.reachability.latest import sweep
 from specshield.robot.dynamics import Body, displacement
 from specshield.rule.values import REGIONS, fill_place, fill_pose, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE, Programs, evaluate_packed
 from specshield.world.regions import PackedRegions
 
 OUT_OF_REACH = 1000.0  # [steps] what is farther counts as out of reach
-SCALE = 64.0  # codes a step
-UNREACHED, INVALID = 65534, 65535
+MOST = int(STEP_CODES * OUT_OF_REACH)  # the code of OUT_OF_REACH
+UNREACHED = 65534  # the code of what no way leads from; read as MOST
 
 Floats = NDArray[np.float64]
 
@@ -29,8 +39,8 @@ Floats = NDArray[np.float64]
 class Fields(NamedTuple):
     """Steps to go, stored over the cells that have a free pose.
 
-    cell [ny, nx]: row of `code`, -1 where no pose is free. code [F, cells, H]: SCALE steps to go, UNREACHED,
-    or INVALID for a pose that is in collision or breaks what the field keeps.
+    cell [ny, nx]: row of `code`, -1 where no pose is free. code [F, cells, H]: STEP_CODES * steps to go,
+    UNREACHED, or INVALID for a pose that is in collision or breaks what the field keeps.
     """
 
     cell: NDArray[np.int32]
@@ -71,42 +81,17 @@ def values_at(
 def steps_to(lattice: Lattice, goal: NDArray[np.bool_], keeps: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """The field of one goal as codes [ny, nx, H], over the free poses that `keeps` allows."""
     valid = np.ascontiguousarray(lattice.valid & keeps)
-    latest = np.where(goal & (valid == 1), np.float32(OUT_OF_REACH), np.float32(NEVER))
+    latest = np.where(goal & (valid == 1), np.float32(OUT_OF_REACH), np.float32(NO_TIME))
     sweep(lattice, valid, 0.0, latest)
-    code = np.where(latest >= 0.0, np.ceil(SCALE * (OUT_OF_REACH - latest)), UNREACHED).astype(np.uint16)
+    code = np.where(latest >= 0.0, np.ceil(STEP_CODES * (OUT_OF_REACH - latest)), UNREACHED).astype(np.uint16)
     code[valid == 0] = INVALID
     return code
 
 
 @leaf
 def to_go(fields: Fields, f: int, v: float, u: float, h: float) -> float:
-    """Steps to go at lattice coordinates: linear over the corners that are valid; inf where none is near."""
-    ny, nx = fields.cell.shape
-    headings = fields.code.shape[2]
-    j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
-    q, p, r = v - j, u - i, h - k
-    low, high = k % headings, (k + 1) % headings
-    total, weights = 0.0, 0.0
-    for dj in range(2):
-        wj = q if dj else 1.0 - q
-        if j + dj < 0 or j + dj >= ny or wj == 0.0:
-            continue
-        for di in range(2):
-            wi = wj * (p if di else 1.0 - p)
-            if i + di < 0 or i + di >= nx or wi == 0.0:
-                continue
-            row = fields.cell[j + dj, i + di]
-            if row < 0:
-                continue
-            code = fields.code[f, row, low]
-            if wi * (1.0 - r) >= 1e-9 and code != INVALID:
-                total += wi * (1.0 - r) * (code if code != UNREACHED else SCALE * OUT_OF_REACH)
-                weights += wi * (1.0 - r)
-            code = fields.code[f, row, high]
-            if wi * r >= 1e-9 and code != INVALID:
-                total += wi * r * (code if code != UNREACHED else SCALE * OUT_OF_REACH)
-                weights += wi * r
-    return total / (SCALE * weights) if weights > 1e-6 else np.inf
+    """Steps to go at lattice coordinates; inf where no corner is valid."""
+    return interpolate(fields.cell, fields.code[f], 0.0, MOST, np.inf, v, u, h)
 
 
 @leaf
@@ -122,14 +107,10 @@ def to_go_after(
 ) -> None:
     """Steps to go after each motion (M,), contact left out; inf for what leads straight back after `last`."""
     headings = fields.code.shape[2]
-    v, u, h = coordinates(body, fields.pitch, headings, x, y, theta)
-    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
-    cos, sin = math.cos(grid_theta) / fields.pitch, math.sin(grid_theta) / fields.pitch
-    moved, turned = displacement(body, last) if last >= 0 else (0.0, 0.0)
+    v, u, h, dv, du = coordinates_ahead(body, fields.pitch, headings, x, y, theta)
     for m in range(out.shape[0]):
         d, angle = displacement(body, m)
-        if d * moved < 0.0 or angle * turned < 0.0 or (d == 0.0 and angle == 0.0):
+        if leads_back(body, last, m) or (d == 0.0 and angle == 0.0):
             out[m] = np.inf
             continue
-        w = h + angle * headings / (2.0 * math.pi)
-        out[m] = to_go(fields, f, v + d * sin, u + d * cos, w if w >= 0.0 else w + headings)
+        out[m] = to_go(fields, f, v + d * dv, u + d * du, heading_after(headings, h, angle))

@@ -31,7 +31,7 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
-from specshield.policy.lattice import Lattice, heading_count, make_lattice, pose_of
+from specshield.policy.lattice import Lattice, lattice_shape, make_lattice, number_cells, pose_of
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to, values_at
@@ -189,8 +189,7 @@ def synthesise(
                     allowed &= holds[g] | holds[k] if ended else holds[g]
                 codes[k, keeps] = steps_to(lattice, holds[k], allowed)[used]
             chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
-    cell = np.full(used.shape, -1, np.int32)
-    cell[used] = np.arange(int(used.sum()))
+    cell = number_cells(used)
     code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
     fields = Fields(cell, code, settings.pitch)
     # Trying it also leaves its kernels compiled where a server finds them.
@@ -212,7 +211,7 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
     cell, code, chosen = named_arrays(
         read_tensors(weights), {"cell": (np.int32, 2), "code": (np.uint16, 3), "chosen": (np.int32, 2)}
     )
-    ny, nx, headings = _shape(task, settings)
+    ny, nx, headings = lattice_shape(task, settings.pitch)
     fits = (
         cell.shape == (ny, nx) and code.shape[2] == headings and chosen.shape == (len(literals), 2)
         and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
@@ -230,7 +229,7 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
 def check(task: Task, settings: Settings) -> None:
     """Raises what `synthesise` would for a task it cannot serve, without making anything."""
     _, literals = literals_of(task, task.formula)
-    ny, nx, headings = _shape(task, settings)
+    ny, nx, headings = lattice_shape(task, settings.pitch)
     fields = min(2 * len(literals), MAX_FIELDS)
     if ny * nx * headings * fields > MAX_ENTRIES:
         raise PolicyError(
@@ -238,14 +237,6 @@ def check(task: Task, settings: Settings) -> None:
             got=f"{fields} fields of {ny} x {nx} x {headings} poses",
             expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer predicates",
         )  # fmt: skip
-
-
-def _shape(task: Task, settings: Settings) -> tuple[int, int, int]:
-    ny, nx = (
-        max(math.ceil(n * task.grid.resolution / settings.pitch - 1e-9), 1)
-        for n in (task.grid.height, task.grid.width)
-    )
-    return ny, nx, heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
 
 
 def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
-"""A beam over the tables: several ways at once, where following the tables comes too late or gets stuck.
+"""A beam over the tables: many ways at once, where following the tables one way comes too late or gets stuck.
 
-One beam serves every first motion that is still open. Ways that meet go on as one, for all the motions they
-began with, and each motion has its share of the poses that are kept.
+One beam serves several first motions, its roots. Ways that meet go on as one, for all the roots that they
+come from, and each root has its share of the poses that are kept.
 """
 
 from __future__ import annotations
@@ -13,63 +13,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, kernel, leaf
+from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, update_progress
 from specshield.policy.reachability.tables import SAFE, is_broken, score, slack
-from specshield.policy.reachability.work import Guide, Work, observe
 from specshield.robot.dynamics import motion_count, step
 
-MAX_ROOTS = 62  # bits of a tag
-ROOM = 128  # poses kept at a step, at most
-MANY = 16  # motions from a pose: of more, only those that are nearly the best
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Statuses = NDArray[np.int8]
+
+MAX_ROOTS = 62  # bits of a tag, which is an int64
+
+# Chosen by hand; nothing measured.
+MAX_KEPT = 128  # poses kept at a step, unless one root alone has a larger share
+MAX_TRIED = 16  # motions from a pose; of more, only those with nearly the best score are tried
+WIDEST_GAP, NARROWEST_GAP = 4.0, 0.1  # [steps] how far below the best score such a motion may be
 EASY = 8.0  # [steps] of slack after a goal was settled: from there the tables can be followed again
-TWIN = 1e3  # [1/m, 1/rad] poses as near as a millimetre count as one
+POSE_GRAIN = 1e3  # [1/m, 1/rad] poses that round to the same multiples of its inverse count once
 
 
 class Poses(NamedTuple):
-    """Poses with their progress, slack, and the roots that lead to them, as bits."""
+    """Poses at one step [N], with the progress, the slack [steps] and the roots they come from, as bits."""
 
-    pose: NDArray[np.float64]
-    status: NDArray[np.int8]
-    run: NDArray[np.int64]
-    slack: NDArray[np.float64]
-    tag: NDArray[np.int64]
+    pose: Floats
+    status: Statuses
+    run: Ints
+    slack: Floats
+    tag: Ints
 
 
 class Edges(NamedTuple):
-    """What led to the poses kept at each step: [steps, edges], made [steps] of them; tag [steps, poses] as in
-    `Poses`.
+    """The motions that led from the poses of each step to those of the next.
+
+    child, parent, motion [steps, edges], of which made [steps] count; tag [steps, poses]: as in `Poses`.
     """
 
     child: NDArray[np.int32]
     parent: NDArray[np.int32]
     motion: NDArray[np.int32]
-    made: NDArray[np.int64]
-    tag: NDArray[np.int64]
+    made: Ints
+    tag: Ints
 
 
 @kernel
-def beam(
-    guide: Guide,
-    t: int,
-    pose: NDArray[np.float64],
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-    share: int,
-    band: float,
-    target: float,
-    work: Work,
-    motions: NDArray[np.int64],
-    taken: NDArray[np.int64],
-) -> None:
-    """Keeps the poses with the most slack at every step until each root has a way, or none is left.
+def beam_search(
+    guide: Guide, t: int, pose: Floats, status: Statuses, run: Ints, share: int, band: float, target: float,
+    scratch: Scratch, motions: Ints, taken: Ints,
+) -> None:  # fmt: skip
+    """Keeps the poses of most slack at every step, until each root has a way or no pose is left.
 
-    pose (R, 3), status, run (R, K): the roots, at step t, R <= MAX_ROOTS. share: poses kept for each root.
-    band: poses with less slack than this are given up. A way ends where every goal is settled, where one
-    more is and EASY steps are to spare, or where the latest feasible time is above `target`. Writes motions
-    (R, n) and how many of them lead there, taken (R,), 0 where no way was found.
+    pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. share: the poses kept for each root.
+    band: a pose with less slack [steps] is given up. A way ends where every goal is settled, where one more
+    goal is settled and EASY steps are to spare, or where the latest feasible time [steps] is above `target`.
+    Writes each root's way into motions (R, n) and its length into taken (R,), 0 where none was found.
     """
     roots, k_count = status.shape
     steps = motions.shape[1]
-    width = max(min(share * roots, ROOM), share)
+    width = max(min(share * roots, MAX_KEPT), share)
     room = width * motion_count(guide.body)
     here, new = _poses(width, k_count), _poses(room, k_count)
     edges = Edges(
@@ -86,7 +85,7 @@ def beam(
     open_roots, count = (1 << roots) - 1, roots
     for n in range(steps):
         table[:] = -1
-        found = _expand(guide, t, n, count, open_roots, band, here, new, edges, table, work)
+        found = _expand(guide, t, n, count, open_roots, band, here, new, edges, table, scratch)
         open_roots = _finish(t, n, found, open_roots, target, status, new, edges, motions, taken)
         if open_roots == 0:
             return
@@ -107,36 +106,18 @@ def _poses(n: int, k: int) -> Poses:
     )
 
 
-@leaf
-def _copy(from_: Poses, i: int, to: Poses, j: int) -> None:
-    for d in range(3):
-        to.pose[j, d] = from_.pose[i, d]
-    for k in range(from_.status.shape[1]):
-        to.status[j, k], to.run[j, k] = from_.status[i, k], from_.run[i, k]
-
-
 @inlined
-def _put(to: Poses, i: int, x: float, y: float, theta: float, work: Work) -> None:
+def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Statuses, run: Ints) -> None:
     to.pose[i, 0], to.pose[i, 1], to.pose[i, 2] = x, y, theta
-    for k in range(to.status.shape[1]):
-        to.status[i, k], to.run[i, k] = work.status[k], work.run[k]
+    copy_progress(status, run, to.status[i], to.run[i])
 
 
 @leaf
 def _expand(
-    guide: Guide,
-    t: int,
-    n: int,
-    count: int,
-    open_roots: int,
-    band: float,
-    here: Poses,
-    new: Poses,
-    edges: Edges,
-    table: NDArray[np.int32],
-    work: Work,
-) -> int:
-    """Every motion from every pose kept, into `new`, twins once; returns how many."""
+    guide: Guide, t: int, n: int, count: int, open_roots: int, band: float, here: Poses, new: Poses,
+    edges: Edges, table: NDArray[np.int32], scratch: Scratch,
+) -> int:  # fmt: skip
+    """Makes every motion from the first `count` poses of `here`; each new pose is written once. How many."""
     body, rules, tables, wait = guide
     found, joined = 0, 0
     for w in range(count):
@@ -144,16 +125,15 @@ def _expand(
         if here.tag[w] & open_roots == 0:
             continue
         x, y, theta = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
-        score(body, rules, tables, x, y, theta, t + n, here.status[w], here.run[w], wait, -1, work.scores)
-        lowest = max(band + t + n + 1, _lowest(work.scores))
+        score(body, rules, tables, x, y, theta, t + n, here.status[w], here.run[w], wait, -1, scratch.scores)
+        lowest = max(band + t + n + 1, _lowest(scratch.scores))
         for m in range(motion_count(body)):
-            if work.scores[m] < lowest:
+            if scratch.scores[m] < lowest:
                 continue
             x, y, theta = step(body, here.pose[w, 0], here.pose[w, 1], here.pose[w, 2], m)
-            for k in range(here.status.shape[1]):
-                work.status[k], work.run[k] = here.status[w, k], here.run[w, k]
-            observe(rules, t + n + 1, x, y, theta, work)
-            _put(new, found, x, y, theta, work)
+            copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
+            update_progress(rules, t + n + 1, x, y, theta, scratch)
+            _put(new, found, x, y, theta, scratch.status, scratch.run)
             at = _place(new, found, table)
             if at == found:
                 new.slack[at] = slack(
@@ -170,19 +150,19 @@ def _expand(
 
 
 @leaf
-def _lowest(scores: NDArray[np.float64]) -> float:
-    """The score from which on a motion is tried: of many motions only those that are nearly the best."""
-    if scores.shape[0] <= MANY:
+def _lowest(scores: Floats) -> float:
+    """The lowest score with which a motion is tried, so that about MAX_TRIED are."""
+    if scores.shape[0] <= MAX_TRIED:
         return -np.inf
     best = -np.inf
     for m in range(scores.shape[0]):
         best = max(best, scores[m])
-    gap = 4.0
-    while gap > 0.1:
+    gap = WIDEST_GAP
+    while gap > NARROWEST_GAP:
         count = 0
         for m in range(scores.shape[0]):
             count += scores[m] >= best - gap
-        if count <= MANY:
+        if count <= MAX_TRIED:
             break
         gap *= 0.5
     return best - gap
@@ -190,18 +170,10 @@ def _lowest(scores: NDArray[np.float64]) -> float:
 
 @leaf
 def _finish(
-    t: int,
-    n: int,
-    found: int,
-    open_roots: int,
-    target: float,
-    status: NDArray[np.int8],
-    new: Poses,
-    edges: Edges,
-    motions: NDArray[np.int64],
-    taken: NDArray[np.int64],
-) -> int:
-    """Notes the way of every root that has one now; returns the roots that are still open."""
+    t: int, n: int, found: int, open_roots: int, target: float, status: Statuses, new: Poses, edges: Edges,
+    motions: Ints, taken: Ints,
+) -> int:  # fmt: skip
+    """Writes the way of every root that has one now; returns the roots that are still open, as bits."""
     for c in range(found):
         arrived = new.tag[c] & open_roots
         ahead = new.slack[c]
@@ -222,19 +194,13 @@ def _finish(
 
 @leaf
 def _select(
-    order: NDArray[np.int64],
-    n: int,
-    open_roots: int,
-    width: int,
-    share: int,
-    band: float,
-    kept: NDArray[np.int64],
-    place: NDArray[np.int64],
-    here: Poses,
-    new: Poses,
-    edges: Edges,
-) -> int:
-    """The poses of `new` to go on with, into `here`: the most slack first, until each root has its share."""
+    order: Ints, n: int, open_roots: int, width: int, share: int, band: float, kept: Ints, place: Ints,
+    here: Poses, new: Poses, edges: Edges,
+) -> int:  # fmt: skip
+    """Puts the poses to go on with into `here`, most slack first, until each root has its share. How many.
+
+    order: the rows of `new` by falling slack. The edges to poses that are not kept are taken out.
+    """
     for r in range(kept.shape[0]):
         kept[r] = 0
     count, full = 0, 0  # full: the roots that have their share
@@ -248,7 +214,7 @@ def _select(
             kept[r] += tag >> r & 1
             if kept[r] >= share:
                 full |= 1 << r
-        _copy(new, o, here, count)
+        _put(here, count, new.pose[o, 0], new.pose[o, 1], new.pose[o, 2], new.status[o], new.run[o])
         here.tag[count], place[o] = tag, count
         count += 1
     joined = 0
@@ -264,7 +230,9 @@ def _select(
 
 @leaf
 def _place(new: Poses, found: int, table: NDArray[np.int32]) -> int:
-    """The pose that `found` is a twin of, progress included; else `found` itself, noted in the table."""
+    """The row of `new` whose pose and progress are those of row `found`: an earlier one, or `found` itself,
+    which is then put into the hash table.
+    """
     x, y, theta = _rounded(new.pose, found)
     key = x * 73856093 ^ y * 19349663 ^ theta * 83492791
     for k in range(new.status.shape[1]):
@@ -285,17 +253,17 @@ def _place(new: Poses, found: int, table: NDArray[np.int32]) -> int:
 
 
 @leaf
-def _rounded(poses: NDArray[np.float64], i: int) -> tuple[int, int, int]:
+def _rounded(poses: Floats, i: int) -> tuple[int, int, int]:
     return (
-        math.floor(TWIN * poses[i, 0] + 0.5),
-        math.floor(TWIN * poses[i, 1] + 0.5),
-        math.floor(TWIN * poses[i, 2] + 0.5),
+        math.floor(POSE_GRAIN * poses[i, 0] + 0.5),
+        math.floor(POSE_GRAIN * poses[i, 1] + 0.5),
+        math.floor(POSE_GRAIN * poses[i, 2] + 0.5),
     )
 
 
 @leaf
-def _trace(n: int, at: int, root: int, edges: Edges, motions: NDArray[np.int64]) -> None:
-    """The motions from `root` to pose `at` of step n, into motions[:n + 1]."""
+def _trace(n: int, at: int, root: int, edges: Edges, motions: Ints) -> None:
+    """Writes the motions from a root to pose `at` of step n into motions[:n + 1]."""
     for layer in range(n, -1, -1):
         for e in range(edges.made[layer]):
             if edges.child[layer, e] == at and edges.tag[layer, edges.parent[layer, e]] >> root & 1:

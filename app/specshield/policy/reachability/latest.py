@@ -1,19 +1,17 @@
 """The latest feasible time: one number a pose and progress from which a formula can still be satisfied.
 
-Where the robot can wait, and as long as no `always` begins or ends, feasibility is monotone in time: what
-can be
-done from time t can be done from any earlier one, by waiting. So time falls into phases, in which the same
-`always` hold, and in each phase, with p the set of settled goals,
+Where the robot can wait, and as long as no `always` begins or ends, feasibility is monotone in time: what can
+be done from time t can be done from any earlier time, by waiting. So time falls into phases, in each of which
+the same `always` hold. In each phase, with p the set of settled goals,
 
-    L(s, p) = max( max_a L(f(s, a), p) - 1,   max_J m(s, p, J),   the phase's end if the next one can be
-    entered )
+    L(s, p) = max( max_a L(f(s, a), p) - 1,
+                   max_J m(s, p, J),
+                   the phase's end, if the next phase can be entered from s )
 
-m(s, p, J) is the latest time from which waiting at s settles all of the goals J and leaves L(s, p + J)
-ahead: for
-F[a,b] at most b, with L >= a; for F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, at most c1 + c2 and L -
-n + 1,
-with L >= a + b. Backward dynamic programming, by in-place semi-Lagrangian sweeps (values off the lattice
-bilinear).
+m(s, p, J) is the latest time from which waiting at s settles all of the goals J and leaves L(s, p + J) ahead.
+For F[a,b] that is at most b, and L >= a has to hold. For F[a,c1] G[c2,b], a dwell of n = b - c2 + 1 steps, it
+is at most c1 + c2 and L - n + 1, and L >= a + b has to hold. This is backward dynamic programming by in-place
+semi-Lagrangian sweeps, bilinear between the lattice's crossings.
 """
 
 from __future__ import annotations
@@ -23,34 +21,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.compiled import kernel, leaf
-from specshield.policy.lattice import Lattice
+from specshield.compiled import kernel
+from specshield.policy.lattice import NO_TIME, Lattice, bilinear
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
-NEVER = -1.0
-SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged
+Ints = NDArray[np.int64]
+Bits = NDArray[np.uint8]
+Singles = NDArray[np.float32]
 
 
-def masks_of(rules: Rules, goals: NDArray[np.int64]) -> list[int]:
+SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged (chosen by hand)
+MAX_SWEEPS = 100_000  # far more than any map needs; it only bounds the loop
+
+
+def masks_of(rules: Rules, goals: Ints) -> list[int]:
     """The sets of settled goals (bit g for goals[g]) that some trajectory can have, the fullest first.
 
     j cannot be settled before k where j's window begins after k's ends.
     """
+    earliest = rules.a + np.where(rules.kind == EVENTUALLY_ALWAYS, rules.b, 0)
     possible = []
     for mask in range(1 << len(goals)):
         missing = [goals[g] for g in range(len(goals)) if not mask >> g & 1]
         have = [goals[g] for g in range(len(goals)) if mask >> g & 1]
-        if all(_earliest(rules, j) <= _latest(rules, k) for j in have for k in missing):
+        if all(earliest[j] <= rules.last[k] for j in have for k in missing):
             possible.append(mask)
-    return sorted(possible, key=lambda m: -bin(m).count("1"))
-
-
-def _earliest(rules: Rules, k: int) -> int:
-    return int(rules.a[k] + (rules.b[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0))
-
-
-def _latest(rules: Rules, k: int) -> int:
-    return int(rules.last[k])
+    return sorted(possible, key=lambda m: -m.bit_count())
 
 
 @dataclass(frozen=True)
@@ -76,19 +72,14 @@ def phases_of(rules: Rules, horizon: int) -> tuple[Phase, ...]:
 
 
 def latest_times(
-    lattice: Lattice,
-    rules: Rules,
-    holds: NDArray[np.uint8],
-    goals: NDArray[np.int64],
-    masks: list[int],
-    phases: tuple[Phase, ...],
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """L for each phase and mask, [phases, masks, ny, nx, H], NEVER where there is no such time in the phase.
+    lattice: Lattice, rules: Rules, holds: Bits, goals: Ints, masks: list[int], phases: tuple[Phase, ...]
+) -> tuple[Singles, Bits]:
+    """L for each phase and mask, [phases, masks, ny, nx, H], NO_TIME where the phase has none.
 
     Also where a pose is free and keeps the phase's `always`, [phases, ny, nx, H].
     """
     index = {mask: n for n, mask in enumerate(masks)}
-    tables = np.full((len(phases), len(masks), *lattice.valid.shape), NEVER, np.float32)
+    tables = np.full((len(phases), len(masks), *lattice.valid.shape), NO_TIME, np.float32)
     valid = np.stack([lattice.valid & np.all(holds[list(phase.always)], axis=0) for phase in phases])
     for i in reversed(range(len(phases))):
         phase = phases[i]
@@ -107,28 +98,24 @@ def latest_times(
                         through = np.ones_like(lattice.valid)
                         for j in range(i + 1, len(phases)):  # a dwell that goes on in a later phase
                             through &= valid[j]
-                            later = np.where(through, tables[j, index[after]], np.float32(NEVER))
+                            later = np.where(through, tables[j, index[after]], np.float32(NO_TIME))
                             _settle(rules, holds, added, later, float(phases[j].start), table)
             table[table > phase.end] = phase.end
-            table[(table < phase.start) | (valid[i] == 0)] = NEVER
+            table[(table < phase.start) | (valid[i] == 0)] = NO_TIME
             sweep(lattice, valid[i], float(phase.start), table)
     return tables, valid
 
 
 @kernel
-def _enter(
-    lattice: Lattice,
-    valid: NDArray[np.uint8],
-    following: NDArray[np.float32],
-    start: int,
-    table: NDArray[np.float32],
-) -> None:
-    """The last step before the next phase's `start`, where some motion leads to a pose feasible at it."""
+def _enter(lattice: Lattice, valid: Bits, following: Singles, start: int, table: Singles) -> None:
+    """Writes the last step before the next phase's `start` into `table`, wherever some motion leads to a pose
+    that is feasible at that start.
+    """
     ny, nx, headings = table.shape
     for j in range(ny):
         for i in range(nx):
             for h in range(headings):
-                best = following[j, i, h] if valid[j, i, h] else np.float32(NEVER)
+                best = following[j, i, h] if valid[j, i, h] else np.float32(NO_TIME)
                 for d in range(lattice.far_u.shape[3]):
                     u = lattice.far_u[j, i, h, d]
                     if u != np.float32(-1.0):
@@ -143,15 +130,8 @@ def _enter(
 
 
 @kernel
-def _settle(
-    rules: Rules,
-    holds: NDArray[np.uint8],
-    added: NDArray[np.int64],
-    ahead: NDArray[np.float32],
-    start: float,
-    table: NDArray[np.float32],
-) -> None:
-    """m(s, p, J) into `table` where it is later. added: J; ahead: L(., p + J) from step `start` on."""
+def _settle(rules: Rules, holds: Bits, added: Ints, ahead: Singles, start: float, table: Singles) -> None:
+    """Writes m(s, p, J) into `table` where it is later. added: J; ahead: L(., p + J) from step `start` on."""
     for j in range(table.shape[0]):
         for i in range(table.shape[1]):
             for h in range(table.shape[2]):
@@ -159,51 +139,29 @@ def _settle(
                 latest = left
                 for k in added:
                     if not holds[k, j, i, h]:
-                        latest = np.float32(NEVER)
+                        latest = np.float32(NO_TIME)
                         break
                     if rules.kind[k] == EVENTUALLY_ALWAYS:
                         dwell = rules.b[k] - rules.c2[k] + 1
                         if left < max(start, rules.a[k] + rules.b[k]):
-                            latest = np.float32(NEVER)
+                            latest = np.float32(NO_TIME)
                             break
                         latest = min(
                             latest, np.float32(rules.c1[k] + rules.c2[k]), np.float32(left - dwell + 1)
                         )
                     else:
                         if left < max(start, rules.a[k]) or start > rules.b[k]:
-                            latest = np.float32(NEVER)
+                            latest = np.float32(NO_TIME)
                             break
                         latest = min(latest, np.float32(rules.b[k]))
                 table[j, i, h] = max(table[j, i, h], latest)
 
 
-@leaf
-def bilinear(valid: NDArray[np.uint8], table: NDArray[np.float32], v: float, u: float, h: int) -> float:
-    """The table at lattice coordinates, over the corners whose pose is valid; NEVER where none is."""
-    ny, nx = table.shape[0], table.shape[1]
-    j, i = int(np.floor(v)), int(np.floor(u))
-    q, p = v - j, u - i
-    total, weights = 0.0, 0.0
-    for dj in range(2):
-        jj = j + dj
-        wj = q if dj else 1.0 - q
-        if jj < 0 or jj >= ny or wj == 0.0:
-            continue
-        for di in range(2):
-            ii = i + di
-            w = wj * (p if di else 1.0 - p)
-            if ii < 0 or ii >= nx or w == 0.0 or not valid[jj, ii, h]:
-                continue
-            total += w * table[jj, ii, h]
-            weights += w
-    return total / weights if weights > 1e-6 else NEVER
-
-
 @kernel
-def sweep(lattice: Lattice, valid: NDArray[np.uint8], start: float, table: NDArray[np.float32]) -> None:
-    """Relaxes max_a L(f(s, a)) - 1 in place to its fixed point, visiting only cells near what changed.
+def sweep(lattice: Lattice, valid: Bits, start: float, table: Singles) -> None:
+    """Relaxes L(s) = max_a L(f(s, a)) - 1 in place to its fixed point; visits only cells near what changed.
 
-    start: the phase's first step, before which there is no time.
+    start: the phase's first step; no L is earlier.
     """
     ny, nx, headings = table.shape
     reach = lattice.reach
@@ -214,7 +172,7 @@ def sweep(lattice: Lattice, valid: NDArray[np.uint8], start: float, table: NDArr
                 if table[j, i, h] >= 0.0:
                     active[max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1] = 1
                     break
-    for sweep in range(100_000):
+    for sweep in range(MAX_SWEEPS):
         changed = False
         for jj in range(ny):
             j = jj if sweep & 1 else ny - 1 - jj

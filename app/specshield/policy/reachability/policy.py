@@ -1,4 +1,4 @@
-"""pi_phi by backward dynamic programming over pose and progress: made in a second, without learning."""
+"""pi_phi by backward dynamic programming over pose and progress: made in about a second, without learning."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
-from specshield.policy.lattice import heading_count, holds_at, make_lattice
+from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, lattice_shape, make_lattice, number_cells
 from specshield.policy.options import options_to_json, read_options
+from specshield.policy.reachability.guide import Guide
 from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
 from specshield.policy.reachability.method import Settings
-from specshield.policy.reachability.search import propose_all
+from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
-from specshield.policy.reachability.tables import INVALID, SCALE, Tables
-from specshield.policy.reachability.work import Guide
+from specshield.policy.reachability.tables import Tables
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.progress import (
@@ -35,13 +35,16 @@ from specshield.rule.progress import (
 from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
 
-MAX_ENTRIES = 100_000_000  # 400 MB while the tables are made
-FINE_ENTRIES = 1_000_000  # a lattice three times finer that needs no more is used instead
+Ints = NDArray[np.int64]
+
+
+MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
+FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
 
 
 @dataclass(frozen=True, eq=False)
 class ReachabilityPolicy:
-    """Follows the tables of latest feasible times (policy/tables.py, policy/search.py)."""
+    """Proposes what the tables (tables.py) lead to (search.py)."""
 
     task: Task
     card: Card
@@ -59,7 +62,7 @@ class ReachabilityPolicy:
     def propose(
         self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
     ) -> Proposal:
-        """A continuation after each first motion: greedy, or by a beam near a deadline."""
+        """A continuation after each first motion."""
         body, rules = self._prepared
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
         rows = signal_rows(self.task, signals, len(history))
@@ -68,7 +71,7 @@ class ReachabilityPolicy:
         for past in pasts(rules, history, rows):
             motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
             poses = np.empty((*motions.shape, 3))
-            preferred = propose_all(guide, self.settings.beam, past, history, rows, motions, poses)
+            preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, int(preferred)))
         return joined(*proposals)
 
@@ -81,8 +84,8 @@ class ReachabilityPolicy:
 def synthesise(
     task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
 ) -> ReachabilityPolicy:
-    """Makes the tables. Raises FragmentError for a formula that they do not cover, PolicyError for a
-    map too large.
+    """Makes the tables. Raises FragmentError for a formula that they do not cover, and PolicyError for a map
+    that is too large.
     """
     began = time.perf_counter()
     settings = settings or Settings()
@@ -91,9 +94,9 @@ def synthesise(
     lattice = make_lattice(body, pitch)
     holds = holds_at(body, rules, lattice)
     if task.robot.wait_motion < 0:
-        used = np.any(lattice.valid, axis=2)
-        bits, feasible = feasible_steps(lattice, rules, holds, task.horizon, used)
-        tables = _step_tables(rules, task.horizon, _numbered(used), bits, pitch)
+        cell = number_cells(np.any(lattice.valid, axis=2))
+        bits, feasible = feasible_steps(lattice, rules, holds, task.horizon, cell)
+        tables = _step_tables(rules, task.horizon, cell, bits, pitch)
         size = tables.bits.nbytes + tables.cell.nbytes
     else:
         masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
@@ -116,11 +119,11 @@ def load_reachability(weights: bytes | Path, card: Card, task: Task) -> Reachabi
     settings = read_options(Settings, card.get("options", {}))
     rules = make_rules(task)
     goals, pitch = _goals(task, rules, settings)
-    tensors, (shape, headings) = read_tensors(weights), _shape(task, pitch)
+    tensors, (ny, nx, headings) = read_tensors(weights), lattice_shape(task, pitch)
     if task.robot.wait_motion < 0:
         cell, bits = named_arrays(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
-        _check_fit(cell, shape, bits.shape[1], bits.shape == size, f"bits {list(size)}")
+        _check_fit(cell, (ny, nx), bits.shape[1], bits.shape == size, f"bits {list(size)}")
         return ReachabilityPolicy(task, card, settings, _step_tables(rules, task.horizon, cell, bits, pitch))
     cell, code, table = named_arrays(
         tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
@@ -131,7 +134,7 @@ def load_reachability(weights: bytes | Path, card: Card, task: Task) -> Reachabi
         and table.min() >= -1 and table.max() < code.shape[0]
     )  # fmt: skip
     wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {1 << len(goals)}]"
-    _check_fit(cell, shape, code.shape[1], fits, wanted)
+    _check_fit(cell, (ny, nx), code.shape[1], fits, wanted)
     return ReachabilityPolicy(
         task, card, settings, _time_tables(rules, goals, phases, cell, code, table, pitch)
     )
@@ -147,12 +150,15 @@ def _check_fit(cell: NDArray[np.int32], shape: tuple[int, int], rows: int, fits:
 
 
 def check(task: Task, settings: Settings) -> None:
-    """Raises what `synthesise` would for a task it cannot serve, without making anything."""
+    """Raises what `synthesise` would raise for a task that it cannot serve, without making anything."""
     _goals(task, make_rules(task), settings)
 
 
-def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[NDArray[np.int64], float]:
-    """The obligations that are not `always`, and the lattice's pitch, where the tables cover the task."""
+def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[Ints, float]:
+    """The goals (indices of the obligations that are not `always`) and the pitch of the task's lattice [m].
+
+    Raises PolicyError where the tables would be too large.
+    """
     goals = np.flatnonzero(rules.kind != ALWAYS)
     if task.robot.wait_motion < 0:
         entries, unit = (task.horizon + 1) * -(-state_count(rules) // 8), "bytes"
@@ -161,7 +167,7 @@ def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[NDArray[np.int
         entries = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
         limits, unit = (FINE_ENTRIES, MAX_ENTRIES), "entries"
     for pitch, limit in zip((settings.pitch / 3.0, settings.pitch), limits, strict=True):
-        (ny, nx), headings = _shape(task, pitch)
+        ny, nx, headings = lattice_shape(task, pitch)
         if ny * nx * headings * entries <= limit:
             return goals, pitch
     raise PolicyError(
@@ -171,30 +177,10 @@ def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[NDArray[np.int
     )  # fmt: skip
 
 
-def _shape(task: Task, pitch: float) -> tuple[tuple[int, int], int]:
-    ny, nx = (
-        max(int(np.ceil(n * task.grid.resolution / pitch - 1e-9)), 1)
-        for n in (task.grid.height, task.grid.width)
-    )
-    return (ny, nx), heading_count([rotate for _, rotate in task.robot.motions if rotate != 0.0])
-
-
-def _numbered(used: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Rows of the cells that are used, -1 elsewhere."""
-    cell = np.full(used.shape, -1, np.int32)
-    cell[used] = np.arange(int(used.sum()))
-    return cell
-
-
 def _pack(
-    latest: NDArray[np.float32],
-    valid: NDArray[np.uint8],
-    masks: list[int],
-    phases: tuple[Phase, ...],
-    goals: NDArray[np.int64],
-    rules: Rules,
-    pitch: float,
-) -> Tables:
+    latest: NDArray[np.float32], valid: NDArray[np.uint8], masks: list[int], phases: tuple[Phase, ...],
+    goals: Ints, rules: Rules, pitch: float,
+) -> Tables:  # fmt: skip
     used = np.any(valid, axis=(0, 3))
     table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
     codes: list[NDArray[np.uint16]] = []
@@ -204,23 +190,18 @@ def _pack(
             settled = mask == masks[0] and i == len(phases) - 1  # nothing left to do
             if settled or not np.any(values >= 0.0):
                 continue
-            code = np.where(values >= 0.0, 1.0 + np.floor(SCALE * values), 0.0).astype(np.uint16)
+            code = np.where(values >= 0.0, 1.0 + np.floor(STEP_CODES * values), 0.0).astype(np.uint16)
             code[valid[i][used] == 0] = INVALID
             table[i, mask] = len(codes)
             codes.append(code)
     code = np.array(codes, np.uint16).reshape(len(codes), int(used.sum()), valid.shape[3])
-    return _time_tables(rules, goals, phases, _numbered(used), code, table, pitch)
+    return _time_tables(rules, goals, phases, number_cells(used), code, table, pitch)
 
 
 def _time_tables(
-    rules: Rules,
-    goals: NDArray[np.int64],
-    phases: tuple[Phase, ...],
-    cell: NDArray[np.int32],
-    code: NDArray[np.uint16],
-    table: NDArray[np.int32],
-    pitch: float,
-) -> Tables:
+    rules: Rules, goals: Ints, phases: tuple[Phase, ...], cell: NDArray[np.int32], code: NDArray[np.uint16],
+    table: NDArray[np.int32], pitch: float,
+) -> Tables:  # fmt: skip
     bit = np.zeros(len(rules.kind), np.int64)
     bit[goals] = 1 << np.arange(len(goals))
     ends = np.array([phase.end for phase in phases], np.int32)

@@ -1,8 +1,9 @@
-"""A continuation after each first motion, out of the tables of latest feasible times.
+"""A continuation to the horizon after each first motion, out of the tables.
 
-The motion of most slack is walked out. For any other it is mostly enough to undo it and go the same way, or
-to turn and go the way of one that led to the same place. Where that comes too late, or the walk gets stuck, a
-beam looks for a way.
+From the motion of most slack the robot climbs the latest feasible times (walk.py). For any other motion it is
+mostly enough to undo it and go the same way, or to turn and go the way of a motion that led to the same
+place. Where that comes too late, or the climb gets stuck, a beam looks for a way (beam.py). A robot that
+cannot stand still has tables step by step, and all its ways are found by beams.
 """
 
 from __future__ import annotations
@@ -15,10 +16,17 @@ from numpy.typing import NDArray
 
 from specshield.compiled import kernel, leaf, merged
 from specshield.policy.detour import copy_way, find_sibling, find_twins
-from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam
+from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search
+from specshield.policy.reachability.guide import (
+    Guide,
+    Scratch,
+    copy_progress,
+    fill,
+    make_scratch,
+    update_progress,
+)
 from specshield.policy.reachability.tables import HOPELESS, SAFE, goals_settled, slack
-from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, rejoin, walk
-from specshield.policy.reachability.work import Guide, Work, fill, make_work, observe
+from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
 from specshield.robot.dynamics import (
     IMPOSSIBLE,
     NOT_NEEDED,
@@ -30,97 +38,97 @@ from specshield.robot.dynamics import (
 )
 from specshield.rule.progress import forgive, recall
 
-ESCAPE_GAIN = 2.0  # [steps] later than where it got stuck: what a way out has to reach
-ESCAPE_LOSS = 6.0  # [steps] of slack that it may cost on the way
-ESCAPE_DEPTH = 24
-MAX_ESCAPES = 8
-BAND = -3.0  # [steps] of slack: how far the tables err
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Statuses = NDArray[np.int8]
+
+# Chosen by hand; nothing measured.
+ESCAPE_GAIN = 2.0  # [steps] how much later than where a climb got stuck a way out has to lead
+ESCAPE_LOSS = 6.0  # [steps] of slack that a way out may cost
+ESCAPE_LENGTH = 24  # [steps] of a way out, at most
+MAX_ESCAPES = 8  # ways out of places where one climb is stuck
+BAND = -3.0  # [steps] of slack: how far the tables may err
 ROOTS = 4  # first motions that one beam serves, where others may then go the ways it finds
-NARROW = 2  # poses that the first beam of a robot that cannot wait keeps for each motion
+NARROW_SHARE = 2  # poses that the first beam of a robot that cannot wait keeps for each first motion
 SMALL = 30_000  # poses of a lattice on which nearly every way can be tried
-SMALL_SHARE = 512
+SMALL_SHARE = 512  # poses that a beam keeps for each first motion on such a lattice
 
 
 class Starts(NamedTuple):
-    """After each first motion [M]: the progress, the slack, whether a way was found.
+    """What is known after each first motion [M].
 
-    turn, move: the motions that undo it, nearly, or NOT_NEEDED; a turn may be IMPOSSIBLE.
-    sibling (3,): scratch.
+    status, run [M, K]: the progress. slack [steps]. turn, move: the motions that nearly undo it, NOT_NEEDED
+    where one is enough; the turn may be IMPOSSIBLE. settled: whether a way that settles every goal was found.
+    sibling (3,): scratch of `find_sibling`.
     """
 
-    status: NDArray[np.int8]
-    run: NDArray[np.int64]
-    slack: NDArray[np.float64]
-    turn: NDArray[np.int64]
-    move: NDArray[np.int64]
+    status: Statuses
+    run: Ints
+    slack: Floats
+    turn: Ints
+    move: Ints
     settled: NDArray[np.bool_]
-    sibling: NDArray[np.int64]
+    sibling: Ints
 
 
 @kernel
-def propose_all(
-    guide: Guide,
-    width: int,
-    past: float,
-    history: NDArray[np.float64],
-    signals: NDArray[np.float64],
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
+def continue_all(
+    guide: Guide, width: int, past: float, history: Floats, signals: Floats, motions: Ints, poses: Floats
 ) -> int:
-    """history (t + 1, 3), signals (t + 1, S); width: poses a beam keeps for each motion; past: the margin
-    that history is judged by.
+    """Writes a continuation after each first motion into motions (M, T - t), and where it leads into poses
+    (M, T - t, 3); returns the motion of most slack.
 
-    Writes a continuation a first motion, motions (M, T - t) and poses (M, T - t, 3); returns the motion of
-    most slack. The rules' signals are left at the last row.
+    history (t + 1, 3), signals (t + 1, S). width: the poses that a beam keeps for each first motion. past:
+    the margin that the history is judged by. The rules' signals are left at their last row.
     """
     count, t, k_count = motions.shape[0], history.shape[0] - 1, guide.rules.kind.shape[0]
     status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
     recall(guide.rules, past, history, signals, status, run)
     forgive(guide.rules, t, status)
-    work = make_work(guide.rules, count)
+    scratch = make_scratch(guide.rules, count)
     starts = Starts(
         np.empty((count, k_count), np.int8), np.empty((count, k_count), np.int64), np.empty(count),
         np.empty(count, np.int64), np.empty(count, np.int64), np.zeros(count, np.bool_),
         np.empty(3, np.int64),
     )  # fmt: skip
     order, twin, walked = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
-    _first_steps(guide, t, history[t], status, run, motions, poses, starts, work)
+    _first_steps(guide, t, history[t], status, run, motions, poses, starts, scratch)
     _by_slack(starts.slack, order)
     find_twins(poses, twin)
     waits, base, ways = guide.wait >= 0, -1, 0
     for m in order:
         if twin[m] != m:
             continue
-        if not waits:  # tables step by step: beams all the way
+        if not waits:  # beams find all its ways: until one does, it repeats the motion
             motions[m, 1:] = m
             simulate(guide.body, poses[m, 0], motions[m, 1:], poses[m, 1:])
             starts.settled[m] = starts.slack[m] == SAFE
             continue
         turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
-        starts.settled[m] = _join(guide, t, walked[:ways], int(m), starts, motions, poses, work)
+        starts.settled[m] = _join(guide, t, walked[:ways], int(m), starts, motions, poses, scratch)
         if base >= 0 and turn != IMPOSSIBLE and not starts.settled[m]:
-            _resume(starts.status[m], starts.run[m], work)
+            copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
             starts.settled[m] = rejoin(
-                guide, t, turn, move, motions[base], poses[base], 0, motions[m], poses[m], work
+                guide, t, turn, move, motions[base], poses[base], 0, motions[m], poses[m], scratch
             )
         if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == IMPOSSIBLE):
-            _resume(starts.status[m], starts.run[m], work)
+            copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
             escapes = ahead >= (0.0 if base < 0 else EASY)
-            starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], work)
+            starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], scratch)
             if starts.settled[m]:
                 walked[ways] = m
                 ways += 1
         if starts.settled[m] and base < 0:
             base = int(m)
     small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
-    for attempt in range(3):
+    for attempt in range(3):  # one call of the beam in a loop, since each call is compiled by itself
         share, band = width, BAND if waits else 0.0
         if attempt == 0:
-            share = NARROW
+            share = NARROW_SHARE
         elif attempt == 2:
             share, band = SMALL_SHARE, 2.0 * HOPELESS
         if (attempt > 0 or not waits) and (attempt < 2 or small):
-            _beam_out(guide, t, share, width, band, order, twin, starts, motions, poses, work)
+            _beam_out(guide, t, share, width, band, order, twin, starts, motions, poses, scratch)
     for same in range(count):
         if twin[same] != same:
             copy_way(motions, poses, twin[same], same)
@@ -130,17 +138,10 @@ def propose_all(
 
 @leaf
 def _first_steps(
-    guide: Guide,
-    t: int,
-    pose: NDArray[np.float64],
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-    starts: Starts,
-    work: Work,
-) -> None:
-    """Every motion from x_t. status, run: the progress there."""
+    guide: Guide, t: int, pose: Floats, status: Statuses, run: Ints, motions: Ints, poses: Floats,
+    starts: Starts, scratch: Scratch,
+) -> None:  # fmt: skip
+    """Makes every motion once, from `pose` (3,), with the progress `status`, `run` (K,) there."""
     body, rules, tables, _ = guide
     for m in range(motions.shape[0]):
         x, y, theta = step(body, pose[0], pose[1], pose[2], m)
@@ -148,15 +149,14 @@ def _first_steps(
         poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
         starts.turn[m] = turn_by(body, -displacement(body, m)[1]) if theta != pose[2] else NOT_NEEDED
         starts.move[m] = move_back(body, m, math.hypot(x - pose[0], y - pose[1]))
-        _resume(status, run, work)
-        observe(rules, t + 1, x, y, theta, work)
-        for k in range(status.shape[0]):
-            starts.status[m, k], starts.run[m, k] = work.status[k], work.run[k]
-        starts.slack[m] = slack(body, rules, tables, x, y, theta, t + 1, work.status, work.run)
+        copy_progress(status, run, scratch.status, scratch.run)
+        update_progress(rules, t + 1, x, y, theta, scratch)
+        copy_progress(scratch.status, scratch.run, starts.status[m], starts.run[m])
+        starts.slack[m] = slack(body, rules, tables, x, y, theta, t + 1, scratch.status, scratch.run)
 
 
 @leaf
-def _by_slack(slacks: NDArray[np.float64], order: NDArray[np.int64]) -> None:
+def _by_slack(slacks: Floats, order: Ints) -> None:
     """The motions by falling slack, the lowest index first on ties."""
     for i in range(slacks.shape[0]):
         j = i
@@ -167,104 +167,72 @@ def _by_slack(slacks: NDArray[np.float64], order: NDArray[np.int64]) -> None:
 
 
 @leaf
-def _resume(status: NDArray[np.int8], run: NDArray[np.int64], work: Work) -> None:
-    for k in range(status.shape[0]):
-        work.status[k], work.run[k] = status[k], run[k]
-
-
-@leaf
 def _join(
-    guide: Guide,
-    t: int,
-    known: NDArray[np.int64],
-    m: int,
-    starts: Starts,
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-    work: Work,
+    guide: Guide, t: int, known: Ints, m: int, starts: Starts, motions: Ints, poses: Floats, scratch: Scratch
 ) -> bool:
-    """Goes the way of one of the motions `known` that led to the same place; whether that settles all."""
+    """Goes from motion m the way of one of the motions `known` that led to the same place. Whether every goal
+    was settled.
+    """
     found = starts.sibling
     find_sibling(guide.body, poses, known, m, True, found)
     if found[0] < 0:
         return False
-    _resume(starts.status[m], starts.run[m], work)
+    copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
     other = found[0]
-    return rejoin(guide, t, found[1], -1, motions[other], poses[other], found[2], motions[m], poses[m], work)
+    return rejoin(
+        guide, t, found[1], -1, motions[other], poses[other], found[2], motions[m], poses[m], scratch
+    )
 
 
 @merged
 def _follow(
-    guide: Guide,
-    width: int,
-    t: int,
-    n: int,
-    escapes: bool,
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-    work: Work,
+    guide: Guide, width: int, t: int, n: int, escapes: bool, motions: Ints, poses: Floats, scratch: Scratch
 ) -> bool:
-    """Walks on from motions[:n], where it gets stuck by a short beam, if that is allowed. Whether every goal
-    was settled."""
-    outcome, n = walk(guide, t, n, motions, poses, work)
+    """Climbs on from motions[:n]; where that gets stuck, a short beam leads out if `escapes` allows it.
+    Whether every goal was settled.
+    """
+    outcome, n = climb(guide, t, n, motions, poses, scratch)
     for _ in range(MAX_ESCAPES if escapes else 0):
         if outcome != STUCK:
             break
-        status, run = work.high_status.copy(), work.high_run.copy()
+        status, run = scratch.high_status.copy(), scratch.high_run.copy()
         x, y, theta = poses[n - 1]
         high = t + n + slack(guide.body, guide.rules, guide.tables, x, y, theta, t + n, status, run)
-        way = np.empty((1, min(motions.shape[0] - n, ESCAPE_DEPTH)), np.int64)
+        way = np.empty((1, min(motions.shape[0] - n, ESCAPE_LENGTH)), np.int64)
         taken = np.empty(1, np.int64)
-        beam(
+        beam_search(
             guide, t + n, poses[n - 1 : n], status.reshape(1, -1), run.reshape(1, -1), width,
-            high - (t + n) - ESCAPE_LOSS, high + ESCAPE_GAIN, work, way, taken,
+            high - (t + n) - ESCAPE_LOSS, high + ESCAPE_GAIN, scratch, way, taken,
         )  # fmt: skip
         if taken[0] == 0:
             break
-        _resume(status, run, work)
-        n = _take(guide, t, n, way[0, : taken[0]], motions, poses, work)
-        outcome, n = walk(guide, t, n, motions, poses, work)
+        copy_progress(status, run, scratch.status, scratch.run)
+        n = _take(guide, t, n, way[0, : taken[0]], motions, poses, scratch)
+        outcome, n = climb(guide, t, n, motions, poses, scratch)
     if outcome == STUCK:
         fill(n, guide.wait, poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2], motions, poses)
     return outcome == SETTLED_ALL
 
 
 @leaf
-def _take(
-    guide: Guide,
-    t: int,
-    n: int,
-    way: NDArray[np.int64],
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-    work: Work,
-) -> int:
-    """Appends `way` to motions[:n], which work's progress belongs to; returns how many there are then."""
+def _take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, scratch: Scratch) -> int:
+    """Appends `way` to motions[:n], to which the scratch's progress belongs; how many there are then."""
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     for i in range(way.shape[0]):
         x, y, theta = step(guide.body, x, y, theta, way[i])
         motions[n] = way[i]
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
         n += 1
-        observe(guide.rules, t + n, x, y, theta, work)
+        update_progress(guide.rules, t + n, x, y, theta, scratch)
     return n
 
 
 @merged
 def _beam_out(
-    guide: Guide,
-    t: int,
-    share: int,
-    width: int,
-    band: float,
-    order: NDArray[np.int64],
-    twin: NDArray[np.int64],
-    starts: Starts,
-    motions: NDArray[np.int64],
-    poses: NDArray[np.float64],
-    work: Work,
-) -> None:
-    """Looks for a way for every first motion without one whose slack is at least `band`."""
+    guide: Guide, t: int, share: int, width: int, band: float, order: Ints, twin: Ints, starts: Starts,
+    motions: Ints, poses: Floats, scratch: Scratch,
+) -> None:  # fmt: skip
+    """Looks for a way after every first motion that has none yet and a slack of at least `band` [steps]."""
     steps = motions.shape[1] - 1
     roots = np.array(
         [m for m in order if twin[m] == m and not starts.settled[m] and starts.slack[m] >= band],
@@ -276,22 +244,22 @@ def _beam_out(
     while roots.shape[0] > 0:
         some, rest = roots[:few], roots[few:]
         way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
-        beam(
-            guide, t + 1, poses[some, 0], starts.status[some], starts.run[some], share, band, np.inf, work,
+        beam_search(
+            guide, t + 1, poses[some, 0], starts.status[some], starts.run[some], share, band, np.inf, scratch,
             way, taken,
         )  # fmt: skip
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:
-                _resume(starts.status[m], starts.run[m], work)
-                n = _take(guide, t, 1, way[i, : taken[i]], motions[m], poses[m], work)
+                copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
+                n = _take(guide, t, 1, way[i, : taken[i]], motions[m], poses[m], scratch)
                 if guide.wait >= 0:
-                    starts.settled[m] = _follow(guide, width, t, n, True, motions[m], poses[m], work)
+                    starts.settled[m] = _follow(guide, width, t, n, True, motions[m], poses[m], scratch)
                     continue
-                starts.settled[m] = goals_settled(guide.rules, work.status)
+                starts.settled[m] = goals_settled(guide.rules, scratch.status)
                 simulate(guide.body, poses[m, n - 1], motions[m, n:], poses[m, n:])
         if guide.wait >= 0:
             known = some[starts.settled[some]]
             for m in rest:
-                starts.settled[m] = _join(guide, t, known, m, starts, motions, poses, work)
+                starts.settled[m] = _join(guide, t, known, m, starts, motions, poses, scratch)
         roots = rest[~starts.settled[rest]]

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined, leaf
-from specshield.policy.lattice import coordinates
+from specshield.policy.lattice import (
+    INVALID,
+    coordinates,
+    coordinates_ahead,
+    corner,
+    heading_after,
+    interpolate,
+    leads_back,
+)
 from specshield.robot.dynamics import Body, displacement
 from specshield.rule.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 
-SCALE = 64.0  # table codes a step
-INVALID = 65535  # code of a pose that is in collision or breaks an `always` of the phase
-HOPELESS = -1e9
-SAFE = 1e6
+Ints = NDArray[np.int64]
+Statuses = NDArray[np.int8]
+
+
+HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
+SAFE = 1e6  # in place of a slack [steps], where nothing is left to do
+DELAYS = (0, 1, 2, 4, 8)  # [steps] that a robot which cannot wait would like to have to spare
 
 
 class Tables(NamedTuple):
-    """Latest feasible times, or feasibility step by step (policy/stepwise.py), over the cells that have a
-    valid pose.
+    """Latest feasible times (latest.py), or feasibility step by step (stepwise.py), over the cells that have
+    a valid pose.
 
     cell [ny, nx]: row of `code`, -1 where no pose is valid. code [P, cells, H]: INVALID, 0 for never, else
-    1 + SCALE * L. table [phases, 2^G]: which table a set of settled goals has in a phase, -1 if it has none.
+    1 + STEP_CODES * L. table [phases, 2^G]: which one a set of settled goals has in a phase, -1 for none.
     phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
     settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: step by step; bits has
     no steps where the tables are latest times.
@@ -35,60 +45,24 @@ class Tables(NamedTuple):
     table: NDArray[np.int32]
     phase: NDArray[np.int32]
     end: NDArray[np.int32]
-    bit: NDArray[np.int64]
+    bit: Ints
     bits: NDArray[np.uint8]
-    stride: NDArray[np.int64]
-    dwell: NDArray[np.int64]
+    stride: Ints
+    dwell: Ints
     pitch: float
 
 
 @inlined
 def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float:
-    """L at lattice coordinates: linear in x, y and heading over the corners that are valid; HOPELESS where
-    none is.
-    """
-    ny, nx = tables.cell.shape
-    headings = tables.code.shape[2]
-    j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
-    q, p, f = v - j, u - i, h - k
-    low, high = k % headings, (k + 1) % headings
-    total, weights = 0.0, 0.0
-    for dj in range(2):
-        wj = q if dj else 1.0 - q
-        if j + dj < 0 or j + dj >= ny or wj == 0.0:
-            continue
-        for di in range(2):
-            wi = wj * (p if di else 1.0 - p)
-            if i + di < 0 or i + di >= nx or wi == 0.0:
-                continue
-            row = tables.cell[j + dj, i + di]
-            if row < 0:
-                continue
-            w = wi * (1.0 - f)
-            code = tables.code[table, row, low]
-            if w >= 1e-9 and code != INVALID:
-                total += w * (code - 1.0)
-                weights += w
-            w = wi * f
-            code = tables.code[table, row, high]
-            if w >= 1e-9 and code != INVALID:
-                total += w * (code - 1.0)
-                weights += w
-    return total / (SCALE * weights) if weights > 1e-6 else HOPELESS
+    """L at lattice coordinates, HOPELESS where no corner is valid."""
+    return interpolate(tables.cell, tables.code[table], 1.0, INVALID, HOPELESS, v, u, h)
 
 
 @leaf
 def slack(
-    body: Body,
-    rules: Rules,
-    tables: Tables,
-    x: float,
-    y: float,
-    theta: float,
-    t: int,
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-) -> float:
+    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Statuses,
+    run: Ints,
+) -> float:  # fmt: skip
     """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something
     is broken.
     """
@@ -118,16 +92,9 @@ def slack(
 
 @leaf
 def _steps_ahead(
-    body: Body,
-    rules: Rules,
-    tables: Tables,
-    x: float,
-    y: float,
-    theta: float,
-    t: int,
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-) -> float:
+    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Statuses,
+    run: Ints,
+) -> float:  # fmt: skip
     """How feasible a pose is, step by step: from 0 to 1 now, and as much for each of some delays [steps]
     that it would stand. SAFE once nothing is pending, HOPELESS where it is not feasible at all.
     """
@@ -143,7 +110,7 @@ def _steps_ahead(
         return SAFE
     v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
     ahead = 0.0
-    for delay in (0, 1, 2, 4, 8):
+    for delay in DELAYS:
         if t + delay >= tables.bits.shape[0]:
             break
         ahead += _feasible_at(tables, t + delay, progress, v, u, h)
@@ -155,18 +122,16 @@ def _steps_ahead(
 @leaf
 def _feasible_at(tables: Tables, t: int, progress: int, v: float, u: float, h: float) -> float:
     """The share of the lattice's corners, by weight, from which the formula can be satisfied at step t."""
-    ny, nx = tables.cell.shape
-    headings = tables.bits.shape[2]
-    j, i, k = int(np.floor(v)), int(np.floor(u)), int(np.floor(h))
+    (ny, nx), headings, k = tables.cell.shape, tables.bits.shape[2], int(np.floor(h))
     share = 0.0
-    for corner in range(8):
-        dj, di, dk = corner >> 2, corner >> 1 & 1, corner & 1
-        if j + dj < 0 or j + dj >= ny or i + di < 0 or i + di >= nx or tables.cell[j + dj, i + di] < 0:
+    for n in range(4):
+        j, i, w = corner(v, u, n)
+        if j < 0 or j >= ny or i < 0 or i >= nx or tables.cell[j, i] < 0:
             continue
-        bits = tables.bits[t, tables.cell[j + dj, i + di], (k + dk) % headings, progress >> 3]
-        if bits >> (progress & 7) & 1:
-            w = (v - j if dj else 1.0 - v + j) * (u - i if di else 1.0 - u + i)
-            share += w * (h - k if dk else 1.0 - h + k)
+        for up in range(2):
+            bits = tables.bits[t, tables.cell[j, i], (k + up) % headings, progress >> 3]
+            if bits >> (progress & 7) & 1:
+                share += w * (h - k if up else 1.0 - h + k)
     return share
 
 
@@ -180,7 +145,7 @@ def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: flo
 
 
 @inlined
-def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
+def goals_settled(rules: Rules, status: Statuses) -> bool:
     for k in range(status.shape[0]):
         if status[k] == BROKEN or (rules.kind[k] != ALWAYS and status[k] == PENDING):
             return False
@@ -188,7 +153,7 @@ def goals_settled(rules: Rules, status: NDArray[np.int8]) -> bool:
 
 
 @inlined
-def is_broken(status: NDArray[np.int8]) -> bool:
+def is_broken(status: Statuses) -> bool:
     broken = False
     for k in range(status.shape[0]):
         broken = broken or status[k] == BROKEN
@@ -197,19 +162,9 @@ def is_broken(status: NDArray[np.int8]) -> bool:
 
 @inlined
 def score(
-    body: Body,
-    rules: Rules,
-    tables: Tables,
-    x: float,
-    y: float,
-    theta: float,
-    t: int,
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-    wait: int,
-    last: int,
-    scores: NDArray[np.float64],
-) -> None:
+    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Statuses,
+    run: Ints, wait: int, last: int, scores: NDArray[np.float64],
+) -> None:  # fmt: skip
     """L after each motion (M,) from x_t, contact and the step's own progress left out: a cheap order to try
     motions in.
 
@@ -228,19 +183,13 @@ def score(
         return
     table = tables.table[tables.phase[t + 1], mask]
     headings = tables.code.shape[2]
-    v, u, h = coordinates(body, tables.pitch, headings, x, y, theta)
-    grid_theta = theta - math.atan2(body.sin_yaw, body.cos_yaw)
-    cos, sin = math.cos(grid_theta) / tables.pitch, math.sin(grid_theta) / tables.pitch
-    before, turn = displacement(body, last) if last >= 0 else (0.0, 0.0)
+    v, u, h, dv, du = coordinates_ahead(body, tables.pitch, headings, x, y, theta)
     for m in range(scores.shape[0]):
-        d, angle = displacement(body, m)
-        if table < 0 or d * before < 0.0 or angle * turn < 0.0:
+        if table < 0 or leads_back(body, last, m):
             scores[m] = HOPELESS
             continue
-        w = h + angle * headings / (2.0 * math.pi)
-        if w < 0.0:
-            w += headings
-        scores[m] = latest_at(tables, table, v + d * sin, u + d * cos, w)
+        d, angle = displacement(body, m)
+        scores[m] = latest_at(tables, table, v + d * dv, u + d * du, heading_after(headings, h, angle))
     for k in range(status.shape[0]):
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
             over = t + rules.b[k] - rules.c2[k] + 1 - run[k]

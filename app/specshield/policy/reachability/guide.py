@@ -1,0 +1,109 @@
+"""What climbs and beams share: what leads the robot, the scratch they work on, and how progress is kept."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import inlined, kernel
+from specshield.policy.reachability.tables import Tables, goals_settled
+from specshield.robot.dynamics import Body
+from specshield.rule.progress import EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
+from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
+from specshield.stl.program import VALUE, evaluate_packed
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Statuses = NDArray[np.int8]
+
+
+class Guide(NamedTuple):
+    """What leads a robot. wait: the motion that stands still, -1 where there is none."""
+
+    body: Body
+    rules: Rules
+    tables: Tables
+    wait: int
+
+
+class Scratch(NamedTuple):
+    """The arrays that one decision works on, made once.
+
+    status, run (K,): the progress at the newest pose; high_status, high_run (K,): where the latest feasible
+    time was highest. predicates (K,): their robustness at the newest pose, where it was needed. scores (M,):
+    the latest feasible time after each motion. values, stack: of `evaluate_packed`.
+    """
+
+    values: Floats
+    stack: Floats
+    predicates: Floats
+    scores: Floats
+    status: Statuses
+    run: Ints
+    high_status: Statuses
+    high_run: Ints
+
+
+@kernel
+def make_scratch(rules: Rules, motions: int) -> Scratch:
+    k = rules.kind.shape[0]
+    return Scratch(
+        np.empty(value_count(rules)), np.empty(STACK), np.empty(k), np.empty(motions), np.empty(k, np.int8),
+        np.empty(k, np.int64), np.empty(k, np.int8), np.empty(k, np.int64),
+    )  # fmt: skip
+
+
+@inlined
+def copy_progress(status: Statuses, run: Ints, to_status: Statuses, to_run: Ints) -> None:
+    for k in range(status.shape[0]):
+        to_status[k], to_run[k] = status[k], run[k]
+
+
+@inlined
+def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, scratch: Scratch) -> float:
+    """The robustness of one obligation's predicate at a pose: only the regions that it names are measured."""
+    values = scratch.values
+    fill_pose(x, y, theta, values)
+    programs, first_signal = rules.programs, REGIONS + region_count(rules.regions)
+    for i in range(programs.starts[k], programs.starts[k + 1]):
+        if programs.ops[i] == VALUE:
+            place = int(programs.args[i])
+            if REGIONS <= place < first_signal:
+                fill_region(rules.regions, place - REGIONS, x, y, values)
+            elif place >= first_signal:
+                values[place] = rules.signals[place - first_signal]
+    return float(evaluate_packed(k, programs, values, scratch.stack))
+
+
+@inlined
+def update_progress(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> None:
+    """Takes x_t into the scratch's progress. Predicates that `advance` does not need are not evaluated."""
+    for k in range(rules.kind.shape[0]):
+        opens = rules.a[k] + (rules.c2[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
+        if scratch.status[k] == PENDING and t >= opens:
+            scratch.predicates[k] = predicate_at(rules, k, x, y, theta, scratch)
+    advance(rules, t, scratch.predicates, scratch.status, scratch.run)
+
+
+@inlined
+def read_pending(rules: Rules, x: float, y: float, theta: float, scratch: Scratch) -> None:
+    """Evaluates the predicates of everything that is pending, once for a robot that will wait here."""
+    for k in range(rules.kind.shape[0]):
+        if scratch.status[k] == PENDING:
+            scratch.predicates[k] = predicate_at(rules, k, x, y, theta, scratch)
+
+
+@inlined
+def is_over(rules: Rules, tables: Tables, t: int, status: Statuses) -> bool:
+    """Whether every goal is settled at step t and no `always` is still to begin."""
+    return goals_settled(rules, status) and tables.phase[t] == len(tables.end) - 1
+
+
+@inlined
+def fill(n: int, wait: int, x: float, y: float, theta: float, motions: Ints, poses: Floats) -> None:
+    """Waits at a pose from the nth motion to the horizon."""
+    for rest in range(n, motions.shape[0]):
+        motions[rest] = wait
+        poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta

@@ -1,0 +1,133 @@
+"""Tables' codes, the slack of a pose, one climb, one way rejoined, one beam: by hand, on a corridor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from specshield.policy.lattice import STEP_CODES
+from specshield.policy.reachability.beam import beam_search
+from specshield.policy.reachability.guide import make_scratch, update_progress
+from specshield.policy.reachability.search import continue_all
+from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
+from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
+from specshield.robot.dynamics import motion_count
+from specshield.rule.progress import BROKEN, PENDING, SETTLED
+from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT
+from tests.policy.reachability.corridor import EAST, RESTLESS, WEST, guide_of, make_corridor, pose
+
+
+@pytest.fixture(scope="module")
+def visit():
+    return guide_of(make_corridor("F[0,10] A", A=5))
+
+
+def begun(guide, first, motion, t=0):
+    """Room for a way from step t, its first motion made, with the progress that belongs to it."""
+    steps = len(guide.tables.phase) - 1 - t
+    motions, poses = np.full(steps, -1), np.zeros((steps, 3))
+    scratch = make_scratch(guide.rules, motion_count(guide.body))
+    scratch.status[:], scratch.run[:] = PENDING, 0
+    motions[0], poses[0] = motion, first
+    update_progress(guide.rules, t + 1, *poses[0], scratch)
+    return motions, poses, scratch
+
+
+def slack_at(guide, where, t, status=PENDING, run=0):
+    return slack(
+        guide.body, guide.rules, guide.tables, *where, t, np.array([status], np.int8), np.array([run])
+    )
+
+
+def test_the_codes_of_the_tables(visit):
+    tables = visit.tables
+    assert tables.cell[0].tolist() == [0, 1, 2, 3, 4, 5]
+    assert tables.table.tolist() == [[0, -1]]  # nothing is left to do once A is settled: no table
+    assert tables.code[0, :, EAST].tolist() == [1 + STEP_CODES * latest for latest in (5, 6, 7, 8, 9, 10)]
+
+
+def test_the_slack_of_a_pose(visit):
+    assert slack_at(visit, pose(1), 2) == 4.0  # five steps away at the latest time 6
+    assert slack_at(visit, pose(1), 9) == -3.0
+    assert slack_at(visit, pose(1) + np.array([0.1, 0.0, 0.0]), 2) == pytest.approx(
+        4.5
+    )  # half way to the next cell
+    assert slack_at(visit, pose(1), 2, SETTLED) == SAFE
+    assert slack_at(visit, pose(1), 2, BROKEN) == HOPELESS
+
+
+def test_a_dwell_under_way_leaves_what_comes_after_it():
+    """Two of three steps in A are over at step 3; then there are four cells to B by step 12."""
+    guide = guide_of(make_corridor("F[0,4] G[0,2] A and F[0,12] B", A=1, B=5))
+    status, run = np.array([PENDING, PENDING], np.int8), np.array([2, 0])
+    here = slack(guide.body, guide.rules, guide.tables, *pose(1), 3, status, run)
+    assert here == 12 - 4 - 4  # it is over at step 4
+
+
+def test_the_score_of_each_motion(visit):
+    scores = np.empty(4)
+    status, run = np.array([PENDING], np.int8), np.array([0])
+    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, -1, scores)
+    assert scores.tolist() == pytest.approx([8.0, 6.0, 6.0, 7.0])
+    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, LEFT, scores)
+    assert scores[RIGHT] == HOPELESS
+
+
+def test_a_climb_turns_goes_and_stays(visit):
+    """Having turned left from west it turns on to east, whichever way; then it goes four cells and waits."""
+    motions, poses, scratch = begun(visit, pose(1, WEST), WAIT)
+    outcome, n = climb(visit, 0, 1, motions, poses, scratch)
+    assert (outcome, n) == (SETTLED_ALL, 7)
+    assert motions[1] == motions[2]
+    assert motions[1] in (LEFT, RIGHT)
+    assert motions[3:].tolist() == [FORWARD] * 4 + [WAIT] * 3
+    np.testing.assert_allclose(poses[-1, :2], pose(5)[:2])
+
+
+def test_a_way_is_rejoined_after_a_turn_is_undone(visit):
+    """The base goes on in two cells; a left turn costs two steps, which come off its last waits."""
+    base, led, scratch = begun(visit, pose(4), FORWARD)
+    climb(visit, 0, 1, base, led, scratch)
+    assert base.tolist() == [FORWARD, FORWARD] + [WAIT] * 8
+    motions, poses, scratch = begun(visit, pose(3, 1), LEFT)
+    assert rejoin(visit, 0, RIGHT, -1, base, led, 0, motions, poses, scratch)
+    assert motions.tolist() == [LEFT, RIGHT, FORWARD, FORWARD] + [WAIT] * 6
+    np.testing.assert_allclose(poses[3], pose(5))
+
+
+def test_a_beam_of_two_roots_ends_where_the_goal_is(visit):
+    """One root is a cell before A and faces it, the other faces north; a beam from step 6 has four steps."""
+    roots = np.array([pose(4), pose(4, 1)])
+    scratch = make_scratch(visit.rules, 4)
+    motions, taken = np.full((2, 4), -1), np.zeros(2, np.int64)
+    status, run = np.full((2, 1), PENDING, np.int8), np.zeros((2, 1), np.int64)
+    beam_search(visit, 6, roots, status, run, 4, 0.0, np.inf, scratch, motions, taken)
+    assert taken.tolist() == [1, 2]
+    assert motions[0, 0] == FORWARD
+    assert motions[1, :2].tolist() == [RIGHT, FORWARD]
+
+
+def test_a_beam_gives_up_what_comes_too_late(visit):
+    scratch = make_scratch(visit.rules, 4)
+    motions, taken = np.full((1, 1), -1), np.zeros(1, np.int64)
+    status, run = np.full((1, 1), PENDING, np.int8), np.zeros((1, 1), np.int64)
+    beam_search(visit, 9, pose(3)[None], status, run, 4, 0.0, np.inf, scratch, motions, taken)
+    assert taken.tolist() == [0]
+
+
+def test_a_continuation_after_each_first_motion(visit):
+    motions, poses = np.empty((4, 10), np.int64), np.empty((4, 10, 3))
+    best = continue_all(visit, 12, 0.0, pose(0)[None], np.empty((1, 0)), motions, poses)
+    assert best == FORWARD
+    assert motions[:, 0].tolist() == [FORWARD, LEFT, RIGHT, WAIT]
+    np.testing.assert_allclose(poses[:, -1, 0], pose(5)[0])  # five cells in at most ten steps, after each
+
+
+def test_a_robot_that_cannot_wait_is_there_at_the_one_step_asked_for():
+    """Two cells from A, which it has to be in at step 4: four steps for two cells, the rest are turns."""
+    guide = guide_of(make_corridor("F[4,4] A", RESTLESS, A=5))
+    assert guide.wait == -1
+    motions, poses = np.empty((3, 4), np.int64), np.empty((3, 4, 3))
+    continue_all(guide, 12, 0.0, pose(3)[None], np.empty((1, 0)), motions, poses)
+    np.testing.assert_allclose(poses[:, -1, 0], pose(5)[0])
+    assert sorted(motions[1].tolist()) == [FORWARD, FORWARD, LEFT, RIGHT]

@@ -1,0 +1,120 @@
+"""The lattice: its poses and headings, where motions lead, what a table says between its crossings."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from specshield.policy.lattice import (
+    INVALID,
+    NO_TIME,
+    STEP_CODES,
+    bilinear,
+    coordinates,
+    coordinates_ahead,
+    corner,
+    heading_after,
+    heading_count,
+    interpolate,
+    leads_back,
+    make_lattice,
+    pose_of,
+)
+from specshield.robot import STRETCH
+from specshield.robot.dynamics import make_body
+from specshield.world.occupancy import OccupancyGrid
+from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
+
+CORRIDOR = OccupancyGrid(np.array([[0, 0, 0, 1]], bool), CELL)
+TURNED = OccupancyGrid(np.zeros((10, 20), bool), 0.1, (1.0, -2.0, 0.7))
+
+
+def test_the_fewest_headings_that_every_turn_fits():
+    assert heading_count([]) == 4
+    assert heading_count([math.pi / 2, -math.pi / 2]) == 4
+    assert heading_count([math.radians(30), math.radians(-6)]) == 60
+    assert heading_count([1.0]) == 72  # none fits
+
+
+def test_a_pose_and_its_coordinates():
+    body = make_body(STRETCH, TURNED)
+    x, y, theta = pose_of(body, 0.1, 60, 3, 5, 45)
+    u, v = 0.55, 0.35  # the centre of column 5 and row 3, along the turned grid
+    assert x == pytest.approx(1.0 + u * math.cos(0.7) - v * math.sin(0.7))
+    assert y == pytest.approx(-2.0 + u * math.sin(0.7) + v * math.cos(0.7))
+    assert theta == pytest.approx(-math.pi / 2)
+    assert coordinates(body, 0.1, 60, x, y, theta) == pytest.approx((3.0, 5.0, 45.0))
+
+
+def test_where_the_motions_lead_in_a_corridor():
+    """Three free cells in a row, then a wall: east leads on, from the last cell nowhere, north nowhere."""
+    lattice = make_lattice(make_body(ROBOT, CORRIDOR), CELL)
+    assert lattice.valid[0, :, 0].tolist() == [1, 1, 1, 0]
+    np.testing.assert_allclose(lattice.far_u[0, :3, 0, 0], [1.0, 2.0, -1.0])  # east
+    np.testing.assert_allclose(lattice.far_u[0, :3, 2, 0], [-1.0, 0.0, 1.0], atol=1e-9)  # west
+    np.testing.assert_allclose(lattice.far_u[0, :3, 1, 0], [-1.0, -1.0, -1.0])  # north
+    assert lattice.far_h[0, 0, 0, 0] == 0
+    assert lattice.far_h[0, 1, 2, 0] == 2
+    assert lattice.shift.tolist() == [1, -1]
+    assert lattice.turns[0, :3].all()
+    assert lattice.reach == 2
+
+
+def test_the_corners_about_a_place():
+    found = [corner(2.25, 4.5, n) for n in range(4)]
+    assert found == [(2, 4, 0.375), (2, 5, 0.375), (3, 4, 0.125), (3, 5, 0.125)]
+    assert [corner(2.0, 4.0, n)[2] for n in range(4)] == [1.0, 0.0, 0.0, 0.0]
+
+
+CELLS = np.array([[0, 1], [2, -1]], np.int32)  # the fourth cell has no row
+CODES = np.array([[0, 64], [128, 192], [256, INVALID]], np.uint16)  # of two headings
+
+
+def steps_at(v, u, h, zero=0.0, largest=INVALID):
+    return interpolate(CELLS, CODES, zero, largest, -7.0, v, u, h)
+
+
+def test_a_table_between_its_crossings():
+    assert steps_at(0.0, 0.0, 0.0) == 0.0
+    assert steps_at(0.0, 0.0, 1.0) == 1.0
+    assert steps_at(0.0, 0.0, 0.25) == 0.25
+    assert steps_at(0.0, 0.0, 1.75) == 0.25  # between the last heading and the first
+    assert steps_at(0.0, 0.5, 0.0) == 1.0  # between 0 and 128 codes
+    assert steps_at(0.5, 0.0, 1.0) == 1.0  # one of the two corners is invalid: the other alone
+    assert steps_at(0.5, 0.5, 0.0) == pytest.approx((0.0 + 2.0 + 4.0) / 3.0)  # the corner without a row
+    assert steps_at(1.0, 1.0, 0.0) == -7.0  # no valid corner
+    assert steps_at(-2.0, 0.0, 0.0) == -7.0  # outside
+    assert steps_at(-0.5, 0.0, 1.0) == 1.0  # at the edge: the row that there is
+    assert steps_at(1.0, 0.0, 0.0, largest=128) == 2.0  # what is above counts as that
+    assert steps_at(0.0, 0.0, 1.0, zero=1.0) == 63.0 / STEP_CODES
+
+
+def test_a_full_table_at_one_heading():
+    valid = np.array([[[1], [1]], [[1], [0]]], np.uint8)
+    table = np.array([[[2.0], [4.0]], [[6.0], [90.0]]], np.float32)
+    assert bilinear(valid, table, 0.0, 1.0, 0) == 4.0
+    assert bilinear(valid, table, 0.25, 0.0, 0) == 3.0
+    assert bilinear(valid, table, 0.5, 0.5, 0) == 4.0  # the three that are valid
+    assert bilinear(valid, table, 1.0, 1.0, 0) == NO_TIME
+
+
+def test_a_motion_from_a_place_between_the_crossings():
+    body = make_body(STRETCH, TURNED)
+    x, y, _ = pose_of(body, 0.1, 60, 3, 5, 0)
+    v, u, h, dv, du = coordinates_ahead(body, 0.1, 60, x, y, 0.7 + math.pi / 6)  # 30 degrees from the columns
+    assert (v, u) == pytest.approx((3.0, 5.0))
+    assert h == pytest.approx((0.7 + math.pi / 6) * 60 / (2 * math.pi))
+    assert (dv, du) == pytest.approx((5.0, 10.0 * math.cos(math.pi / 6)))  # cells a metre
+    assert heading_after(60, 2.0, math.radians(12)) == pytest.approx(4.0)
+    assert heading_after(60, 2.0, math.radians(-18)) == pytest.approx(59.0)
+
+
+def test_what_leads_straight_back():
+    body = make_body(ROBOT, CORRIDOR)
+    assert leads_back(body, LEFT, RIGHT)
+    assert not leads_back(body, LEFT, LEFT)
+    assert not leads_back(body, FORWARD, LEFT)
+    assert not leads_back(body, WAIT, RIGHT)
+    assert not leads_back(body, -1, RIGHT)
