@@ -122,7 +122,7 @@ def test_the_papers_formulas_take_well_under_a_millisecond() -> None:
     samples = {name: np.random.default_rng(1).normal(size=(7, 151)) for name in formula.names}
     times = []
     for _ in range(20):
-        start = time.perf_counter()
+        start = time.process_time()  # what others do on the machine does not count
         robustness(formula, samples)
-        times.append(time.perf_counter() - start)
+        times.append(time.process_time() - start)
     assert min(times) < 1e-3

@@ -175,7 +175,7 @@ def install(app: FastAPI) -> None:
 
     async def known(request: Request, error: Exception) -> Response:
         assert isinstance(error, SpecshieldError)
-        if status_of(error) >= 500:
+        if status_of(error) >= 500 and not isinstance(error, errors.Starting):  # startup.py logs that
             log.warning("%s %s: %s", request.method, request.url.path, error.message)
         return response(error)
 
