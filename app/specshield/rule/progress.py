@@ -1,8 +1,7 @@
-"""The formula's progress: which obligations are settled, which are broken, as compiled code steps along a
-trajectory.
+"""The formula's progress along a trajectory: which of its obligations are settled, and which are broken.
 
-pi_phi sees time and pose, but phi depends on history (a charger already visited): progress is what of the
-history still matters to a formula of the paper's fragment.
+pi_phi sees time and pose, but phi depends on the history: a charger may have been visited already. The
+progress is all of the history that still matters to a formula of the paper's fragment.
 """
 
 from __future__ import annotations
@@ -159,10 +158,10 @@ def recall(
     status: NDArray[np.int8],
     run: NDArray[np.int64],
 ) -> None:
-    """As `replay`, but the states x_0..x_t are judged by the margin `past`: what that settles is settled.
+    """As `replay`, but the states x_0..x_t have to keep the margin `past` instead of the rules' own.
 
-    Of a dwell in progress only the steps that keep the rules' own margin count, as J asks it of all of them;
-    where it is too late to begin anew, all that keep `past`.
+    J asks the rules' own margin of every step of a dwell. So of a dwell that has begun only the steps that
+    keep that margin count. Where it is too late to begin the dwell anew, all steps that keep `past` count.
     """
     _replay(rules, past, poses, signals, status, run)
     if past == rules.margin:
@@ -183,7 +182,7 @@ def _replay(
     status: NDArray[np.int8],
     run: NDArray[np.int64],
 ) -> None:
-    """`replay` by the margin `past`."""
+    """`replay` with the margin `past` instead of the rules' own."""
     values, stack = np.empty(value_count(rules)), np.empty(STACK)
     predicates = np.empty(rules.kind.shape[0])
     status[:] = PENDING
@@ -198,10 +197,11 @@ def _replay(
 
 
 def pasts(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[float, ...]:
-    """By which margins proposals have to `recall` the states x_0..x_t, as J will ask for the rules' own.
+    """The margins by which proposals have to `recall` the states x_0..x_t, given what J asks for.
 
-    J asks it of the whole trajectory where that can be had: what was settled by less is settled anew. Else of
-    what is still open, where what was settled at all is settled.
+    Where it can be had, J asks the rules' margin of the whole trajectory; then what was settled by less than
+    that margin has to be settled anew. Elsewhere J asks it only of what is still open; then what was settled
+    at all counts as settled. Where both may apply, a proposal is made for each.
     """
     if rules.margin == 0.0:
         return (0.0,)
@@ -213,8 +213,8 @@ def pasts(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]
 
 @kernel
 def _fall_short(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[bool, bool]:
-    """Whether x_0..x_t lost the rules' margin for good where they keep the rule, and whether they settled
-    something by less.
+    """Two answers: whether the rules' margin cannot be had any more on the whole trajectory though the rule
+    can, and whether x_0..x_t settled something by less than that margin.
     """
     count = rules.kind.shape[0]
     asked, status, run = np.empty(count, np.int8), np.empty(count, np.int8), np.empty(count, np.int64)
@@ -229,8 +229,8 @@ def _fall_short(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.fl
 
 @leaf
 def forgive(rules: Rules, t: int, status: NDArray[np.int8]) -> None:
-    """What is broken at step t and what a policy goes on with: an `always` holds again from t + 1, the rest
-    is dropped.
+    """Lets a policy go on after something broke at step t, in place: an `always` whose window is not over is
+    pending again, and any other broken obligation counts as settled.
     """
     for k in range(rules.kind.shape[0]):
         if status[k] == BROKEN:

@@ -1,4 +1,4 @@
-"""What is left of a formula after a prefix: what is still open, and what can be kept of it once violated."""
+"""What a prefix leaves of a formula: what is still open, and what can still be kept of a violated one."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from specshield.task import Task
 
 
 def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int) -> Iterator[Formula]:
-    """What is left to keep after a prefix that violates, the most demanding first.
+    """What can be kept after a prefix that violates the formula, the most demanding choice first.
 
-    prefix {name: [t + 1]}. The broken conjuncts are dropped, a broken G is enforced again from t + 1; and
-    where even that cannot be (the robot is still inside), without those. Nothing is yielded where no conjunct
-    is left.
+    prefix {name: [t + 1]}. The first choice drops the broken conjuncts and enforces a broken G again from
+    step t + 1 on. The second leaves those G out, for a robot that is still inside what they forbid. A choice
+    without any conjunct is not yielded.
     """
     kept, broken = left_over(formula, prefix, t)
     if broken:
@@ -29,7 +29,7 @@ def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: in
 def left_over(
     formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int
 ) -> tuple[list[Formula], list[Always]]:
-    """The conjuncts that can still be kept, and the broken G whose windows are not over."""
+    """The conjuncts that can still be kept, and the broken ones of the form G whose windows are not over."""
     kept: list[Formula] = []
     broken: list[Always] = []
     for conjunct in conjuncts(formula):
@@ -42,17 +42,18 @@ def left_over(
 
 
 def again(broken: Sequence[Always], t: int) -> list[Formula]:
-    """The broken G whose windows are not over by step t, enforced from then on."""
+    """Those of the broken G whose windows reach step t, each enforced from step t on."""
     return [Always(max(each.a, t), each.b, each.child) for each in broken if each.b >= t]
 
 
 def still_open(
     task: Task, formula: Formula, poses: NDArray[np.float64], rows: NDArray[np.float64], slack: int
 ) -> Formula:
-    """What of the formula x_{0:t} leaves open: a G from where its child is, an F `slack` steps early.
+    """What x_{0:t} leaves open of the formula, with each F of the conjunction met `slack` steps early.
 
-    poses [t + 1, 3], rows [t + 1, S]: the signals. A window keeps at least half its length. With nothing
-    open, the formula itself.
+    poses [t + 1, 3], rows [t + 1, S]: the signals. A G is asked from the first step on at which its child is
+    still open. The window of an F keeps at least half its length, however much slack is asked for. Where
+    nothing is open the result is the formula itself.
     """
     t, kept = len(poses) - 1, list[Formula]()
     for conjunct in conjuncts(formula):

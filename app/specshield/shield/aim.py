@@ -1,7 +1,8 @@
 """What J asks for beyond satisfaction, so that noise does not break the rule: a margin [m] and slack [steps].
 
-The margin is asked of the whole trajectory first; where no future has that, and with slack, of what is still
-open. Where they cannot be had, the most that can: of the slack first, then of the margin.
+The margin is asked of the whole trajectory first. Where no future keeps it there, or where slack is asked for
+too, it is asked of what the formula still leaves open. Where both cannot be had, the slack is lowered first,
+to the most steps with which the margin can be had, and then the margin.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ Bools = NDArray[np.bool_]
 
 
 def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[Best, Bools, bool]:
-    """(best futures, which motions keep what can be had, whether it is less than was asked for).
+    """The best futures, which motions [M] keep as much as can be had, and whether that is less than asked.
 
-    whole [N]: rho of the futures on the whole of `prefix.formula`; what does not satisfy it keeps nothing.
+    whole [N]: rho of the futures on the whole of `prefix.formula`. A future that does not satisfy it counts
+    for nothing, whatever it keeps of a part.
     """
     motions, margin = len(shield.task.robot.motions), SATISFIED_ABOVE + shield.config.margin
 

@@ -107,11 +107,11 @@ def decide(
     memory, weights = None if carry is None else carry.memory, None
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
-    margin = SATISFIED_ABOVE + shield.config.margin  # is nothing left that could change whether it is kept?
-    kept_margin = prefix.low > margin or prefix.high <= margin
+    margin = SATISFIED_ABOVE + shield.config.margin
+    margin_decided = prefix.low > margin or prefix.high <= margin  # whatever follows, it is kept or it is not
 
     answer: _Answer
-    if t >= task.horizon or (spec_status == "satisfied" and kept_margin):
+    if t >= task.horizon or (spec_status == "satisfied" and margin_decided):
         judged = None
         answer = _unmodified(shield, log_prior)
     else:

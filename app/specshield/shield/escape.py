@@ -1,4 +1,7 @@
-"""The quickest way out of where a broken G forbids the robot to be."""
+"""The quickest way out of a place where a broken G forbids the robot to be.
+
+A breadth-first search over f from x_t: one layer of poses a step, those that are nearest to being out first.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,18 @@ from specshield.task import Task
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-WORK = 1024  # poses tried at a step, about
-LONGEST = 24  # [steps]
-WAYS = 4  # that are gone on with: each asks every proposer
-ALIKE = 1e3  # [1/m, 1/rad] poses as near as a millimetre count as one
+# Chosen by hand, so that one search costs some milliseconds; tests/shield/test_escape.py says what is found.
+POSES_A_LAYER = 1024  # poses that are simulated at each step of the search, about
+LONGEST_ESCAPE = 24  # [steps] ways out that take longer are not searched for
+ESCAPES = 4  # ways out that are continued to the horizon: each of them asks every proposer
+POSES_A_METRE = 1e3  # [1/m, 1/rad] poses that agree when rounded to this grid count as one
 
 
 class Layer(NamedTuple):
-    """Poses so many steps from x_t. pose [N, 3]; root, motion [N]: the first motion and the last; parent [N]:
-    the row of the layer before.
+    """The poses that are so many steps from x_t.
+
+    pose [N, 3]; root [N]: the first motion of the way to each; motion [N]: the last one; parent [N]: the row
+    of the layer before that it comes from.
     """
 
     pose: Floats
@@ -37,7 +43,7 @@ class Layer(NamedTuple):
 
 
 def flat(formula: Always) -> Always:
-    """A G of a G as one."""
+    """A G whose child is a G, written as one G."""
     while isinstance(formula.child, Always):
         inner = formula.child
         formula = Always(formula.a + inner.a, formula.b + inner.b, inner.child)
@@ -45,19 +51,20 @@ def flat(formula: Always) -> Always:
 
 
 def is_place(task: Task, formula: Always) -> bool:
-    """Whether a robot keeps a G by its pose, step by step: by leaving a place, or keeping off it."""
+    """Whether the robot's pose alone decides at each step if a G is kept, as in "never enter a place"."""
     return formula.child.horizon == 0 and any(name not in task.signals for name in formula.child.names)
 
 
 def escape(
     shield: Shield, prefix: Prefix, broken: Sequence[Always], kept: Sequence[Always]
 ) -> tuple[int, Futures | None]:
-    """How many steps it takes until every `broken` whose window is not over holds again, 0 where no way out
-    was found; and, where it takes more than one, such ways, or the one that came nearest to being out, and
-    then on as the proposers propose.
+    """Searches for ways on which every formula of `broken` holds again.
 
-    No way breaks one of `kept`, if there is one that does not. Each way has another first motion. The signals
-    keep their last values.
+    Returns the fewest steps that such a way takes, 0 where none was found, and futures to the horizon: the
+    ways found, or else the way that came nearest to being out, each continued as the proposers propose. The
+    futures are None where one step is enough, since then the futures of the decision hold such ways already.
+    Ways that break a formula of `kept` are taken only where there are no others. Each way begins with another
+    motion. The signals keep their last values.
     """
     for guards in (kept, ()) if kept else ((),):
         steps, ways = _search(shield.body, prefix, broken, guards)
@@ -69,13 +76,14 @@ def escape(
 def _search(
     body: Body, prefix: Prefix, broken: Sequence[Always], guards: Sequence[Always]
 ) -> tuple[int, list[tuple[Ints, Floats]]]:
-    """The fewest steps out, and some ways that take no more, each by another first motion; 0 where none leads
-    out in LONGEST, and the way that came nearest.
+    """The fewest steps out, and some ways that take that many, each beginning with another motion.
+
+    The steps are 0 where no way of LONGEST_ESCAPE steps leads out; the way is then the one that came nearest.
     """
     root, motion = np.zeros(1, np.int64), np.full(1, -1)
     layers = [Layer(prefix.poses[-1:], root, motion, root)]
-    width = max(WORK // motion_count(body), motion_count(body))
-    for k in range(1, min(LONGEST, prefix.task.horizon - prefix.t) + 1):
+    width = max(POSES_A_LAYER // motion_count(body), motion_count(body))
+    for k in range(1, min(LONGEST_ESCAPE, prefix.task.horizon - prefix.t) + 1):
         layer = _expand(body, layers[-1])
         layer = _rows(layer, _holding(prefix, guards, layer.pose, prefix.t + k) > SATISFIED_ABOVE)
         if not len(layer.pose):
@@ -85,7 +93,7 @@ def _search(
         if out[order[0]] > SATISFIED_ABOVE:
             best = order[out[order] > SATISFIED_ABOVE]
             _, first = np.unique(layer.root[best], return_index=True)
-            return k, [_trace([*layers, layer], int(end)) for end in best[np.sort(first)[:WAYS]]]
+            return k, [_trace([*layers, layer], int(end)) for end in best[np.sort(first)[:ESCAPES]]]
         layers.append(_rows(layer, order[:width]))
     return 0, [_trace(layers, 0)] if len(layers) > 1 else []
 
@@ -95,13 +103,13 @@ def _rows(layer: Layer, which: NDArray[Any]) -> Layer:
 
 
 def _expand(body: Body, layer: Layer) -> Layer:
-    """Every motion from every pose, those alike once for each first motion."""
+    """Every motion from every pose. Of poses that are alike, one is kept for each first motion."""
     count = motion_count(body)
     pose = np.empty((len(layer.pose) * count, 3))
     _successors(body, layer.pose, pose)
     motion, parent = np.tile(np.arange(count), len(layer.pose)), np.repeat(np.arange(len(layer.pose)), count)
     root = motion if layer.motion[0] < 0 else layer.root[parent]
-    _, once = np.unique(np.column_stack([root, np.rint(ALIKE * pose)]), axis=0, return_index=True)
+    _, once = np.unique(np.column_stack([root, np.rint(POSES_A_METRE * pose)]), axis=0, return_index=True)
     once.sort()
     return Layer(pose[once], root[once], motion[once], parent[once])
 
@@ -114,7 +122,7 @@ def _successors(body: Body, poses: Floats, out: Floats) -> None:
 
 
 def _holding(prefix: Prefix, formulas: Sequence[Always], poses: Floats, t: int) -> Floats:
-    """By how much all whose window holds step t would hold there at each pose [N]; inf for none."""
+    """By how much all formulas whose window holds step t would hold at each pose, [N]; inf for none."""
     least = np.full(len(poses), np.inf)
     now = {name: values[-1:] for name, values in prefix.signals.items()}
     samples = prefix.task.samples(poses[:, None], now)
@@ -136,7 +144,7 @@ def _trace(layers: Sequence[Layer], at: int) -> tuple[Ints, Floats]:
 
 
 def _onward(shield: Shield, prefix: Prefix, ways: Sequence[tuple[Ints, Floats]]) -> Futures:
-    """The ways to the horizon: from the end of each by what the proposers propose there."""
+    """The ways continued to the horizon: from the end of each by what the proposers propose there."""
     rows, warnings, count = list[Ints](), list[str](), motion_count(shield.body)
     for taken, reached in ways:
         k, left = len(taken), prefix.steps - len(taken)

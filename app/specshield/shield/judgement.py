@@ -1,4 +1,4 @@
-"""What the futures at one step say of each action: S_t, J, rho, witnesses, and the certified continuation."""
+"""What the futures at one step say of each action: S_t, J, rho, its witness; and which action completes the rule."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class Judged:
     values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf where nothing was evaluated
     robustness: Floats  # [A], rho of the whole formula along the same trajectories; -inf likewise
     completion: int
-    margin_unattainable: bool  # the margin asked for was lowered
+    margin_unattainable: bool  # less than the margin or the slack asked for can be had
 
 
 def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) -> Judged:
-    """Tries the futures from x_t and judges the motions by the most that can still be kept.
+    """Tries the futures from x_t, and judges each motion by the best of its futures.
 
     prefix: as the whole formula sees it; tail: the witness the robot follows, one motion a byte; violated:
     whether the prefix decides so.
@@ -93,11 +93,18 @@ def _by_action(
 
 
 def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best, Prefix]:
-    """The futures by what can still be kept of a formula that is violated, and the prefix as that sees it.
+    """What can still be kept of a violated formula: futures, the best of them, and the prefix as it sees it.
 
-    The first of these that some future keeps: all but what is broken, with a broken G again from the next
-    step; from the earliest step at which it can hold again; that with the other G, before what is to be
-    reached; all but what is broken; the broken G alone. A G over signals that does not hold now is given up.
+    Conjuncts that cannot be kept any more are dropped. A broken G can still be enforced from a later step on.
+    These are tried in turn, and the first that some future keeps is what is kept:
+
+    1. all other conjuncts, and each broken G from the next step on;
+    2. the same, each broken G from the earliest step at which the robot can be out of the forbidden place;
+    3. the same without broken G over signals, which no motion of the robot mends;
+    4. the conjuncts of the form G, and the broken G, at the price of what was to be reached;
+    5. all other conjuncts, without the broken G.
+
+    A broken G over signals alone that does not hold now is given up at once.
     """
     task, t = shield.task, prefix.t
     kept, lost = left_over(task.formula, task.samples(prefix.poses, prefix.signals), t)
@@ -137,7 +144,7 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best
 
 
 def _holds_now(prefix: Prefix, formula: Always) -> bool:
-    """Whether what a G over signals alone asks for holds at x_t."""
+    """Whether the child of a G over signals alone holds at x_t."""
     now = {name: values[-1:] for name, values in prefix.task.samples(prefix.poses, prefix.signals).items()}
     return bool(robustness(formula.child, {n: now[n] for n in formula.child.names}) > SATISFIED_ABOVE)
 
