@@ -7,21 +7,16 @@ import math
 import numpy as np
 import pytest
 
+from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by, undo_motion, undoing_motions
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import (
-    IMPOSSIBLE,
-    NOT_NEEDED,
     calmest_motion,
     displacement,
     longest_motions,
     make_body,
     motion_count,
-    move_back,
     swing_radius,
-    turn_by,
     turns_in_place,
-    undo_motion,
-    undoing_motions,
 )
 from specshield.world.occupancy import OccupancyGrid
 

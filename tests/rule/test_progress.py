@@ -8,17 +8,9 @@ import numpy as np
 import pytest
 
 from specshield.errors import FragmentError
+from specshield.policy.recall import pasts, recall
 from specshield.robot import STRETCH
-from specshield.rule.progress import (
-    BROKEN,
-    PENDING,
-    SETTLED,
-    make_rules,
-    pasts,
-    recall,
-    replay,
-    signal_rows,
-)
+from specshield.rule.progress import BROKEN, PENDING, SETTLED, make_rules, replay, signal_rows
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.brute_stl import brute_robustness

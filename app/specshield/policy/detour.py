@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf
-from specshield.robot.dynamics import IMPOSSIBLE, Body, turn_by, wrap
+from specshield.policy.undo import IMPOSSIBLE, turn_by
+from specshield.robot.dynamics import Body, wrap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

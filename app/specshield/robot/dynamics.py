@@ -11,8 +11,8 @@ its dynamics knows what each of them does. A dynamics offers:
     motion_count, displacement,    how many motions there are, where they lead from, and how far
     displacements, longest_motions
     turns_in_place, calmest_motion whether it can turn on the spot, and what comes nearest to standing still
-    turn_by, move_back,            the motions that take one back
-    undo_motion, undoing_motions
+
+Which motions take another one back (policy/undo.py) follows from the displacements.
 
 All but the queries on whole robots are compiled, and compiled anew for each type of `Body`, together with
 what calls them: nothing is dispatched while a decision is made.
@@ -31,19 +31,9 @@ from specshield.robot.body import (
     wrap,
 )
 from specshield.robot.contact import TOUCH, free_distance, in_collision, overlap
-from specshield.robot.undo import (
-    IMPOSSIBLE,
-    NOT_NEEDED,
-    move_back,
-    turn_by,
-    undo_motion,
-    undoing_motions,
-)
 from specshield.robot.unicycle import simulate, step, successors, unhindered
 
 __all__ = [
-    "IMPOSSIBLE",
-    "NOT_NEEDED",
     "TOUCH",
     "Body",
     "calmest_motion",
@@ -54,16 +44,12 @@ __all__ = [
     "longest_motions",
     "make_body",
     "motion_count",
-    "move_back",
     "overlap",
     "simulate",
     "step",
     "successors",
     "swing_radius",
-    "turn_by",
     "turns_in_place",
-    "undo_motion",
-    "undoing_motions",
     "unhindered",
     "wrap",
 ]

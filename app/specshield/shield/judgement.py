@@ -1,4 +1,4 @@
-"""What the futures at one step say of each action: S_t, J, rho, its witness; and which action completes the rule."""
+"""What the futures at one step say of each action: whether it is in S_t, its J, its rho, its witness."""
 
 from __future__ import annotations
 

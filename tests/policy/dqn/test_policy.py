@@ -9,8 +9,8 @@ import pytest
 from specshield.errors import PolicyError
 from specshield.policy.card import policy_id
 from specshield.policy.methods import load_policy
+from specshield.policy.undo import undoing_motions
 from specshield.robot import STRETCH, Action, Robot
-from specshield.robot.dynamics import undoing_motions
 from tests.policy.rooms import CUSTOM, flat, random_policy, sizes
 
 

@@ -11,7 +11,8 @@ from specshield.policy.planner.approach import BEAM_LENGTH, BEAM_WIDTH
 from specshield.policy.planner.due_dates import foresee, is_open, make_bounds, read_signals
 from specshield.policy.planner.search import MAX_DEPTH, Nodes, search, value
 from specshield.policy.planner.way import Way, World, move, read_at, stay
-from specshield.robot.dynamics import IMPOSSIBLE, motion_count, undo_motion
+from specshield.policy.undo import IMPOSSIBLE, undo_motion
+from specshield.robot.dynamics import motion_count
 from specshield.rule.values import REGIONS, fill_signals, region_count
 from specshield.stl.program import STACK_SIZE
 

@@ -23,15 +23,10 @@ from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
 from specshield.policy.reachability.tables import Tables
+from specshield.policy.recall import pasts
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.robot.dynamics import Body, make_body
-from specshield.rule.progress import (
-    ALWAYS,
-    Rules,
-    make_rules,
-    pasts,
-    signal_rows,
-)
+from specshield.rule.progress import ALWAYS, Rules, make_rules, signal_rows
 from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
 

@@ -27,16 +27,9 @@ from specshield.policy.reachability.guide import (
 )
 from specshield.policy.reachability.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
-from specshield.robot.dynamics import (
-    IMPOSSIBLE,
-    NOT_NEEDED,
-    displacement,
-    move_back,
-    simulate,
-    step,
-    turn_by,
-)
-from specshield.rule.progress import forgive, recall
+from specshield.policy.recall import forgive, recall
+from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
+from specshield.robot.dynamics import displacement, simulate, step
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

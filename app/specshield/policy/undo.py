@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from specshield.compiled import leaf
-from specshield.robot.actions import Robot
-from specshield.robot.body import Body, wrap
-from specshield.robot.unicycle import step
+from specshield.robot import Robot
+from specshield.robot.dynamics import Body, displacement, motion_count, step, wrap
 
 Floats = NDArray[np.float64]
-
 
 SAME_ANGLE = 1e-9  # [rad] angles that differ by less are the same: far above rounding, far below any turn
 SAME_POSE = 1e-6  # [m, rad] poses that differ by less are the same: ten times what a contact leaves (SKIN)
@@ -25,8 +23,9 @@ def turn_by(body: Body, angle: float) -> int:
     """The motion that turns by an angle [rad] and does nothing else; or NOT_NEEDED, or IMPOSSIBLE."""
     if abs(angle) < SAME_ANGLE:
         return NOT_NEEDED
-    for motion in range(body.translate.shape[0]):
-        if body.translate[motion] == 0.0 and abs(wrap(body.rotate[motion] - angle)) < SAME_ANGLE:
+    for motion in range(motion_count(body)):
+        ahead, turn = displacement(body, motion)
+        if ahead == 0.0 and abs(wrap(turn - angle)) < SAME_ANGLE:
             return motion
     return IMPOSSIBLE
 
@@ -36,11 +35,12 @@ def move_back(body: Body, motion: int, moved: float) -> int:
     """The straight move that leads nearest to where the robot was before `motion` took it `moved` metres on;
     NOT_NEEDED where no move brings it nearer by a quarter of the way.
     """
-    ahead = moved if body.translate[motion] > 0.0 else -moved
+    ahead = moved if displacement(body, motion)[0] > 0.0 else -moved
     best, left = NOT_NEEDED, 0.75 * moved
-    for back in range(body.translate.shape[0]):
-        if body.rotate[back] == 0.0 and abs(ahead + body.translate[back]) < left:
-            best, left = back, abs(ahead + body.translate[back])
+    for back in range(motion_count(body)):
+        length, turn = displacement(body, back)
+        if turn == 0.0 and abs(ahead + length) < left:
+            best, left = back, abs(ahead + length)
     return best
 
 
@@ -51,7 +51,7 @@ def undo_motion(body: Body, pose: Floats, reached: Floats) -> int:
     """
     if _is_near(pose[0], pose[1], pose[2], reached):
         return NOT_NEEDED
-    for motion in range(body.translate.shape[0]):
+    for motion in range(motion_count(body)):
         x, y, theta = step(body, reached[0], reached[1], reached[2], motion)
         if _is_near(x, y, theta, pose):
             return motion

@@ -1,0 +1,77 @@
+"""What a policy makes of the states behind it: what counts as settled for a margin, and what is left once
+something broke.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from specshield.compiled import kernel, leaf
+from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay_by
+
+
+@kernel
+def recall(
+    rules: Rules,
+    past: float,
+    poses: NDArray[np.float64],
+    signals: NDArray[np.float64],
+    status: NDArray[np.int8],
+    run: NDArray[np.int64],
+) -> None:
+    """As `replay`, but the states x_0..x_t have to keep the margin `past` instead of the rules' own.
+
+    J asks the rules' own margin of every step of a dwell. So of a dwell that has begun only the steps that
+    keep that margin count. Where it is too late to begin the dwell anew, all steps that keep `past` count.
+    """
+    replay_by(rules, past, poses, signals, status, run)
+    if past == rules.margin:
+        return
+    asked, whole = np.empty_like(status), np.empty_like(run)
+    replay_by(rules, rules.margin, poses, signals, asked, whole)
+    for k in range(status.shape[0]):
+        if status[k] == PENDING and asked[k] == PENDING:
+            run[k] = whole[k]
+
+
+def pasts(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[float, ...]:
+    """The margins by which proposals have to `recall` the states x_0..x_t, given what J asks for.
+
+    Where it can be had, J asks the rules' margin of the whole trajectory; then what was settled by less than
+    that margin has to be settled anew. Elsewhere J asks it only of what is still open; then what was settled
+    at all counts as settled. Where both may apply, a proposal is made for each.
+    """
+    if rules.margin == 0.0:
+        return (0.0,)
+    lost, less = _fall_short(rules, poses, signals)
+    if lost:
+        return (0.0,)
+    return (rules.margin, 0.0) if less else (rules.margin,)
+
+
+@kernel
+def _fall_short(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[bool, bool]:
+    """Two answers: whether the rules' margin cannot be had any more on the whole trajectory though the rule
+    can, and whether x_0..x_t settled something by less than that margin.
+    """
+    count = rules.kind.shape[0]
+    asked, status, run = np.empty(count, np.int8), np.empty(count, np.int8), np.empty(count, np.int64)
+    replay_by(rules, rules.margin, poses, signals, asked, run)
+    replay_by(rules, 0.0, poses, signals, status, run)
+    lost = less = False
+    for k in range(count):
+        lost = lost or (asked[k] == BROKEN and status[k] != BROKEN)
+        less = less or asked[k] != status[k]
+    return lost, less
+
+
+@leaf
+def forgive(rules: Rules, t: int, status: NDArray[np.int8]) -> None:
+    """Lets a policy go on after something broke at step t, in place: an `always` whose window is not over is
+    pending again, and any other broken obligation counts as settled.
+    """
+    for k in range(rules.kind.shape[0]):
+        if status[k] == BROKEN:
+            again = rules.kind[k] == ALWAYS and rules.b[k] > t
+            status[k] = PENDING if again else SETTLED
