@@ -94,7 +94,7 @@ def _stretch() -> Robot:
 
 
 STRETCH = _stretch()
-"""The 20 tokens of SPOC, PoliFormer and FLaRe on a Hello Robot Stretch (DESIGN.md, section 4)."""
+"""The 20 tokens of SPOC, PoliFormer and FLaRe on a Hello Robot Stretch (docs/architecture.md)."""
 
 PRESETS = {"stretch": STRETCH}
 
