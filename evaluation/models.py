@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from specshield.arrays import Floats
 from specshield.errors import NotFound
 from specshield.sim import model, robot, senses
 from specshield.sim.cases import Case
 from specshield.sim.learned import model as learned
 from specshield.sim.learned import network, reckoning
-from specshield.sim.model import Floats, FoundationModel, GoalSeeker
+from specshield.sim.model import FoundationModel, GoalSeeker
 from specshield.sim.robot import COMFORT, NEAR, Observation, SimulatedRobot, way
 
 

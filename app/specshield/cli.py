@@ -138,8 +138,7 @@ def demo(
 def train(
     case: Annotated[str, typer.Option(help="A case of maps/, as 1 or case1.")],
     method: Annotated[
-        str,
-        typer.Option(help="reachability, planner, dqn, or what another package adds."),
+        str, typer.Option(help="reachability, planner, dqn, or what another package adds.")
     ] = "reachability",
     seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,

@@ -10,8 +10,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from specshield.arrays import Floats
 from specshield.errors import FormulaError, InputError, MapError, SampleError
 from specshield.robot import Robot, robot_to_json
 from specshield.stl import Formula, is_name, parse
@@ -55,16 +56,14 @@ class Task:
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
-    def samples(
-        self, poses: ArrayLike, signals: Mapping[str, NDArray[np.float64]] | None = None
-    ) -> dict[str, NDArray[np.float64]]:
+    def samples(self, poses: ArrayLike, signals: Mapping[str, Floats] | None = None) -> dict[str, Floats]:
         """What the formula reads along a trajectory, {name: [..., N]}, for `stl.robustness`.
 
         poses [..., N, 3] in metres and radians. signals {name: [n]} with n <= N: the last value is held to N
         (J is conditional on that), and the initial value where none was sent.
         """
         array = np.asarray(poses, dtype=np.float64)
-        result: dict[str, NDArray[np.float64]] = {}
+        result: dict[str, Floats] = {}
         for name in self.formula.names:
             if name in self.regions:
                 result[name] = signed_distance(self.regions[name], array[..., :2])
@@ -74,9 +73,7 @@ class Task:
                 result[name] = np.broadcast_to(self.signal(name, signals, array.shape[-2]), array.shape[:-1])
         return result
 
-    def signal(
-        self, name: str, signals: Mapping[str, NDArray[np.float64]] | None, n: int
-    ) -> NDArray[np.float64]:
+    def signal(self, name: str, signals: Mapping[str, Floats] | None, n: int) -> Floats:
         """A signal's first n samples, shape (n,). Where fewer were sent, the last value is held."""
         sent = np.asarray((signals or {}).get(name, ()), dtype=np.float64)
         held = np.full(n, sent[-1] if len(sent) else self.signals[name])

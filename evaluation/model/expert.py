@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, label
 
 from specshield.compiled import leaf
+from specshield.policy.geodesic import geodesic_distance
 from specshield.robot.dynamics import Body, displacement, step
 from specshield.sim.robot import COMFORT, LOOK_AHEAD
-from specshield.world.geodesic import geodesic_distance
 from specshield.world.occupancy import OccupancyGrid
 
 Floats = NDArray[np.float64]

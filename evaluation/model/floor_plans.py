@@ -30,23 +30,14 @@ CLOSE = (0.4, 1.1)  # [m] between a target and its furniture, and between a targ
 
 # Along a wall: name, length, depth, chance. In the middle of a room: likewise, the two sides.
 AGAINST_WALL: dict[str, tuple[tuple[str, tuple[float, float], tuple[float, float], float], ...]] = {
-    "Kitchen": (
-        ("counter", (2.0, 4.5), (0.6, 0.7), 1.0),
-        ("counter", (1.2, 4.0), (0.6, 0.7), 0.8),
-    ),
+    "Kitchen": (("counter", (2.0, 4.5), (0.6, 0.7), 1.0), ("counter", (1.2, 4.0), (0.6, 0.7), 0.8)),
     "LivingRoom": (
         ("sofa", (1.6, 2.4), (0.8, 1.0), 1.0),
         ("bench", (1.0, 1.8), (0.4, 0.5), 0.8),
         ("cupboard", (1.0, 1.6), (0.4, 0.5), 0.4),
     ),
-    "Bedroom": (
-        ("bed", (1.8, 2.2), (1.4, 2.1), 1.0),
-        ("wardrobe", (1.2, 1.8), (0.5, 0.6), 0.9),
-    ),
-    "Bathroom": (
-        ("bath", (1.6, 2.1), (0.7, 0.8), 0.9),
-        ("basin", (0.6, 0.9), (0.5, 0.6), 1.0),
-    ),
+    "Bedroom": (("bed", (1.8, 2.2), (1.4, 2.1), 1.0), ("wardrobe", (1.2, 1.8), (0.5, 0.6), 0.9)),
+    "Bathroom": (("bath", (1.6, 2.1), (0.7, 0.8), 0.9), ("basin", (0.6, 0.9), (0.5, 0.6), 1.0)),
     "Office": (
         ("desk", (1.4, 1.9), (0.7, 0.9), 1.0),
         ("shelves", (1.2, 3.2), (0.4, 0.5), 0.8),

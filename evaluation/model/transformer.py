@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from specshield.arrays import Singles
 from specshield.sim.learned.network import (
     ACTIONS,
     FAR,
@@ -21,7 +22,6 @@ from specshield.sim.learned.network import (
     SPAN,
     UNITS,
     WINDOW,
-    Array,
 )
 
 
@@ -67,10 +67,10 @@ class Transformer(nn.Module):
 
     @torch.no_grad()
     def logits(
-        self, t: int, x: Array, place: Array, last: NDArray[np.int64], kind: NDArray[np.int64]
-    ) -> Array:
+        self, t: int, x: Singles, place: Singles, last: NDArray[np.int64], kind: NDArray[np.int64]
+    ) -> Singles:
         """Logits [B, A] of step t; x [B, FEATURES], place [B, 3]."""
-        out: Array = self.step(t, *map(torch.from_numpy, (x, place, last, kind))).numpy()
+        out: Singles = self.step(t, *map(torch.from_numpy, (x, place, last, kind))).numpy()
         return out
 
     def step(
@@ -145,7 +145,7 @@ def biases(steps: int) -> torch.Tensor:
 EMBEDDINGS = ("last", "kind")
 
 
-def export(network: Transformer) -> dict[str, Array]:
+def export(network: Transformer) -> dict[str, Singles]:
     """The weights as network.py takes them: w [inputs, outputs]."""
     tensors = {}
     for name, tensor in network.state_dict().items():
@@ -154,7 +154,7 @@ def export(network: Transformer) -> dict[str, Array]:
     return tensors
 
 
-def restore(weights: Mapping[str, Array]) -> Transformer:
+def restore(weights: Mapping[str, Singles]) -> Transformer:
     """A network with checked weights: the inverse of `export`."""
     network = Transformer()
     with torch.no_grad():
@@ -170,5 +170,5 @@ def _serving(name: str) -> str:
     return name.removeprefix("blocks.").replace(".weight", ".w").replace(".bias", ".b")
 
 
-def _turned(name: str, array: Array) -> bool:
+def _turned(name: str, array: Singles) -> bool:
     return array.ndim == 2 and name.removesuffix(".weight") not in EMBEDDINGS

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from evaluation.apartments import APARTMENTS, draw, files
-from specshield.world.geodesic import geodesic_distance
+from specshield.policy.geodesic import geodesic_distance
 from specshield.world.map_server import load_map
 from specshield.world.regions import region_from_json, signed_distance
 

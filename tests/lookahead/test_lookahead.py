@@ -14,14 +14,7 @@ from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import make_goals
 from specshield.lookahead.lattice import blocked_at, make_planes
 from specshield.lookahead.lookahead import prepare
-from specshield.lookahead.surrogate import (
-    WANDER,
-    StandIn,
-    end_chance,
-    follow,
-    price_left,
-    step_price,
-)
+from specshield.lookahead.surrogate import WANDER, StandIn, end_chance, follow, price_left, step_price
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, step
 from specshield.rule.progress import make_rules

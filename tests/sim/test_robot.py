@@ -20,14 +20,7 @@ def test_it_executes_what_the_actions_say(case):
         ("l", (x + 0.2, y, math.pi / 6)),
         ("rs", (x + 0.2, y, turned)),
         ("end", (x + 0.2, y, turned)),
-        (
-            "b",
-            (
-                x + 0.2 - 0.2 * math.cos(turned),
-                y - 0.2 * math.sin(turned),
-                math.radians(24),
-            ),
-        ),
+        ("b", (x + 0.2 - 0.2 * math.cos(turned), y - 0.2 * math.sin(turned), math.radians(24))),
         ("sub_done", None),
     ]:
         before = robot.pose

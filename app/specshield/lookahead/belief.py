@@ -13,14 +13,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel
 from specshield.lookahead.goals import Goals, cell_of
 from specshield.lookahead.surrogate import FEATURES, WANDER, bearing_of, features_of, follow
 from specshield.robot.dynamics import Body, displacements
-
-Floats = NDArray[np.float64]
 
 # Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
 STYLE = np.array([2.0, 2.0, -2.0, -1.0])  # of an unknown model: the logit of each feature
@@ -93,13 +91,7 @@ def begin(goals: int, motions: int) -> Belief:
 
 
 def update(
-    belief: Belief,
-    body: Body,
-    goals: Goals,
-    pose: Floats,
-    blocked: NDArray[np.bool_],
-    said: Floats,
-    end: float,
+    belief: Belief, body: Body, goals: Goals, pose: Floats, blocked: Bools, said: Floats, end: float
 ) -> Belief:
     """The belief after what the model said at x_t (3,).
 
@@ -148,7 +140,7 @@ def _charge(
     x: float,
     y: float,
     theta: float,
-    blocked: NDArray[np.bool_],
+    blocked: Bools,
     said: Floats,
     log_said: Floats,
     end: float,

@@ -18,15 +18,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bytes, Codes, Ints, Singles
 from specshield.compiled import kernel, leaf
 from specshield.lookahead.lattice import Planes
 from specshield.lookahead.surrogate import StandIn
 from specshield.policy.lattice import coordinates, corner
 from specshield.robot.dynamics import Body, displacement
-
-Singles = NDArray[np.float32]
 
 UNKEEPABLE = np.float32(1e6)  # D where the rule cannot be kept
 TIGHT = np.float32(6.0)  # [nats] D of a corner from which it cannot, beside others; by hand, nothing measured
@@ -43,7 +41,7 @@ class Sums(NamedTuple):
 
 
 @kernel
-def solve(body: Body, planes: Planes, stand_in: StandIn) -> NDArray[np.uint16]:
+def solve(body: Body, planes: Planes, stand_in: StandIn) -> Codes:
     """D as codes [kept, H, rows]."""
     headings, cells = planes.valid.shape
     horizon, sets = planes.slot.shape[0] - 2, planes.slot.shape[1]
@@ -216,7 +214,7 @@ def _sum_up(least: Singles, total: Singles, ends: Singles, price: np.float32, ou
 
 
 @kernel
-def _rule_out(possible: NDArray[np.uint8], values: Singles) -> None:
+def _rule_out(possible: Bytes, values: Singles) -> None:
     for h in range(possible.shape[0]):
         for c in range(possible.shape[1]):
             if not possible[h, c]:
@@ -224,7 +222,7 @@ def _rule_out(possible: NDArray[np.uint8], values: Singles) -> None:
 
 
 @kernel
-def _encode(row: NDArray[np.int64], values: Singles, out: NDArray[np.uint16]) -> None:
+def _encode(row: Ints, values: Singles, out: Codes) -> None:
     top = np.float32((NO_CODE - 1) / CODES)
     for c in range(row.shape[0]):
         if row[c] >= 0:
@@ -236,7 +234,7 @@ def _encode(row: NDArray[np.int64], values: Singles, out: NDArray[np.uint16]) ->
 
 @leaf
 def desirability(
-    body: Body, planes: Planes, table: NDArray[np.uint16], t: int, mask: int, x: float, y: float, theta: float
+    body: Body, planes: Planes, table: Codes, t: int, mask: int, x: float, y: float, theta: float
 ) -> float:
     """D at a pose at step t with the goals of `mask` settled [nats]; UNKEEPABLE where no corner has any."""
     if mask < 0 or planes.kept[t, mask] < 0:
@@ -255,7 +253,7 @@ def desirability(
 
 
 @leaf
-def _at(body: Body, planes: Planes, table: NDArray[np.uint16], x: float, y: float, theta: float) -> float:
+def _at(body: Body, planes: Planes, table: Codes, x: float, y: float, theta: float) -> float:
     """Bilinear in a table [H, rows]."""
     headings = table.shape[0]
     v, u, h = coordinates(body, planes.pitch, headings, x, y, theta)

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Codes, Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.lookahead.desirability import UNKEEPABLE, desirability
 from specshield.lookahead.goals import Goals
@@ -17,8 +17,6 @@ from specshield.lookahead.lattice import Planes, is_blocked
 from specshield.lookahead.surrogate import follow, price_left, step_price
 from specshield.robot.dynamics import Body, step
 from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
-
-Floats = NDArray[np.float64]
 
 DEPTH = 2  # exact steps before the lattice is asked; chosen by hand, nothing measured
 
@@ -29,9 +27,9 @@ def expand_all(
     rules: Rules,
     goals: Goals,
     planes: Planes,
-    tables: NDArray[np.uint16],
-    leads: NDArray[np.int64],
-    asked: NDArray[np.int64],
+    tables: Codes,
+    leads: Ints,
+    asked: Ints,
     style: Floats,
     t: int,
     mask: int,

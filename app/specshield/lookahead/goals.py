@@ -6,12 +6,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from specshield.arrays import Bools, Codes, Floats, Int8s
 from specshield.compiled import kernel, leaf
+from specshield.policy.geodesic import geodesic_distance
 from specshield.robot.dynamics import Body, swing_radius
-from specshield.world.geodesic import geodesic_distance
 from specshield.world.occupancy import OccupancyGrid
 
 MAX_GOALS = 300  # keeps a decision short: each goal is compared with what the model says at every step
@@ -21,8 +21,6 @@ MAX_CELLS = 20_000  # keeps memory small: MAX_GOALS fields of so many cells and 
 STEER = 5  # [cells] how far along the way the point lies that the robot steers for
 UNIT = 127  # of a direction's components, as stored in a byte
 NO_PATH = 65535  # [cm] the distance from where no path leads to a goal
-
-Floats = NDArray[np.float64]
 
 
 class Goals(NamedTuple):
@@ -34,8 +32,8 @@ class Goals(NamedTuple):
     """
 
     pitch: float
-    distance: NDArray[np.uint16]
-    way: NDArray[np.int8]
+    distance: Codes
+    way: Int8s
 
 
 def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
@@ -63,7 +61,7 @@ def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
     return Goals(pitch, distance, way)
 
 
-def _places(roomy: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
+def _places(roomy: Bools, gap: int) -> list[tuple[int, int]]:
     """One roomy cell in each square of `gap` cells, the middlemost. The squares grow until there are at most
     MAX_GOALS.
     """
@@ -77,7 +75,7 @@ def _places(roomy: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
     return places if len(places) <= MAX_GOALS else _places(roomy, gap + 1)
 
 
-def _falling(free: NDArray[np.bool_], onward: Floats, pitch: float) -> Floats:
+def _falling(free: Bools, onward: Floats, pitch: float) -> Floats:
     """A height [h, w] that falls along the way to a goal: in roomy space the distance `onward` to the goal;
     beside an obstacle, where the robot cannot turn, higher, so that the way first leads off it.
     """
@@ -87,7 +85,7 @@ def _falling(free: NDArray[np.bool_], onward: Floats, pitch: float) -> Floats:
 
 
 @kernel
-def _steer(height: Floats, way: NDArray[np.int8]) -> None:
+def _steer(height: Floats, way: Int8s) -> None:
     """The direction from each cell to the one STEER cells down the steepest way."""
     rows, columns = height.shape
     after = np.empty(rows * columns, np.int64)

@@ -6,20 +6,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
 from specshield.policy.lattice import heading_count, pose_of
 from specshield.policy.reachability.tables import Tables, slack
-from specshield.robot.dynamics import (
-    Body,
-    displacement,
-    in_collision,
-    longest_motions,
-    motion_count,
-    step,
-)
+from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 from specshield.rule.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -35,8 +28,6 @@ COARSE_PITCH = 0.4  # [m] as fine as the stand-ins deserve; chosen by hand, noth
 MOST_HEADINGS = 24  # one for each 15 degrees; chosen by hand, nothing measured
 MAX_ENTRIES = 40_000_000  # poses times steps and sets of settled goals: what solving one stand-in costs
 KEPT_ENTRIES = 500_000  # of them that a table of D keeps, 1 MB
-
-Ints = NDArray[np.int64]
 
 
 class Planes(NamedTuple):
@@ -60,19 +51,19 @@ class Planes(NamedTuple):
     pitch: float
     pad: int
     width: int
-    valid: NDArray[np.uint8]
-    free: NDArray[np.float32]
-    holds: NDArray[np.int32]
-    keeps: NDArray[np.int32]
+    valid: Bytes
+    free: Singles
+    holds: Int32s
+    keeps: Int32s
     goal: Ints
     first: Ints
     last: Ints
-    due: NDArray[np.int32]
-    open: NDArray[np.int32]
+    due: Int32s
+    open: Int32s
     slot: Ints
     kept: Ints
     row: Ints
-    possible: NDArray[np.uint8]
+    possible: Bytes
 
 
 def make_planes(
@@ -116,7 +107,7 @@ def make_planes(
     return planes
 
 
-def _bits(first: Ints, last: Ints, bit: Ints, horizon: int) -> NDArray[np.int32]:
+def _bits(first: Ints, last: Ints, bit: Ints, horizon: int) -> Int32s:
     """The bits of the windows from `first` to `last` that each step from 0 to T + 1 is in, [T + 2]."""
     times = np.arange(horizon + 2)[:, None]
     inside = ((first <= times) & (times <= last)).astype(np.int32)
@@ -154,7 +145,7 @@ def is_blocked(
 
 
 @kernel
-def blocked_at(body: Body, x: float, y: float, theta: float) -> NDArray[np.bool_]:
+def blocked_at(body: Body, x: float, y: float, theta: float) -> Bools:
     """Which motions an obstacle stops short at a pose, shape (M,)."""
     blocked = np.empty(motion_count(body), np.bool_)
     for m in range(len(blocked)):

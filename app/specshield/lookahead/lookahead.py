@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from specshield.arrays import Codes, Floats, Ints
 from specshield.errors import Unsupported
 from specshield.lookahead import belief as beliefs
 from specshield.lookahead.belief import STYLE, Belief
@@ -32,9 +32,6 @@ from specshield.robot.dynamics import Body, make_body
 from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
 from specshield.shield.proposal import Proposer
 from specshield.task import Task
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 AHEADS = 8  # tasks that a process keeps prepared
 # Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
@@ -60,9 +57,9 @@ class LookAhead:
     rules: Rules
     goals: Goals
     planes: Planes
-    leads: Integers
+    leads: Ints
     shares: Floats
-    tables: NDArray[np.uint16]
+    tables: Codes
 
     def begin(self) -> bytes:
         return beliefs.begin(len(self.goals.distance), len(self.task.robot.motions)).to_bytes()
@@ -158,7 +155,7 @@ PREFERENCE = PreferenceKind(
 )
 
 
-def _leads(goals: Goals, most: int) -> tuple[Integers, Floats]:
+def _leads(goals: Goals, most: int) -> tuple[Ints, Floats]:
     """At most `most` goals that lie apart, [B], and how far each stands for each goal, [G, B]."""
     cells = np.array([np.argwhere(distance == 0)[0] for distance in goals.distance])
     between = goals.distance[:, cells[:, 0], cells[:, 1]].astype(np.float64) / 100.0

@@ -13,16 +13,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats, Singles
 from specshield.compiled import kernel, leaf
 from specshield.lookahead.goals import NO_PATH, Goals, cell_of
 from specshield.lookahead.lattice import Planes, pose_at
 from specshield.robot.dynamics import Body, displacement, longest_motions
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 FEATURES = 4  # of a motion, see `features_of`
 WANDER = -1  # in place of a goal: the stand-in that wanders

@@ -6,15 +6,10 @@ Near a wall many motions end in the same pose. Arcs of one length end in the sam
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from specshield.arrays import Floats, Ints
 from specshield.compiled import leaf
 from specshield.policy.undo import IMPOSSIBLE, turn_by
 from specshield.robot.dynamics import Body, wrap
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @leaf

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Bytes, Codes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.robot.dynamics import (
     TOUCH,
@@ -30,11 +31,6 @@ from specshield.rule.progress import STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
 from specshield.task import Task
-
-Ints = NDArray[np.int64]
-Bits = NDArray[np.uint8]
-Singles = NDArray[np.float32]
-
 
 MAX_HEADINGS = 120
 USUAL_HEADINGS = 72  # where no number of headings up to MAX_HEADINGS fits every turn: 5 degrees each
@@ -55,11 +51,11 @@ class Lattice(NamedTuple):
 
     pitch: float
     headings: int
-    valid: Bits
+    valid: Bytes
     far_u: Singles
     far_v: Singles
     far_h: NDArray[np.int16]
-    turns: Bits
+    turns: Bytes
     shift: Ints
     reach: int
 
@@ -82,7 +78,7 @@ def lattice_shape(task: Task, pitch: float) -> tuple[int, int, int]:
     return height, width, heading_count([turn for _, turn in task.robot.motions if turn != 0.0])
 
 
-def number_cells(used: NDArray[np.bool_]) -> NDArray[np.int32]:
+def number_cells(used: Bools) -> Int32s:
     """The row that each cell in use has in a table, -1 for the others. used, result [ny, nx]."""
     cell = np.full(used.shape, -1, np.int32)
     cell[used] = np.arange(int(used.sum()))
@@ -148,7 +144,7 @@ def corner(v: float, u: float, n: int) -> tuple[int, int, float]:
 
 @inlined
 def interpolate(
-    cell: NDArray[np.int32], code: NDArray[np.uint16], zero: float, largest: int, nothing: float, v: float,
+    cell: Int32s, code: Codes, zero: float, largest: int, nothing: float, v: float,
     u: float, h: float,
 ) -> float:  # fmt: skip
     """A table of steps at lattice coordinates: linear in x, y and heading over the corners that are valid.
@@ -178,7 +174,7 @@ def interpolate(
 
 
 @leaf
-def bilinear(valid: Bits, table: Singles, v: float, u: float, h: int) -> float:
+def bilinear(valid: Bytes, table: Singles, v: float, u: float, h: int) -> float:
     """A table [ny, nx, H] at a place and one heading, over the corners whose pose is valid; NO_TIME where
     none is.
     """
@@ -253,7 +249,7 @@ def _simulate_all(body: Body, lattice: Lattice, moving: Ints, turning: Ints) -> 
 
 
 @kernel
-def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bits:
+def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
     """Where each obligation's predicate holds, [K, ny, nx, H]; 0 where the pose is not valid."""
     ny, nx, headings = lattice.valid.shape
     out = np.zeros((rules.kind.shape[0], ny, nx, headings), np.uint8)

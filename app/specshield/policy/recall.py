@@ -5,21 +5,14 @@ something broke.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay_by
 
 
 @kernel
-def recall(
-    rules: Rules,
-    past: float,
-    poses: NDArray[np.float64],
-    signals: NDArray[np.float64],
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-) -> None:
+def recall(rules: Rules, past: float, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
     """As `replay`, but the states x_0..x_t have to keep the margin `past` instead of the rules' own.
 
     J asks the rules' own margin of every step of a dwell. So of a dwell that has begun only the steps that
@@ -35,7 +28,7 @@ def recall(
             run[k] = whole[k]
 
 
-def pasts(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[float, ...]:
+def pasts(rules: Rules, poses: Floats, signals: Floats) -> tuple[float, ...]:
     """The margins by which proposals have to `recall` the states x_0..x_t, given what J asks for.
 
     Where it can be had, J asks the rules' margin of the whole trajectory; then what was settled by less than
@@ -51,7 +44,7 @@ def pasts(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]
 
 
 @kernel
-def _fall_short(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.float64]) -> tuple[bool, bool]:
+def _fall_short(rules: Rules, poses: Floats, signals: Floats) -> tuple[bool, bool]:
     """Two answers: whether the rules' margin cannot be had any more on the whole trajectory though the rule
     can, and whether x_0..x_t settled something by less than that margin.
     """
@@ -67,7 +60,7 @@ def _fall_short(rules: Rules, poses: NDArray[np.float64], signals: NDArray[np.fl
 
 
 @leaf
-def forgive(rules: Rules, t: int, status: NDArray[np.int8]) -> None:
+def forgive(rules: Rules, t: int, status: Int8s) -> None:
     """Lets a policy go on after something broke at step t, in place: an `always` whose window is not over is
     pending again, and any other broken obligation counts as settled.
     """

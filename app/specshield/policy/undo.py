@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import leaf
 from specshield.robot import Robot
 from specshield.robot.dynamics import Body, displacement, motion_count, step, wrap
-
-Floats = NDArray[np.float64]
 
 SAME_ANGLE = 1e-9  # [rad] angles that differ by less are the same: far above rounding, far below any turn
 SAME_POSE = 1e-6  # [m, rad] poses that differ by less are the same: ten times what a contact leaves (SKIN)
@@ -65,7 +63,7 @@ def _is_near(x: float, y: float, theta: float, pose: Floats) -> bool:
     return bool(abs(x - pose[0]) + abs(y - pose[1]) < SAME_POSE and near)
 
 
-def undoing_motions(robot: Robot) -> NDArray[np.int64]:
+def undoing_motions(robot: Robot) -> Ints:
     """The two motions, in their order, that undo each motion where nothing is in the way, or nearly so.
 
     Shape (M, 2), NOT_NEEDED where one or none does it.

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Ints
 from specshield.errors import RobotError
 
 # A witness is stored as one byte a motion: the uint8 in shield/judgement.py and shield/feasibility.py holds
@@ -50,7 +50,7 @@ class Robot:
         return tuple(action.name for action in self.actions)
 
     @cached_property
-    def terminal(self) -> NDArray[np.bool_]:
+    def terminal(self) -> Bools:
         """Shape (A,)."""
         return np.array([action.terminal for action in self.actions])
 
@@ -60,7 +60,7 @@ class Robot:
         return tuple(dict.fromkeys((a.translate, a.rotate) for a in self.actions if not a.terminal))
 
     @cached_property
-    def motion_of(self) -> NDArray[np.int64]:
+    def motion_of(self) -> Ints:
         """Index into `motions` of each action, -1 for a terminal one. Shape (A,)."""
         index = {motion: i for i, motion in enumerate(self.motions)}
         return np.array([-1 if a.terminal else index[a.translate, a.rotate] for a in self.actions])
@@ -71,24 +71,19 @@ class Robot:
         return self.motions.index((0.0, 0.0)) if (0.0, 0.0) in self.motions else -1
 
     @cached_property
-    def representative(self) -> NDArray[np.int64]:
+    def representative(self) -> Ints:
         """The lowest action index of each motion. Shape (M,)."""
         return np.array([int(np.argmax(self.motion_of == i)) for i in range(len(self.motions))])
 
 
 def _stretch() -> Robot:
     turn, nudge = math.radians(30), math.radians(6)
-    moves = {
-        "m": (0.2, 0.0),
-        "r": (0.0, -turn),
-        "l": (0.0, turn),
-        "b": (-0.2, 0.0),
-        "ls": (0.0, nudge),
-        "rs": (0.0, -nudge),
-    }
+    translate = {"m": 0.2, "b": -0.2}
+    rotate = {"r": -turn, "l": turn, "rs": -nudge, "ls": nudge}
     tokens = "m r l b end sub_done ls rs p zm zp yp ym wp wm yms zms zps yps d"
     actions = tuple(
-        Action(name, *moves.get(name, (0.0, 0.0)), terminal=name == "end") for name in tokens.split()
+        Action(name, translate.get(name, 0.0), rotate.get(name, 0.0), name == "end")
+        for name in tokens.split()
     )
     return Robot("stretch", radius=0.1855, offset=(-0.109, 0.0), on_contact="stop", actions=actions)
 

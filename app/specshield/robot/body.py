@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bytes, Floats
 from specshield.compiled import inlined, leaf
 from specshield.robot.actions import Robot
 from specshield.world.occupancy import OccupancyGrid
@@ -19,8 +19,8 @@ from specshield.world.occupancy import OccupancyGrid
 class Body(NamedTuple):
     """Grid, footprint and motions as the compiled functions take them. Metres, radians."""
 
-    occupied: NDArray[np.uint8]  # [height, width], row 0 lowest
-    clearance: NDArray[np.float64]  # [height, width] from a cell's centre to the nearest obstacle
+    occupied: Bytes  # [height, width], row 0 lowest
+    clearance: Floats  # [height, width] from a cell's centre to the nearest obstacle
     resolution: float
     origin_x: float
     origin_y: float
@@ -30,8 +30,8 @@ class Body(NamedTuple):
     offset_x: float
     offset_y: float
     stop: bool
-    translate: NDArray[np.float64]  # [M]
-    rotate: NDArray[np.float64]  # [M]
+    translate: Floats  # [M]
+    rotate: Floats  # [M]
 
 
 def make_body(robot: Robot, grid: OccupancyGrid) -> Body:
@@ -66,7 +66,7 @@ def displacement(body: Body, motion: int) -> tuple[float, float]:
     return body.translate[motion], body.rotate[motion]
 
 
-def displacements(body: Body) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def displacements(body: Body) -> tuple[Floats, Floats]:
     """The displacement of every motion: metres ahead [M] and radians [M]."""
     return body.translate, body.rotate
 

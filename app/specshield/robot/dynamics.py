@@ -32,24 +32,3 @@ from specshield.robot.body import (
 )
 from specshield.robot.contact import TOUCH, free_distance, in_collision, overlap
 from specshield.robot.unicycle import simulate, step, successors, unhindered
-
-__all__ = [
-    "TOUCH",
-    "Body",
-    "calmest_motion",
-    "displacement",
-    "displacements",
-    "free_distance",
-    "in_collision",
-    "longest_motions",
-    "make_body",
-    "motion_count",
-    "overlap",
-    "simulate",
-    "step",
-    "successors",
-    "swing_radius",
-    "turns_in_place",
-    "unhindered",
-    "wrap",
-]

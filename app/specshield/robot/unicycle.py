@@ -8,14 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, leaf
 from specshield.robot.body import Body, centre, wrap
 from specshield.robot.contact import TOUCH, can_turn, room_around, way_ahead
-
-Floats = NDArray[np.float64]
 
 
 @leaf
@@ -67,7 +63,7 @@ def _end(
 
 
 @leaf
-def simulate(body: Body, pose: Floats, motions: NDArray[np.int64], out: Floats) -> None:
+def simulate(body: Body, pose: Floats, motions: Ints, out: Floats) -> None:
     """The trajectory of a list of motions. pose (3,), motions (n,), out (n, 3): the poses after each."""
     x, y, theta = pose[0], pose[1], pose[2]
     for k in range(motions.shape[0]):

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.errors import FragmentError
 from specshield.rule.values import REGIONS, fill_place, fill_signals, initial_signals, places, regions_of
@@ -30,15 +30,15 @@ STACK = STACK_SIZE
 class Rules(NamedTuple):
     """A formula's K obligations as flat arrays."""
 
-    kind: NDArray[np.int64]  # [K]
-    a: NDArray[np.int64]  # [K] windows in absolute steps, closed
-    b: NDArray[np.int64]
-    c1: NDArray[np.int64]
-    c2: NDArray[np.int64]
-    last: NDArray[np.int64]  # [K] the step by which the obligation is decided
+    kind: Ints  # [K]
+    a: Ints  # [K] windows in absolute steps, closed
+    b: Ints
+    c1: Ints
+    c2: Ints
+    last: Ints  # [K] the step by which the obligation is decided
     programs: Programs  # of the K predicates, over `values` (rule/values.py)
     regions: PackedRegions
-    signals: NDArray[np.float64]  # [S] the value each signal holds
+    signals: Floats  # [S] the value each signal holds
     margin: float  # an obligation holds where its predicate's robustness is above this
 
 
@@ -50,7 +50,7 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
         raise FragmentError("too many obligations", got=len(parts), expected=expected)
     known = places(task)
 
-    def column(values: list[int]) -> NDArray[np.int64]:
+    def column(values: list[int]) -> Ints:
         return np.array(values, dtype=np.int64)
 
     return Rules(
@@ -72,7 +72,7 @@ def last_step(part: Obligation) -> int:
     return part.c1 + part.b if part.kind == "eventually_always" else part.b
 
 
-def signal_rows(task: Task, signals: Mapping[str, NDArray[np.float64]], n: int) -> NDArray[np.float64]:
+def signal_rows(task: Task, signals: Mapping[str, Floats], n: int) -> Floats:
     """The signals' first n samples in the order of `Rules.signals`, shape (n, S). signals {name: [..n]}."""
     rows = np.empty((n, len(task.signals)))
     for i, name in enumerate(task.signals):
@@ -87,13 +87,7 @@ def value_count(rules: Rules) -> int:
 
 @leaf
 def read_predicates(
-    rules: Rules,
-    x: float,
-    y: float,
-    theta: float,
-    values: NDArray[np.float64],
-    stack: NDArray[np.float64],
-    out: NDArray[np.float64],
+    rules: Rules, x: float, y: float, theta: float, values: Floats, stack: Floats, out: Floats
 ) -> None:
     """The robustness of each obligation's predicate at a pose, into `out`, shape (K,)."""
     fill_place(rules.regions, x, y, theta, values)
@@ -103,9 +97,7 @@ def read_predicates(
 
 
 @leaf
-def advance(
-    rules: Rules, t: int, predicates: NDArray[np.float64], status: NDArray[np.int8], run: NDArray[np.int64]
-) -> None:
+def advance(rules: Rules, t: int, predicates: Floats, status: Int8s, run: Ints) -> None:
     """Takes the state at step t into the progress, in place.
 
     predicates (K,) at x_t; status (K,): PENDING, SETTLED or BROKEN; run (K,): how many steps, this one
@@ -135,13 +127,7 @@ def advance(
 
 
 @kernel
-def replay(
-    rules: Rules,
-    poses: NDArray[np.float64],
-    signals: NDArray[np.float64],
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-) -> None:
+def replay(rules: Rules, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
     """The progress after the states x_0..x_t. poses (t + 1, 3), signals (t + 1, S).
 
     Overwritten: status, run (K,), and rules.signals, which is left at the last row: the values that are held.
@@ -150,14 +136,7 @@ def replay(
 
 
 @kernel
-def replay_by(
-    rules: Rules,
-    past: float,
-    poses: NDArray[np.float64],
-    signals: NDArray[np.float64],
-    status: NDArray[np.int8],
-    run: NDArray[np.int64],
-) -> None:
+def replay_by(rules: Rules, past: float, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
     """`replay` with the margin `past` instead of the rules' own."""
     values, stack = np.empty(value_count(rules)), np.empty(STACK)
     predicates = np.empty(rules.kind.shape[0])

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.rule.view import look, view_of
 from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts, robustness_bounds
 from specshield.task import Task
 
 
-def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int) -> Iterator[Formula]:
+def residuals(formula: Formula, prefix: Mapping[str, Floats], t: int) -> Iterator[Formula]:
     """What can be kept after a prefix that violates the formula, the most demanding choice first.
 
     prefix {name: [t + 1]}. The first choice drops the broken conjuncts and enforces a broken G again from
@@ -26,9 +26,7 @@ def residuals(formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: in
         yield joined(kept)
 
 
-def left_over(
-    formula: Formula, prefix: Mapping[str, NDArray[np.float64]], t: int
-) -> tuple[list[Formula], list[Always]]:
+def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[list[Formula], list[Always]]:
     """The conjuncts that can still be kept, and the broken ones of the form G whose windows are not over."""
     kept: list[Formula] = []
     broken: list[Always] = []
@@ -46,9 +44,7 @@ def again(broken: Sequence[Always], t: int) -> list[Formula]:
     return [Always(max(each.a, t), each.b, each.child) for each in broken if each.b >= t]
 
 
-def still_open(
-    task: Task, formula: Formula, poses: NDArray[np.float64], rows: NDArray[np.float64], slack: int
-) -> Formula:
+def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats, slack: int) -> Formula:
     """What x_{0:t} leaves open of the formula, with each F of the conjunction met `slack` steps early.
 
     poses [t + 1, 3], rows [t + 1, S]: the signals. A G is asked from the first step on at which its child is
@@ -69,9 +65,7 @@ def still_open(
     return joined(kept) if kept else formula
 
 
-def bounds_after(
-    task: Task, formula: Formula, poses: NDArray[np.float64], rows: NDArray[np.float64]
-) -> tuple[float, float]:
+def bounds_after(task: Task, formula: Formula, poses: Floats, rows: Floats) -> tuple[float, float]:
     """Bounds (lo, hi) on rho of the formula, or of a part of it, after x_{0:t}."""
     view = view_of(task, formula)
     low, high = look(view, poses, rows, np.empty(view.tree.size))

@@ -8,13 +8,11 @@ that evaluates predicates fills it here, so that the places mean the same to all
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.compiled import inlined
 from specshield.task import POSE_NAMES, Task
 from specshield.world.regions import PackedRegions, pack_regions, region_distance
-
-Floats = NDArray[np.float64]
 
 HEADING = POSE_NAMES.index("theta")
 REGIONS = len(POSE_NAMES)  # the place of the first region

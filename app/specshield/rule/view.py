@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import inlined, kernel
 from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
 from specshield.stl import Always, And, Formula, Node, Until
@@ -17,9 +17,6 @@ from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
 from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_bounds, tree_value
 from specshield.task import Task
 from specshield.world.regions import PackedRegions
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class View(NamedTuple):
@@ -33,7 +30,7 @@ class View(NamedTuple):
     regions: PackedRegions
     first: Ints
     last: Ints
-    binds: NDArray[np.bool_]
+    binds: Bools
 
 
 @lru_cache(maxsize=256)
@@ -144,6 +141,16 @@ def look(view: View, poses: Floats, signals: Floats, known: Floats) -> tuple[flo
     return tree_bounds(tree, low, high)
 
 
+@inlined
+def recall_prefix(view: View, known: Floats, t: int, buffer: Floats) -> None:
+    """Writes the leaves at the steps to t, which `look` left in `known`, into `buffer`."""
+    tree = view.tree
+    for n in range(tree.leaf_at.shape[0]):
+        at = tree.leaf_at[n]
+        for i in range(at, at + min(t + 1, tree.leaf_stop[n]) - tree.leaf_start[n]):
+            buffer[i] = known[i]
+
+
 @kernel
 def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Floats) -> None:
     """rho (N,) of the futures poses (N, T - t, 3) of the prefix that `look` left in `known`; NaN as there.
@@ -154,9 +161,6 @@ def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Fl
     values = np.empty(value_count(view, held))
     stack, buffer = np.empty(STACK_SIZE), np.empty(tree.size)
     for f in range(poses.shape[0]):
-        for n in range(tree.leaf_at.shape[0]):
-            at = tree.leaf_at[n]
-            for i in range(at, at + min(t + 1, tree.leaf_stop[n]) - tree.leaf_start[n]):
-                buffer[i] = known[i]
+        recall_prefix(view, known, t, buffer)
         sound = _read(view, poses[f], held, t + 1, values, stack, buffer)
         rho[f] = tree_value(tree, buffer) if sound else math.nan

@@ -54,8 +54,7 @@ class Settings(BaseSettings):
     shield_cache: int = Field(default=32, ge=1, description="Prepared shields kept in memory.")
 
     worker: bool | None = Field(
-        default=None,
-        description="Start a training worker too. Unset: where the store is embedded.",
+        default=None, description="Start a training worker too. Unset: where the store is embedded."
     )
     training_timeout: int = Field(default=6 * 3600, ge=1, description="Longest training run [s].")
 

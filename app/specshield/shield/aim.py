@@ -8,16 +8,13 @@ to the most steps with which the margin can be had, and then the margin.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats
 from specshield.rule.residual import still_open
 from specshield.rule.view import view_of
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, prefix_of, rho_of
 from specshield.stl import SATISFIED_ABOVE
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 def aim(shield: Shield, prefix: Prefix, tried: Futures, whole: Floats) -> tuple[Best, Bools, bool]:

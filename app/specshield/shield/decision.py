@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.errors import InputError, PolicyError
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.view import View, view_of
@@ -19,7 +19,6 @@ from specshield.shield.proposal import Proposer
 from specshield.stl import Verdict
 from specshield.task import Task
 
-Floats = NDArray[np.float64]
 Mode = Literal["prior", "shaped", "completion", "fallback", "violated"]
 Reason = Literal["infeasible", "zero_prior_mass", "margin_unattainable"]
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from hashlib import blake2b
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from specshield.arrays import Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.robot.dynamics import in_collision, successors, wrap
@@ -33,7 +34,6 @@ from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "close", "decide", "make_shield", "start"]
 
-Floats = NDArray[np.float64]
 Signals = Mapping[str, Floats]
 SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
 
@@ -163,11 +163,7 @@ class _Answer:
 
 
 def _answer(
-    shield: Shield,
-    log_prior: Floats | None,
-    judged: Judged,
-    main_task_done: bool,
-    weights: Floats | None,
+    shield: Shield, log_prior: Floats | None, judged: Judged, main_task_done: bool, weights: Floats | None
 ) -> _Answer:
     """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`.
 

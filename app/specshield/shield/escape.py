@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel
 from specshield.robot.dynamics import Body, motion_count, successors
 from specshield.shield.decision import Shield
@@ -18,9 +19,6 @@ from specshield.shield.feasibility import Futures, Prefix, simulated
 from specshield.shield.proposal import ask
 from specshield.stl import SATISFIED_ABOVE, Always, robustness
 from specshield.task import Task
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Chosen by hand, so that one search costs some milliseconds; tests/shield/test_escape.py says what is found.
 POSES_A_LAYER = 1024  # poses that are simulated at each step of the search, about

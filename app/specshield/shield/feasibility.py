@@ -12,20 +12,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, kernel
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
 from specshield.rule.progress import signal_rows
-from specshield.rule.view import View, look, rate, read_step, value_count
+from specshield.rule.view import View, look, rate, read_step, recall_prefix, value_count
 from specshield.shield.proposal import Proposer, ask
 from specshield.stl import SATISFIED_ABOVE, Formula, robustness_bounds
 from specshield.stl.program import STACK_SIZE
 from specshield.stl.tree import tree_value
 from specshield.task import Task
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Signals = Mapping[str, Floats]
 SLOTS = 8  # remembered motions for each step of a future: enough that few share one
 NOT_FINITE = "the formula's arithmetic is not finite along some futures; these certify nothing"
@@ -181,10 +179,7 @@ def _simulate_and_rate(
     met = np.full(1 << math.ceil(math.log2(SLOTS * steps)), -1, np.int64)
     for f in range(motions.shape[0]):
         first, row = motions[f, 0], poses[f]
-        for n in range(tree.leaf_at.shape[0]):
-            at = tree.leaf_at[n]
-            for i in range(at, at + min(t + 1, tree.leaf_stop[n]) - tree.leaf_start[n]):
-                buffer[i] = known[i]
+        recall_prefix(view, known, t, buffer)
         x, y, theta = pose[0], pose[1], pose[2]
         k, whole = 0, True
         while k < steps and whole:

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.rule.residual import again, joined, left_over
 from specshield.rule.view import view_of
@@ -16,21 +16,8 @@ from specshield.shield import shaping
 from specshield.shield.aim import aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, flat, is_place
-from specshield.shield.feasibility import (
-    Best,
-    Futures,
-    Prefix,
-    best_of,
-    futures,
-    prefix_of,
-    rho_of,
-    together,
-)
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho_of, together
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

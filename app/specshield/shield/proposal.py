@@ -13,13 +13,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel
 from specshield.task import Task
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 MAX_MOTIONS = 1_000_000  # in one proposal, all rows together: 32 MB while they are simulated
 log = logging.getLogger("specshield")

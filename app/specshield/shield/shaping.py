@@ -10,12 +10,9 @@ Only threshold = 1 with binary J carries a guarantee: a threshold holds per step
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 
 @kernel

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
+from specshield.arrays import Bools, Singles
 from specshield.sim.robot import Pose
 from specshield.stl import Formula, Implies, Not
 from specshield.task import Task
@@ -110,12 +110,12 @@ class Canvas:
         u, v = (point[0] - self.top[0]) * self._scale, (self.top[1] - point[1]) * self._scale
         return (float(u) + BORDER) * FINE, (float(v) + BORDER + self._above) * FINE
 
-    def _refined(self, values: NDArray[np.float32], how: Image.Resampling) -> NDArray[np.float32]:
+    def _refined(self, values: Singles, how: Image.Resampling) -> Singles:
         """One value a pixel of the map, as one value a fine pixel."""
         size = (self.width * FINE, self.height * FINE)
         return np.asarray(Image.fromarray(values).resize(size, how))
 
-    def _paint(self, where: NDArray[np.bool_], color: str, opacity: float) -> None:
+    def _paint(self, where: Bools, color: str, opacity: float) -> None:
         mask = Image.fromarray((where * round(255 * opacity)).astype(np.uint8))
         place = BORDER * FINE, (BORDER + self._above) * FINE
         self._image.paste(ImageColor.getrgb(color), place, mask)

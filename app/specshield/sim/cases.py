@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.errors import NotFound
+from specshield.policy.geodesic import geodesic_distance
 from specshield.policy.methods import load_policy
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, make_body
 from specshield.shield.proposal import Proposer
 from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task
-from specshield.world.geodesic import geodesic_distance
 from specshield.world.map_server import load_map
 from specshield.world.regions import Region, region_from_json
 
@@ -40,7 +40,7 @@ class Case:
         return make_body(self.task.robot, self.task.grid)
 
     @cached_property
-    def distance(self) -> NDArray[np.float64]:
+    def distance(self) -> Floats:
         """Metres along free space from each cell to the target, inf in walls. Shape [height, width]."""
         grid = self.task.grid
         goal = np.zeros_like(grid.occupied)

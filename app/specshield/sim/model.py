@@ -6,12 +6,10 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.robot import Robot
 from specshield.sim.robot import Observation, SimulatedRobot
-
-Floats = NDArray[np.float64]
 
 
 class FoundationModel(Protocol):

@@ -29,10 +29,7 @@ def table(campaigns: Sequence[Campaign]) -> str:
 def _outcome(episodes: Sequence[Episode]) -> dict[str, str]:
     kept = sum(episode.spec_status == "satisfied" for episode in episodes)
     done = sum(episode.main_done for episode in episodes)
-    return {
-        "rule satisfied": f"{kept} of {len(episodes)}",
-        "main task done": f"{done} of {len(episodes)}",
-    }
+    return {"rule satisfied": f"{kept} of {len(episodes)}", "main task done": f"{done} of {len(episodes)}"}
 
 
 def _shielded(campaign: Campaign) -> dict[str, str]:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats
+from specshield.policy.geodesic import geodesic_distance
 from specshield.robot.dynamics import displacements, step, successors
 from specshield.sim.cases import Case
 from specshield.sim.senses import RAYS, Senses, scan, see
-from specshield.world.geodesic import geodesic_distance
 
 COMFORT = 0.32  # [m] clearance in which a Stretch turns freely about its origin
 LOOK_AHEAD = 10  # [cells] along the way: how far ahead the bearing is taken; chosen by hand
@@ -31,7 +31,7 @@ class Observation:
 
     distance: float
     bearing: float
-    blocked: NDArray[np.bool_]
+    blocked: Bools
     last_action: int | None
 
 
@@ -64,7 +64,7 @@ class SimulatedRobot:
         scan(self._case.body, *self.pose, ranges)
         return Senses(ranges, *see(self._case.body, *self.pose, *self._case.target), self.last_action)
 
-    def _blocked(self) -> NDArray[np.bool_]:
+    def _blocked(self) -> Bools:
         robot, body = self._case.task.robot, self._case.body
         after = np.empty((len(robot.motions), 3))
         successors(body, np.array(self.pose), after)
@@ -86,7 +86,7 @@ def way(case: Case, pose: Pose) -> tuple[float, float]:
 
 
 @lru_cache(maxsize=32)
-def waypoints(case: Case) -> NDArray[np.float64]:
+def waypoints(case: Case) -> Floats:
     """From each cell, the point that lies LOOK_AHEAD cells on along the way to the target [m].
 
     The way keeps off the walls, so that the robot can turn on it; from a cell beside a wall it first leads

@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.compiled import leaf
 from specshield.robot.dynamics import Body
 
@@ -27,7 +27,7 @@ class Senses(NamedTuple):
     and bearing [rad], otherwise 0. last_action: the one that was executed, None at first.
     """
 
-    ranges: NDArray[np.float64]
+    ranges: Floats
     seen: bool
     distance: float
     bearing: float
@@ -35,7 +35,7 @@ class Senses(NamedTuple):
 
 
 @leaf
-def scan(body: Body, x: float, y: float, theta: float, out: NDArray[np.float64]) -> None:
+def scan(body: Body, x: float, y: float, theta: float, out: Floats) -> None:
     """Writes the ranges, shape (RAYS,)."""
     for k in range(out.shape[0]):
         out[k] = cast(body, x, y, theta + 2.0 * math.pi * k / out.shape[0], REACH)

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, kernel
 from specshield.errors import FormulaError, FragmentError
 from specshield.stl.formula import (
@@ -40,16 +40,16 @@ _ARITHMETIC = {"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "/": DIVIDE}
 class Program(NamedTuple):
     """ops int64[n]; args float64[n]: the number of a NUMBER, the slot of a VALUE, else 0."""
 
-    ops: NDArray[np.int64]
-    args: NDArray[np.float64]
+    ops: Ints
+    args: Floats
 
 
 class Programs(NamedTuple):
     """Several programs end to end; program k is at starts[k] to starts[k + 1]. starts int64[k + 1]."""
 
-    ops: NDArray[np.int64]
-    args: NDArray[np.float64]
-    starts: NDArray[np.int64]
+    ops: Ints
+    args: Floats
+    starts: Ints
 
 
 def compile_predicate(predicate: Node, slots: Mapping[str, int]) -> Program:
@@ -113,14 +113,7 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
 
 
 @inlined
-def _run(
-    ops: NDArray[np.int64],
-    args: NDArray[np.float64],
-    start: int,
-    stop: int,
-    values: NDArray[np.float64],
-    stack: NDArray[np.float64],
-) -> float:
+def _run(ops: Ints, args: Floats, start: int, stop: int, values: Floats, stack: Floats) -> float:
     top = -1
     for i in range(start, stop):
         op = ops[i]
@@ -158,14 +151,12 @@ def _run(
 
 
 @kernel
-def evaluate(ops: NDArray[np.int64], args: NDArray[np.float64], values: NDArray[np.float64]) -> float:
+def evaluate(ops: Ints, args: Floats, values: Floats) -> float:
     """The robustness that one program computes from values float64[slots]."""
     return _run(ops, args, 0, len(ops), values, np.empty(STACK_SIZE))
 
 
 @inlined
-def evaluate_packed(
-    k: int, programs: Programs, values: NDArray[np.float64], stack: NDArray[np.float64]
-) -> float:
+def evaluate_packed(k: int, programs: Programs, values: Floats, stack: Floats) -> float:
     """The robustness of program k of `programs`; stack float64[STACK_SIZE] is scratch."""
     return _run(programs.ops, programs.args, programs.starts[k], programs.starts[k + 1], values, stack)

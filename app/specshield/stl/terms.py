@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.errors import SampleError
 from specshield.stl.formula import Abs, Arithmetic, Name, Neg, Number, Term
 
-Array: TypeAlias = NDArray[np.float64]
+Array: TypeAlias = Floats
 
 _ARITHMETIC = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}
 

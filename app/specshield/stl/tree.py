@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, leaf
 from specshield.stl.formula import (
     Always,
@@ -32,9 +32,6 @@ from specshield.stl.robustness import difference
 from specshield.stl.terms import interval
 
 NOT, AND, OR, ALWAYS, EVENTUALLY, UNTIL = range(6)
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class Tree(NamedTuple):

@@ -14,6 +14,7 @@ import yaml
 from numpy.typing import NDArray
 from PIL import Image
 
+from specshield.arrays import Floats
 from specshield.errors import MapError
 from specshield.world import checks
 from specshield.world.formats import MapFormat, Rooms
@@ -123,7 +124,7 @@ def _number(value: Any, path: str, low: float = -checks.LIMIT, high: float = che
     return checks.number(value, path, low, high)
 
 
-def _read_image(image: bytes, alpha_counts: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
     """(shade, opacity) in [0, 1], each [height, width]. The size is checked before anything is decoded."""
     try:
         picture = Image.open(io.BytesIO(image), formats=["PPM", "PNG"])

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel
 from specshield.errors import MapError
 from specshield.world import checks
@@ -28,7 +29,7 @@ class OccupancyGrid:
     Grids are equal when their content_hash is. Raises MapError for sizes or numbers out of range.
     """
 
-    occupied: NDArray[np.bool_]
+    occupied: Bools
     resolution: float
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -79,18 +80,18 @@ class OccupancyGrid:
         return float(xmin), float(ymin), float(xmax), float(ymax)
 
     @cached_property
-    def clearance(self) -> NDArray[np.float64]:
+    def clearance(self) -> Floats:
         """Metres from each cell's centre to the nearest obstacle. Shape [height, width], read-only.
 
         Exact Euclidean distance to the nearest point of any occupied cell's closed square or of the
         outside of the grid; 0 in occupied cells, at least resolution / 2 in free ones. A point p in the
         cell with centre c is between clearance - |p - c| and clearance + |p - c| from the nearest obstacle.
         """
-        clearance: NDArray[np.float64] = np.sqrt(_squared_half_cells(self.occupied)) * (self.resolution / 2)
+        clearance: Floats = np.sqrt(_squared_half_cells(self.occupied)) * (self.resolution / 2)
         clearance.flags.writeable = False
         return clearance
 
-    def to_grid(self, points: ArrayLike) -> NDArray[np.float64]:
+    def to_grid(self, points: ArrayLike) -> Floats:
         """Map frame to grid frame, [..., 2] to [..., 2], metres.
 
         The grid's lower-left corner is (0, 0), its first axis runs along the columns and its second along the
@@ -102,7 +103,7 @@ class OccupancyGrid:
         dx, dy = delta[..., 0], delta[..., 1]
         return np.stack([dx * cos + dy * sin, dy * cos - dx * sin], axis=-1)
 
-    def to_map(self, points: ArrayLike) -> NDArray[np.float64]:
+    def to_map(self, points: ArrayLike) -> Floats:
         """Grid frame to map frame: the inverse of to_grid."""
         x0, y0, yaw = self.origin
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -111,7 +112,7 @@ class OccupancyGrid:
         return np.stack([x0 + gx * cos - gy * sin, y0 + gx * sin + gy * cos], axis=-1)
 
     @cached_property
-    def centres(self) -> NDArray[np.float64]:
+    def centres(self) -> Floats:
         """Cell centres in the map frame, metres. Shape [height, width, 2]."""
         columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         return self.to_map(np.stack([columns, rows], axis=-1) * self.resolution)
@@ -130,7 +131,7 @@ def check_size(width: int, height: int) -> None:
 
 
 @kernel
-def _squared_half_cells(occupied: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _squared_half_cells(occupied: Bools) -> Floats:
     """Squared distance from each cell's centre to the nearest occupied square, in half cells.
 
     It is a whole number, so exact: on the lattice of half cells a centre is (2i + 1, 2j + 1), and the nearest

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats
 from specshield.errors import MapError
 from specshield.world import checks
 from specshield.world.formats import MapFormat
@@ -24,8 +24,6 @@ from specshield.world.regions import Polygon, Region, Union, signed_distance
 STANDS_BELOW = 0.3  # [m] a fixed thing whose lowest point is higher hangs on a wall or stands on another
 TOUCH = 1e-9  # [m] things that come this near touch
 MAX_ITEMS = 10_000  # of one list, so that hostile JSON ends early
-
-Array = NDArray[np.float64]
 
 
 def load_house(house: Any, asset_sizes: Any, resolution: float) -> tuple[OccupancyGrid, dict[str, Region]]:
@@ -82,9 +80,9 @@ def _rooms(polygons: list[tuple[str, Polygon]]) -> dict[str, Region]:
     return rooms
 
 
-def _walls(house: Any) -> Iterator[tuple[Array, Array]]:
+def _walls(house: Any) -> Iterator[tuple[Floats, Floats]]:
     """The two ends [2] of each straight piece of wall that is left when the doorways are cut out."""
-    walls: dict[str, tuple[Array, Array]] = {}
+    walls: dict[str, tuple[Floats, Floats]] = {}
     open_plan: set[str] = set()
     for path, wall in _items(house, "walls"):
         ends = [np.array([x, z]) for x, _, z in _points(wall, "polygon", path, 2)]
@@ -92,7 +90,7 @@ def _walls(house: Any) -> Iterator[tuple[Array, Array]]:
         walls[identity] = ends[0], ends[1]
         if wall.get("empty") is True:
             open_plan.add(identity)
-    gaps: dict[str, list[tuple[Array, Array]]] = {}
+    gaps: dict[str, list[tuple[Floats, Floats]]] = {}
     for path, door in _items(house, "doors"):
         first, second = (checks.member(door, key, path) for key in ("wall0", "wall1"))
         for key, identity in (("wall0", first), ("wall1", second)):
@@ -124,7 +122,7 @@ def _passable(door: Mapping[str, Any], path: str) -> bool:
     )
 
 
-def _pieces(start: Array, end: Array, gaps: list[tuple[Array, Array]]) -> Iterator[tuple[Array, Array]]:
+def _pieces(start: Floats, end: Floats, gaps: list[tuple[Floats, Floats]]) -> Iterator[tuple[Floats, Floats]]:
     """The segment from start to end without the gaps on it."""
     length = float(np.linalg.norm(end - start))
     if length < TOUCH:
@@ -142,7 +140,7 @@ def _pieces(start: Array, end: Array, gaps: list[tuple[Array, Array]]) -> Iterat
         yield start + done * along, end
 
 
-def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Array, Array]]:
+def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Floats, Floats]]:
     """Centre [2] and half edges [3, 2] on the floor plane of each fixed thing that stands on the floor."""
     sizes = checks.mapping(asset_sizes, "asset_sizes")
     pending = list(_items(house, "objects"))
@@ -183,13 +181,13 @@ def _size(value: Any, path: str) -> list[float]:
     return [checks.number(extent, f"{path}[{i}]", 0.0, 1000.0) for i, extent in enumerate(extents)]
 
 
-def _rotation(degrees: tuple[float, float, float]) -> Array:
+def _rotation(degrees: tuple[float, float, float]) -> Floats:
     """Unity's rotation matrix [3, 3]: about z, then x, then y."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    rotation: Array = about_y @ about_x @ about_z
+    rotation: Floats = about_y @ about_x @ about_z
     return rotation
 
 
@@ -197,11 +195,11 @@ def _rotation(degrees: tuple[float, float, float]) -> Array:
 class _Canvas:
     """The cells while they are drawn: bool[height, width], resolution [m], lower left corner (x, y)."""
 
-    occupied: NDArray[np.bool_]
+    occupied: Bools
     resolution: float
-    corner: Array
+    corner: Floats
 
-    def window(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
+    def window(self, low: Floats, high: Floats) -> tuple[Bools, Floats]:
         """A view of the cells [h, w] that touch a rectangle, and their centres [h, w, 2]."""
         size = self.occupied.shape[::-1]
         j0, i0 = np.clip(np.floor((low - TOUCH - self.corner) / self.resolution), 0, size).astype(int)
@@ -209,7 +207,7 @@ class _Canvas:
         columns, rows = np.meshgrid(np.arange(j0, j1) + 0.5, np.arange(i0, i1) + 0.5)
         return self.occupied[i0:i1, j0:j1], self.corner + np.stack([columns, rows], axis=-1) * self.resolution
 
-    def cover(self, centre: Array, spans: Array) -> None:
+    def cover(self, centre: Floats, spans: Floats) -> None:
         """Occupies the cells that touch {centre + sum of t_k spans[k], |t_k| <= 1}, spans [k, 2].
 
         That set is a segment or a box's shadow. Two convex shapes are apart exactly when the normal of some

@@ -9,8 +9,9 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import MapError
 from specshield.world import checks
@@ -92,11 +93,11 @@ class Union:
 Region = Circle | Rectangle | Polygon | Union
 
 
-def signed_distance(region: Region, points: ArrayLike) -> NDArray[np.float64]:
+def signed_distance(region: Region, points: ArrayLike) -> Floats:
     """Metres to the region's boundary, positive inside. points [..., 2] in the map frame, result [...]."""
     array = np.asarray(points, dtype=np.float64)
     flat = np.ascontiguousarray(array.reshape(-1, 2))
-    result: NDArray[np.float64] = _distances(_packed(region), flat).reshape(array.shape[:-1])
+    result: Floats = _distances(_packed(region), flat).reshape(array.shape[:-1])
     return result
 
 
@@ -109,10 +110,10 @@ class PackedRegions(NamedTuple):
     data: float64, in metres: circle x, y, radius; rectangle xmin, ymin, xmax, ymax; polygon x, y, x, y, ...
     """
 
-    starts: NDArray[np.int64]
-    kinds: NDArray[np.int64]
-    offsets: NDArray[np.int64]
-    data: NDArray[np.float64]
+    starts: Ints
+    kinds: Ints
+    offsets: Ints
+    data: Floats
 
 
 @lru_cache(maxsize=1024)
@@ -162,7 +163,7 @@ def region_distance(regions: PackedRegions, i: int, x: float, y: float) -> float
 
 
 @leaf
-def _polygon_distance(data: NDArray[np.float64], begin: int, end: int, x: float, y: float) -> float:
+def _polygon_distance(data: Floats, begin: int, end: int, x: float, y: float) -> float:
     """The nearest edge gives the size; the sign is positive if a ray to the right crosses an odd number."""
     inside = False
     nearest = np.inf
@@ -181,7 +182,7 @@ def _polygon_distance(data: NDArray[np.float64], begin: int, end: int, x: float,
 
 
 @kernel
-def _distances(regions: PackedRegions, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _distances(regions: PackedRegions, points: Floats) -> Floats:
     out = np.empty(points.shape[0])
     for k in range(points.shape[0]):
         out[k] = region_distance(regions, 0, points[k, 0], points[k, 1])

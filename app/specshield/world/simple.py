@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from specshield.arrays import Floats
 from specshield.compiled import kernel
 
 
@@ -16,7 +14,7 @@ def _side(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> i
 
 
 @kernel
-def crossing_edges(v: NDArray[np.float64]) -> tuple[int, int]:
+def crossing_edges(v: Floats) -> tuple[int, int]:
     """The first two edges of a closed polygon v[n, 2] that share a point they should not, or (-1, -1)."""
     n = v.shape[0]
     for i in range(n):

@@ -11,8 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats, Int8s, Ints, Singles
 from specshield.compiled import kernel
 from specshield.errors import MapError
 from specshield.policy.dqn.funnel import Funnels, make_funnels, reward
@@ -30,8 +30,6 @@ from specshield.robot.dynamics import Body, in_collision, motion_count, successo
 from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, advance
 from specshield.task import Task
 
-Floats = NDArray[np.float64]
-
 FROM_THE_START = 0.5  # share of the episodes that begin at t = 0; chosen by hand, nothing was measured
 PROBES = 4096  # poses over which the least and greatest robustness of a predicate are taken
 
@@ -39,12 +37,12 @@ PROBES = 4096  # poses over which the least and greatest robustness of a predica
 class Robots(NamedTuple):
     """Where N robots are in their episodes. The members are `State`'s, one row for each robot."""
 
-    t: NDArray[np.int64]  # [N]
+    t: Ints  # [N]
     pose: Floats  # [N, 3]
-    status: NDArray[np.int8]  # [N, K]
-    run: NDArray[np.int64]  # [N, K]
+    status: Int8s  # [N, K]
+    run: Ints  # [N, K]
     nexts: Floats  # [N, M, 3]
-    observation: NDArray[np.float32]  # [N, F]
+    observation: Singles  # [N, F]
 
 
 class Environment:
@@ -68,11 +66,11 @@ class Environment:
         self.step(np.zeros(count, dtype=np.int64))
 
     @property
-    def observations(self) -> NDArray[np.float32]:
+    def observations(self) -> Singles:
         """What each robot sees now, (N, F)."""
         return self.robots.observation
 
-    def step(self, motions: NDArray[np.int64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def step(self, motions: Ints) -> tuple[Singles, Bools]:
         """Each robot takes its motion, (N,). Returns the rewards (N,) and which episodes ended (N,).
 
         The robots whose episodes ended are at the beginning of their next.
@@ -107,7 +105,7 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> F
 
 
 @kernel
-def _are_free(body: Body, poses: Floats) -> NDArray[np.bool_]:
+def _are_free(body: Body, poses: Floats) -> Bools:
     out = np.empty(poses.shape[0], np.bool_)
     for i in range(poses.shape[0]):
         out[i] = not in_collision(body, poses[i, 0], poses[i, 1], poses[i, 2])
@@ -139,12 +137,12 @@ def _step_all(
     scene: Scene,
     funnels: Funnels,
     robots: Robots,
-    motions: NDArray[np.int64],
+    motions: Ints,
     fresh: Floats,
-    times: NDArray[np.int64],
+    times: Ints,
     chance: Floats,
-    rewards: NDArray[np.float32],
-    ended: NDArray[np.bool_],
+    rewards: Singles,
+    ended: Bools,
 ) -> None:
     """One step of every robot. fresh (N, 3), times (N,), chance (N, K): where a new episode would begin."""
     rules, t = scene.rules, robots.t

@@ -15,14 +15,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import leaf
 from specshield.policy.dqn.observation import State
 from specshield.policy.dqn.scene import Scene, current_goal, distance_to
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED
-
-Floats = NDArray[np.float64]
 
 # Chosen by hand; nothing was measured.
 CAP = 0.15  # [m] robustness of an `always` beyond which more is no better, and rho_max inside a goal
@@ -37,7 +35,7 @@ class Funnels(NamedTuple):
     gamma_0: Floats
     gamma_inf: Floats
     rate: Floats
-    clock: NDArray[np.int64]
+    clock: Ints
     rho_max: Floats
     literal: bool
 

@@ -11,10 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.arrays import Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import PolicyError
-
-Floats = NDArray[np.float32]
 
 NAMES = ("w1", "b1", "w2", "b2", "w3", "b3")
 MAX_UNITS = 1024  # of a layer; bounds the time of a decision with weights that come from outside
@@ -23,20 +22,20 @@ MAX_UNITS = 1024  # of a layer; bounds the time of a decision with weights that 
 class Network(NamedTuple):
     """Observation -> w1 -> relu -> w2 -> relu -> w3 -> one Q-value a motion. Weights [inputs, outputs]."""
 
-    w1: Floats
-    b1: Floats
-    w2: Floats
-    b2: Floats
-    w3: Floats
-    b3: Floats
+    w1: Singles
+    b1: Singles
+    w2: Singles
+    b2: Singles
+    w3: Singles
+    b3: Singles
 
 
 class Layers(NamedTuple):
     """What the network computed last: both hidden layers, and q [M], the value of each motion."""
 
-    h1: Floats
-    h2: Floats
-    q: Floats
+    h1: Singles
+    h2: Singles
+    q: Singles
 
 
 def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, outputs: int) -> Network:
@@ -69,7 +68,7 @@ def make_layers(net: Network) -> Layers:
 
 
 @leaf
-def greedy(net: Network, observation: Floats, layers: Layers) -> int:
+def greedy(net: Network, observation: Singles, layers: Layers) -> int:
     """argmax_a Q(observation, a), the lowest index on ties. Overwrites `layers`."""
     _layer(observation, net.w1, net.b1, layers.h1)
     _relu(layers.h1)
@@ -84,7 +83,7 @@ def greedy(net: Network, observation: Floats, layers: Layers) -> int:
 
 
 @inlined
-def _layer(x: Floats, w: Floats, b: Floats, out: Floats) -> None:
+def _layer(x: Singles, w: Singles, b: Singles, out: Singles) -> None:
     """out = b + x w, each sum in the inputs' order; eight inputs a pass, so that sums stay in registers."""
     for j in range(out.shape[0]):
         out[j] = b[j]
@@ -101,6 +100,6 @@ def _layer(x: Floats, w: Floats, b: Floats, out: Floats) -> None:
 
 
 @inlined
-def _relu(x: Floats) -> None:
+def _relu(x: Singles) -> None:
     for j in range(x.shape[0]):
         x[j] = max(x[j], np.float32(0.0))

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Int8s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.dqn.scene import Scene, between, blend, current_goal, distance_to
 from specshield.robot.dynamics import Body, displacement, motion_count
@@ -40,15 +40,15 @@ MOST_GAIN = 1.5  # [strides] by which one motion may bring the goal nearer or fa
 class State(NamedTuple):
     """A robot at one step, of a task with K obligations and M motions."""
 
-    pose: NDArray[np.float64]  # [3]
-    status: NDArray[np.int8]  # [K] the progress, as `advance` keeps it
-    run: NDArray[np.int64]  # [K]
-    predicates: NDArray[np.float64]  # [K] robustness at `pose`
-    nexts: NDArray[np.float64]  # [M, 3] the pose after each motion
-    observation: NDArray[np.float32]  # [observation_size]
-    values: NDArray[np.float64]  # what predicates read (rule/values.py), filled for some pose
-    stack: NDArray[np.float64]  # scratch of programs
-    after: NDArray[np.float64]  # [K] scratch: predicates after a motion
+    pose: Floats  # [3]
+    status: Int8s  # [K] the progress, as `advance` keeps it
+    run: Ints  # [K]
+    predicates: Floats  # [K] robustness at `pose`
+    nexts: Floats  # [M, 3] the pose after each motion
+    observation: Singles  # [observation_size]
+    values: Floats  # what predicates read (rule/values.py), filled for some pose
+    stack: Floats  # scratch of programs
+    after: Floats  # [K] scratch: predicates after a motion
 
 
 def observation_size(rules: Rules, body: Body) -> int:
@@ -83,7 +83,7 @@ def arrive(rules: Rules, t: int, x: float, y: float, theta: float, state: State)
 
 
 @leaf
-def outcome(status: NDArray[np.int8]) -> int:
+def outcome(status: Int8s) -> int:
     """BROKEN if any obligation is, SETTLED if all are, else PENDING."""
     settled = True
     for k in range(status.shape[0]):
@@ -179,7 +179,7 @@ def _observe_motions(
 
 
 @inlined
-def _safety(rules: Rules, t: int, predicates: NDArray[np.float64]) -> np.float32:
+def _safety(rules: Rules, t: int, predicates: Floats) -> np.float32:
     """How far every `always` that holds at step t is from being broken, in units of SAFE; from -1 to 1."""
     safe = np.float32(1.0)
     for k in range(rules.kind.shape[0]):

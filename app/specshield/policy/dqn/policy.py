@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
+from specshield.arrays import Floats, Ints
 from specshield.policy.card import Card
 from specshield.policy.dqn.network import Network, make_network
 from specshield.policy.dqn.observation import observation_size
@@ -48,12 +48,10 @@ class Policy:
         return make_scene(self.task)
 
     @cached_property
-    def _undoing(self) -> NDArray[np.int64]:
+    def _undoing(self) -> Ints:
         return undoing_motions(self.task.robot)
 
-    def propose(
-        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
-    ) -> Proposal:
+    def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """As `Proposer` says."""
         rules = self.scene.rules
         scene = self.scene._replace(rules=rules._replace(signals=rules.signals.copy(), margin=margin))

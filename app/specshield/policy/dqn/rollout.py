@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_way, find_sibling, find_twins, join
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
@@ -14,12 +14,9 @@ from specshield.policy.recall import recall
 from specshield.robot.dynamics import motion_count, step, successors
 from specshield.rule.progress import BROKEN, PENDING, SETTLED, Rules, advance
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 @leaf
-def _begin(rules: Rules, pose: Floats, status: NDArray[np.int8], run: Ints, state: State) -> None:
+def _begin(rules: Rules, pose: Floats, status: Int8s, run: Ints, state: State) -> None:
     """Puts a rollout at x_t. status, run (K,): the progress there, which is copied."""
     for k in range(status.shape[0]):
         state.status[k], state.run[k] = status[k], run[k]
@@ -27,7 +24,7 @@ def _begin(rules: Rules, pose: Floats, status: NDArray[np.int8], run: Ints, stat
 
 
 @leaf
-def _is_pending(status: NDArray[np.int8]) -> bool:
+def _is_pending(status: Int8s) -> bool:
     pending = False
     for k in range(status.shape[0]):
         pending = pending or status[k] == PENDING
@@ -167,7 +164,7 @@ def propose_all(
 
 
 @kernel
-def satisfies(scene: Scene, net: Network, starts: Floats, first: bool) -> NDArray[np.bool_]:
+def satisfies(scene: Scene, net: Network, starts: Floats, first: bool) -> Bools:
     """Whether pi_phi settles the formula from each of starts (N, 3) at t = 0. Shape (N,).
 
     first: whether any first motion may come before pi_phi.

@@ -9,18 +9,16 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
+from specshield.policy.geodesic import geodesic_distance
 from specshield.robot.dynamics import Body, longest_motions, make_body
 from specshield.rule.progress import ALWAYS, PENDING, STACK, Rules, make_rules, read_predicates, value_count
 from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import VALUE
 from specshield.task import Task
-from specshield.world.geodesic import geodesic_distance
-
-Floats = NDArray[np.float64]
 
 # The networks that are shipped were trained with these, which were chosen by hand; nothing was measured.
 UNREACHABLE = 1e3  # [m] the distance everywhere to a goal that no cell of the map reaches
@@ -34,12 +32,12 @@ class Scene(NamedTuple):
     body: Body
     rules: Rules
     distance: Floats  # [G, height, width] metres along free space to where the goal's predicate holds
-    goal: NDArray[np.int64]  # [K] index into `distance`, -1 for an `always`
+    goal: Ints  # [K] index into `distance`, -1 for an `always`
     centre: tuple[float, float]  # of the map [m]
     half: tuple[float, float]  # half the map's width and height [m]
     horizon: int
     stride: float  # the longest move [m]
-    guards: NDArray[np.int64]  # the regions that an `always` reads
+    guards: Ints  # the regions that an `always` reads
     guards_turn: bool  # whether an `always` reads the heading
     wait: int  # the motion that leaves the pose as it is, -1 for a robot that has none
 
@@ -131,7 +129,7 @@ def distance_to(scene: Scene, k: int, x: float, y: float) -> float:
 
 
 @inlined
-def current_goal(rules: Rules, status: NDArray[np.int8]) -> int:
+def current_goal(rules: Rules, status: Int8s) -> int:
     """The pending goal with the earliest deadline, the first of those due together, -1 where none is left."""
     best = -1
     for k in range(rules.kind.shape[0]):

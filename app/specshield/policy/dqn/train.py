@@ -24,6 +24,7 @@ from safetensors.torch import save_file
 from scipy.stats import binomtest
 from torch import nn
 
+from specshield.arrays import Bools, Ints, Singles
 from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.method import Settings
@@ -97,7 +98,7 @@ def train(
     return Policy(task, card, make_network(weights, run.inputs, run.outputs))
 
 
-def measure(task: Task, weights: dict[str, NDArray[np.float32]], starts: int, seed: int) -> dict[str, Any]:
+def measure(task: Task, weights: dict[str, Singles], starts: int, seed: int) -> dict[str, Any]:
     """How often pi_phi satisfies the formula from starts uniform over free space, t = 0.
 
     `satisfied`: pi_phi alone. `feasible_start`: some first action, then pi_phi, which is where a session can
@@ -121,7 +122,7 @@ def make_q_network(inputs: int, units: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(*hidden, nn.Linear(units, outputs))
 
 
-def weights_of(network: nn.Module) -> dict[str, NDArray[np.float32]]:
+def weights_of(network: nn.Module) -> dict[str, Singles]:
     """A copy of the weights as network.py has them: w [inputs, outputs]."""
     arrays = [parameter.detach().cpu().numpy().T.copy() for parameter in network.parameters()]
     return dict(zip(NAMES, arrays, strict=True))
@@ -138,13 +139,7 @@ class Replay:
         self.ended = np.zeros((steps, robots), np.bool_)
         self.added = 0
 
-    def add(
-        self,
-        observation: NDArray[np.float32],
-        motion: NDArray[np.int64],
-        reward: NDArray[np.float32],
-        ended: NDArray[np.bool_],
-    ) -> None:
+    def add(self, observation: Singles, motion: Ints, reward: Singles, ended: Bools) -> None:
         at = self.added % self.steps
         self.observation[at], self.motion[at] = observation, motion
         self.reward[at], self.ended[at] = reward, ended

@@ -6,8 +6,8 @@ The fields only propose. Poses come from f, and the robot has arrived where the 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import leaf, merged
 from specshield.policy.lattice import SHORTEST_MOVE
 from specshield.policy.planner.due_dates import read_pose
@@ -25,9 +25,6 @@ DETOUR_GAIN = 2.0  # [steps] nearer than where the descent was stuck: what such 
 BEAM_WIDTH = 12  # poses that a beam keeps at a step
 BEAM_LENGTH = 64  # [steps] of a beam, at most
 SAME_POSE = 0.05  # [m + rad] poses that differ by less than this count once in a beam
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @merged

@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats
 from specshield.compiled import kernel, leaf
 from specshield.policy.planner.literals import LAST, PREDICATE, SIDE, PackedLiterals
 from specshield.rule.values import fill_place
@@ -20,8 +20,6 @@ from specshield.stl.program import evaluate_packed
 from specshield.stl.tree import tree_bounds
 
 NO_DATE = 1 << 40  # later than every step: the literal is not due
-
-Floats = NDArray[np.float64]
 
 
 class Bounds(NamedTuple):

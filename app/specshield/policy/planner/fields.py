@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Codes, Floats, Int32s, Singles
 from specshield.compiled import kernel, leaf
 from specshield.policy.lattice import (
     INVALID,
@@ -33,8 +33,6 @@ OUT_OF_REACH = 1000.0  # [steps] what is farther counts as out of reach
 MOST = int(STEP_CODES * OUT_OF_REACH)  # the code of OUT_OF_REACH
 UNREACHED = 65534  # the code of what no way leads from; read as MOST
 
-Floats = NDArray[np.float64]
-
 
 class Fields(NamedTuple):
     """Steps to go, stored over the cells that have a free pose.
@@ -43,15 +41,15 @@ class Fields(NamedTuple):
     UNREACHED, or INVALID for a pose that is in collision or breaks what the field keeps.
     """
 
-    cell: NDArray[np.int32]
-    code: NDArray[np.uint16]
+    cell: Int32s
+    code: Codes
     pitch: float
 
 
 @kernel
 def values_at(
     body: Body, lattice: Lattice, areas: PackedRegions, programs: Programs, signals: Floats
-) -> NDArray[np.float32]:
+) -> Singles:
     """Each predicate's robustness over the lattice, [P, ny, nx, H]; -inf where the pose is not valid.
 
     The programs read x, y, theta, the regions, then `signals` (S,).
@@ -78,7 +76,7 @@ def values_at(
     return out
 
 
-def steps_to(lattice: Lattice, goal: NDArray[np.bool_], keeps: NDArray[np.bool_]) -> NDArray[np.uint16]:
+def steps_to(lattice: Lattice, goal: Bools, keeps: Bools) -> Codes:
     """The field of one goal as codes [ny, nx, H], over the free poses that `keeps` allows."""
     valid = np.ascontiguousarray(lattice.valid & keeps)
     latest = np.where(goal & (valid == 1), np.float32(OUT_OF_REACH), np.float32(NO_TIME))

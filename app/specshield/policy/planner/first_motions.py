@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.planner.approach import BEAM_LENGTH, BEAM_WIDTH
@@ -19,9 +19,6 @@ from specshield.stl.program import STACK_SIZE
 # The share of one plan's effort that a first motion may cost which the plan does not begin with; chosen by
 # hand, nothing measured.
 SHARE = 0.25
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @kernel

@@ -13,14 +13,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Ints
 from specshield.rule.view import View, view_of
 from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until
 from specshield.stl.tree import is_temporal
 from specshield.task import Task
 
-Ints = NDArray[np.int64]
 Ends = frozenset[tuple[Formula, int]]
 
 PREDICATE, SIDE, LAST, GUARDS = range(4)  # the columns of PackedLiterals.literal

@@ -26,9 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
+from specshield.arrays import Bools, Codes, Floats, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
 from specshield.policy.lattice import Lattice, lattice_shape, make_lattice, number_cells, pose_of
@@ -70,7 +70,7 @@ class PlannerPolicy:
     card: Card
     settings: Settings
     fields: Fields
-    chosen: NDArray[np.int32]
+    chosen: Int32s
 
     @property
     def id(self) -> str:
@@ -99,15 +99,11 @@ class PlannerPolicy:
         band = BAND if turns_in_place(self._body) else 2.0 * OUT_OF_REACH
         return World(self._body, self.fields, packed, field, band, pad, stands, cost_of(packed.formula.tree))
 
-    def propose(
-        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
-    ) -> Proposal:
+    def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A plan from x_t, and one after each other first motion."""
         return self._plan(history, signals, margin)[0]
 
-    def _plan(
-        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
-    ) -> tuple[Proposal, bool]:
+    def _plan(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> tuple[Proposal, bool]:
         """The proposal, and whether a plan of it satisfies the formula, or what can still be kept of it."""
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
         _, high = look(
@@ -126,9 +122,7 @@ class PlannerPolicy:
                 break
         return joined(*(proposal for proposal, _ in plans)), found
 
-    def _asked(
-        self, formula: Formula, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
-    ) -> tuple[Formula, ...]:
+    def _asked(self, formula: Formula, history: Floats, rows: Floats, margin: float) -> tuple[Formula, ...]:
         """What J asks the margin of: the whole trajectory where that can be had, else what is still open."""
         bounds = [bounds_after(self.task, part, history, rows) for part in conjuncts(formula)]
         lost = any(SATISFIED_ABOVE < high <= margin for _, high in bounds)
@@ -137,9 +131,7 @@ class PlannerPolicy:
         left = still_open(self.task, formula, history, rows, 0)
         return (left,) if lost else (formula, left)
 
-    def _plan_in(
-        self, world: World, history: NDArray[np.float64], rows: NDArray[np.float64], margin: float
-    ) -> tuple[Proposal, bool]:
+    def _plan_in(self, world: World, history: Floats, rows: Floats, margin: float) -> tuple[Proposal, bool]:
         t = len(history) - 1
         literals = world.literals._replace(margin=margin)
         known = np.empty(literals.formula.tree.size)
@@ -177,7 +169,7 @@ def synthesise(
     lattice = make_lattice(make_body(task.robot, task.grid), settings.pitch)
     holds, free = _holding(task, lattice, literals), lattice.valid == 1
     used = free.any(axis=2)
-    codes: dict[tuple[int, tuple[int, ...]], NDArray[np.uint16]] = {}
+    codes: dict[tuple[int, tuple[int, ...]], Codes] = {}
     chosen = np.full((len(literals), 2), -1, np.int32)
     for column, kept in enumerate(_kept(task, packed, literals)):
         for k in range(len(literals)):
@@ -239,13 +231,13 @@ def check(task: Task, settings: Settings) -> None:
         )  # fmt: skip
 
 
-def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> NDArray[np.bool_]:
+def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> Bools:
     """Where each literal holds, [L, ny, nx, H], with the signals at their initial values."""
     known, body = places(task), make_body(task.robot, task.grid)
     programs = pack([compile_predicate(each.predicate, known) for each in literals])
     values = values_at(body, lattice, regions_of(task), programs, initial_signals(task))
     sides = np.array([each.side for each in literals]).reshape(-1, 1, 1, 1)
-    holds: NDArray[np.bool_] = (values * sides > SATISFIED_ABOVE) & (lattice.valid == 1)
+    holds: Bools = (values * sides > SATISFIED_ABOVE) & (lattice.valid == 1)
     return holds
 
 

@@ -16,19 +16,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from specshield.arrays import Ints
 from specshield.compiled import leaf, merged
 from specshield.policy.planner.approach import BEAM_LENGTH, descend, descend_by_beam, linger
-from specshield.policy.planner.due_dates import (
-    NO_DATE,
-    due_date,
-    foresee,
-    is_open,
-    needed_until,
-    stay_for,
-)
+from specshield.policy.planner.due_dates import NO_DATE, due_date, foresee, is_open, needed_until, stay_for
 from specshield.policy.planner.fields import to_go_at
 from specshield.policy.planner.literals import GUARDS
 from specshield.policy.planner.way import (
@@ -53,9 +44,6 @@ MADE, COUNT, TRIED, OPENED, USED = range(5)  # the columns of a node's state
 KEY, LITERAL, BEFORE, STAY, KEEP = range(5)  # the columns of a child
 # The key that orders children: their class, plus the step at which the literal is due.
 AT_ONCE, STAYING, LATER, NOT_DUE, SINGLE = 0, 1 << 20, 1 << 21, 1 << 22, 1 << 23
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class Nodes(NamedTuple):

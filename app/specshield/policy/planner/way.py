@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from specshield.arrays import Floats, Ints
 from specshield.compiled import leaf
 from specshield.policy.planner.due_dates import Bounds, note, read_pose
 from specshield.policy.planner.fields import Fields
@@ -20,9 +18,6 @@ from specshield.robot.dynamics import Body, step
 # until which it has to hold throughout; and until which step it has to as long as the literal that the robot
 # goes to does not hold.
 DUE, BEGIN, UNTIL, UNTIL_GOAL = range(4)
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 class World(NamedTuple):

@@ -10,16 +10,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, update_progress
 from specshield.policy.reachability.tables import SAFE, is_broken, score, slack
 from specshield.robot.dynamics import motion_count, step
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Statuses = NDArray[np.int8]
 
 MAX_ROOTS = 62  # bits of a tag, which is an int64
 
@@ -35,7 +31,7 @@ class Poses(NamedTuple):
     """Poses at one step [N], with the progress, the slack [steps] and the roots they come from, as bits."""
 
     pose: Floats
-    status: Statuses
+    status: Int8s
     run: Ints
     slack: Floats
     tag: Ints
@@ -47,16 +43,16 @@ class Edges(NamedTuple):
     child, parent, motion [steps, edges], of which made [steps] count; tag [steps, poses]: as in `Poses`.
     """
 
-    child: NDArray[np.int32]
-    parent: NDArray[np.int32]
-    motion: NDArray[np.int32]
+    child: Int32s
+    parent: Int32s
+    motion: Int32s
     made: Ints
     tag: Ints
 
 
 @kernel
 def beam_search(
-    guide: Guide, t: int, pose: Floats, status: Statuses, run: Ints, share: int, band: float, target: float,
+    guide: Guide, t: int, pose: Floats, status: Int8s, run: Ints, share: int, band: float, target: float,
     scratch: Scratch, motions: Ints, taken: Ints,
 ) -> None:  # fmt: skip
     """Keeps the poses of most slack at every step, until each root has a way or no pose is left.
@@ -107,7 +103,7 @@ def _poses(n: int, k: int) -> Poses:
 
 
 @inlined
-def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Statuses, run: Ints) -> None:
+def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Int8s, run: Ints) -> None:
     to.pose[i, 0], to.pose[i, 1], to.pose[i, 2] = x, y, theta
     copy_progress(status, run, to.status[i], to.run[i])
 
@@ -115,7 +111,7 @@ def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Statuses, 
 @leaf
 def _expand(
     guide: Guide, t: int, n: int, count: int, open_roots: int, band: float, here: Poses, new: Poses,
-    edges: Edges, table: NDArray[np.int32], scratch: Scratch,
+    edges: Edges, table: Int32s, scratch: Scratch,
 ) -> int:  # fmt: skip
     """Makes every motion from the first `count` poses of `here`; each new pose is written once. How many."""
     body, rules, tables, wait = guide
@@ -170,7 +166,7 @@ def _lowest(scores: Floats) -> float:
 
 @leaf
 def _finish(
-    t: int, n: int, found: int, open_roots: int, target: float, status: Statuses, new: Poses, edges: Edges,
+    t: int, n: int, found: int, open_roots: int, target: float, status: Int8s, new: Poses, edges: Edges,
     motions: Ints, taken: Ints,
 ) -> int:  # fmt: skip
     """Writes the way of every root that has one now; returns the roots that are still open, as bits."""
@@ -229,7 +225,7 @@ def _select(
 
 
 @leaf
-def _place(new: Poses, found: int, table: NDArray[np.int32]) -> int:
+def _place(new: Poses, found: int, table: Int32s) -> int:
     """The row of `new` whose pose and progress are those of row `found`: an earlier one, or `found` itself,
     which is then put into the hash table.
     """

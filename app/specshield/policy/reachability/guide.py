@@ -5,18 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
 from specshield.policy.reachability.tables import Tables, goals_settled
 from specshield.robot.dynamics import Body
 from specshield.rule.progress import EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
 from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
 from specshield.stl.program import VALUE, evaluate_packed
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Statuses = NDArray[np.int8]
 
 
 class Guide(NamedTuple):
@@ -40,9 +36,9 @@ class Scratch(NamedTuple):
     stack: Floats
     predicates: Floats
     scores: Floats
-    status: Statuses
+    status: Int8s
     run: Ints
-    high_status: Statuses
+    high_status: Int8s
     high_run: Ints
 
 
@@ -56,7 +52,7 @@ def make_scratch(rules: Rules, motions: int) -> Scratch:
 
 
 @inlined
-def copy_progress(status: Statuses, run: Ints, to_status: Statuses, to_run: Ints) -> None:
+def copy_progress(status: Int8s, run: Ints, to_status: Int8s, to_run: Ints) -> None:
     for k in range(status.shape[0]):
         to_status[k], to_run[k] = status[k], run[k]
 
@@ -96,7 +92,7 @@ def read_pending(rules: Rules, x: float, y: float, theta: float, scratch: Scratc
 
 
 @inlined
-def is_over(rules: Rules, tables: Tables, t: int, status: Statuses) -> bool:
+def is_over(rules: Rules, tables: Tables, t: int, status: Int8s) -> bool:
     """Whether every goal is settled at step t and no `always` is still to begin."""
     return goals_settled(rules, status) and tables.phase[t] == len(tables.end) - 1
 

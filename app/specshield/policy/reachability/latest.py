@@ -19,16 +19,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bytes, Ints, Singles
 from specshield.compiled import kernel
 from specshield.policy.lattice import NO_TIME, Lattice, bilinear
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
-
-Ints = NDArray[np.int64]
-Bits = NDArray[np.uint8]
-Singles = NDArray[np.float32]
-
 
 SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged (chosen by hand)
 MAX_SWEEPS = 100_000  # far more than any map needs; it only bounds the loop
@@ -72,8 +67,8 @@ def phases_of(rules: Rules, horizon: int) -> tuple[Phase, ...]:
 
 
 def latest_times(
-    lattice: Lattice, rules: Rules, holds: Bits, goals: Ints, masks: list[int], phases: tuple[Phase, ...]
-) -> tuple[Singles, Bits]:
+    lattice: Lattice, rules: Rules, holds: Bytes, goals: Ints, masks: list[int], phases: tuple[Phase, ...]
+) -> tuple[Singles, Bytes]:
     """L for each phase and mask, [phases, masks, ny, nx, H], NO_TIME where the phase has none.
 
     Also where a pose is free and keeps the phase's `always`, [phases, ny, nx, H].
@@ -107,7 +102,7 @@ def latest_times(
 
 
 @kernel
-def _enter(lattice: Lattice, valid: Bits, following: Singles, start: int, table: Singles) -> None:
+def _enter(lattice: Lattice, valid: Bytes, following: Singles, start: int, table: Singles) -> None:
     """Writes the last step before the next phase's `start` into `table`, wherever some motion leads to a pose
     that is feasible at that start.
     """
@@ -130,7 +125,7 @@ def _enter(lattice: Lattice, valid: Bits, following: Singles, start: int, table:
 
 
 @kernel
-def _settle(rules: Rules, holds: Bits, added: Ints, ahead: Singles, start: float, table: Singles) -> None:
+def _settle(rules: Rules, holds: Bytes, added: Ints, ahead: Singles, start: float, table: Singles) -> None:
     """Writes m(s, p, J) into `table` where it is later. added: J; ahead: L(., p + J) from step `start` on."""
     for j in range(table.shape[0]):
         for i in range(table.shape[1]):
@@ -158,7 +153,7 @@ def _settle(rules: Rules, holds: Bits, added: Ints, ahead: Singles, start: float
 
 
 @kernel
-def sweep(lattice: Lattice, valid: Bits, start: float, table: Singles) -> None:
+def sweep(lattice: Lattice, valid: Bytes, start: float, table: Singles) -> None:
     """Relaxes L(s) = max_a L(f(s, a)) - 1 in place to its fixed point; visits only cells near what changed.
 
     start: the phase's first step; no L is earlier.

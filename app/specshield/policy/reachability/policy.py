@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
+from specshield.arrays import Bytes, Codes, Floats, Int32s, Ints, Singles
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, lattice_shape, make_lattice, number_cells
@@ -29,9 +29,6 @@ from specshield.robot.dynamics import Body, make_body
 from specshield.rule.progress import ALWAYS, Rules, make_rules, signal_rows
 from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
-
-Ints = NDArray[np.int64]
-
 
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
 FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
@@ -54,9 +51,7 @@ class ReachabilityPolicy:
     def _prepared(self) -> tuple[Body, Rules]:
         return make_body(self.task.robot, self.task.grid), make_rules(self.task)
 
-    def propose(
-        self, history: NDArray[np.float64], signals: Mapping[str, NDArray[np.float64]], margin: float
-    ) -> Proposal:
+    def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A continuation after each first motion."""
         body, rules = self._prepared
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
@@ -135,7 +130,7 @@ def load_reachability(weights: bytes | Path, card: Card, task: Task) -> Reachabi
     )
 
 
-def _check_fit(cell: NDArray[np.int32], shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
+def _check_fit(cell: Int32s, shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
     if not fits or cell.shape != shape or cell.min(initial=-1) < -1 or cell.max(initial=-1) >= rows:
         raise PolicyError(
             "the tables do not fit the task", path="weights",
@@ -173,12 +168,12 @@ def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[Ints, float]:
 
 
 def _pack(
-    latest: NDArray[np.float32], valid: NDArray[np.uint8], masks: list[int], phases: tuple[Phase, ...],
+    latest: Singles, valid: Bytes, masks: list[int], phases: tuple[Phase, ...],
     goals: Ints, rules: Rules, pitch: float,
 ) -> Tables:  # fmt: skip
     used = np.any(valid, axis=(0, 3))
     table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
-    codes: list[NDArray[np.uint16]] = []
+    codes: list[Codes] = []
     for i in range(len(phases)):
         for n, mask in enumerate(masks):
             values = latest[i, n][used]
@@ -194,8 +189,8 @@ def _pack(
 
 
 def _time_tables(
-    rules: Rules, goals: Ints, phases: tuple[Phase, ...], cell: NDArray[np.int32], code: NDArray[np.uint16],
-    table: NDArray[np.int32], pitch: float,
+    rules: Rules, goals: Ints, phases: tuple[Phase, ...], cell: Int32s, code: Codes,
+    table: Int32s, pitch: float,
 ) -> Tables:  # fmt: skip
     bit = np.zeros(len(rules.kind), np.int64)
     bit[goals] = 1 << np.arange(len(goals))
@@ -205,9 +200,7 @@ def _time_tables(
     return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch)
 
 
-def _step_tables(
-    rules: Rules, horizon: int, cell: NDArray[np.int32], bits: NDArray[np.uint8], pitch: float
-) -> Tables:
+def _step_tables(rules: Rules, horizon: int, cell: Int32s, bits: Bytes, pitch: float) -> Tables:
     code = np.empty((0, *bits.shape[1:3]), np.uint16)
     phase, end = np.zeros(horizon + 1, np.int32), np.array([horizon], np.int32)
     bit = np.zeros(len(rules.kind), np.int64)

@@ -12,8 +12,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf, merged
 from specshield.policy.detour import copy_way, find_sibling, find_twins
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search
@@ -30,10 +30,6 @@ from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoi
 from specshield.policy.recall import forgive, recall
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
 from specshield.robot.dynamics import displacement, simulate, step
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Statuses = NDArray[np.int8]
 
 # Chosen by hand; nothing measured.
 ESCAPE_GAIN = 2.0  # [steps] how much later than where a climb got stuck a way out has to lead
@@ -55,12 +51,12 @@ class Starts(NamedTuple):
     sibling (3,): scratch of `find_sibling`.
     """
 
-    status: Statuses
+    status: Int8s
     run: Ints
     slack: Floats
     turn: Ints
     move: Ints
-    settled: NDArray[np.bool_]
+    settled: Bools
     sibling: Ints
 
 
@@ -131,7 +127,7 @@ def continue_all(
 
 @leaf
 def _first_steps(
-    guide: Guide, t: int, pose: Floats, status: Statuses, run: Ints, motions: Ints, poses: Floats,
+    guide: Guide, t: int, pose: Floats, status: Int8s, run: Ints, motions: Ints, poses: Floats,
     starts: Starts, scratch: Scratch,
 ) -> None:  # fmt: skip
     """Makes every motion once, from `pose` (3,), with the progress `status`, `run` (K,) there."""

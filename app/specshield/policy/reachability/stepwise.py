@@ -20,15 +20,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bytes, Floats, Int32s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.lattice import Lattice, corner
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
-
-Ints = NDArray[np.int64]
-Bits = NDArray[np.uint8]
-
 
 MAX_BYTES = 100_000_000  # of the tables
 BROKEN_STATE = -1
@@ -81,8 +77,8 @@ def transitions(rules: Rules, t: int, holds: int) -> Ints:
 
 
 def feasible_steps(
-    lattice: Lattice, rules: Rules, holds: Bits, horizon: int, row: NDArray[np.int32]
-) -> tuple[Bits, float]:
+    lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, row: Int32s
+) -> tuple[Bytes, float]:
     """B as bits, uint8 [T + 1, cells, H, ceil(P / 8)], and the share of valid poses feasible at t = 0.
 
     holds [K, ny, nx, H]; row [ny, nx]: of each cell in B, -1 for none.
@@ -115,7 +111,7 @@ def feasible_steps(
 
 
 @kernel
-def _before(bits: Bits, valid: Bits, pattern: Ints, after: Ints, out: Bits) -> None:
+def _before(bits: Bytes, valid: Bytes, pattern: Ints, after: Ints, out: Bytes) -> None:
     """From the progress that includes a step's pose to the one before it: out[p] = bits[after[p]]."""
     states = after.shape[1]
     for c in range(bits.shape[0]):
@@ -134,7 +130,7 @@ def _before(bits: Bits, valid: Bits, pattern: Ints, after: Ints, out: Bits) -> N
 
 
 @kernel
-def _step_back(lattice: Lattice, valid: Bits, row: NDArray[np.int32], following: Bits, out: Bits) -> None:
+def _step_back(lattice: Lattice, valid: Bytes, row: Int32s, following: Bytes, out: Bytes) -> None:
     """out(s) = the union over motions of `following` where they lead."""
     ny, nx = row.shape
     headings, size = following.shape[1], following.shape[2]
@@ -164,9 +160,7 @@ def _step_back(lattice: Lattice, valid: Bits, row: NDArray[np.int32], following:
 
 
 @leaf
-def _corners(
-    row: NDArray[np.int32], valid: Bits, v: float, u: float, h: int, at: Ints, weight: NDArray[np.float64]
-) -> int:
+def _corners(row: Int32s, valid: Bytes, v: float, u: float, h: int, at: Ints, weight: Floats) -> int:
     """The rows of the valid corners about a place of the lattice, with weights that sum to 1; how many."""
     found, total = 0, 0.0
     for n in range(4):
@@ -183,7 +177,7 @@ def _corners(
 
 
 @leaf
-def _majority(bits: Bits, at: Ints, weight: NDArray[np.float64], n: int, h: int, b: int) -> int:
+def _majority(bits: Bytes, at: Ints, weight: Floats, n: int, h: int, b: int) -> int:
     """The bits that corners of more than half of the weight have."""
     common, some = 255, 0
     for k in range(n):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, leaf
 from specshield.policy.lattice import (
     INVALID,
@@ -19,10 +19,6 @@ from specshield.policy.lattice import (
 )
 from specshield.robot.dynamics import Body, displacement
 from specshield.rule.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
-
-Ints = NDArray[np.int64]
-Statuses = NDArray[np.int8]
-
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
 SAFE = 1e6  # in place of a slack [steps], where nothing is left to do
@@ -40,13 +36,13 @@ class Tables(NamedTuple):
     no steps where the tables are latest times.
     """
 
-    cell: NDArray[np.int32]
-    code: NDArray[np.uint16]
-    table: NDArray[np.int32]
-    phase: NDArray[np.int32]
-    end: NDArray[np.int32]
+    cell: Int32s
+    code: Codes
+    table: Int32s
+    phase: Int32s
+    end: Int32s
     bit: Ints
-    bits: NDArray[np.uint8]
+    bits: Bytes
     stride: Ints
     dwell: Ints
     pitch: float
@@ -60,7 +56,7 @@ def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float
 
 @leaf
 def slack(
-    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Statuses,
+    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
     run: Ints,
 ) -> float:  # fmt: skip
     """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something
@@ -92,7 +88,7 @@ def slack(
 
 @leaf
 def _steps_ahead(
-    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Statuses,
+    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
     run: Ints,
 ) -> float:  # fmt: skip
     """How feasible a pose is, step by step: from 0 to 1 now, and as much for each of some delays [steps]
@@ -145,7 +141,7 @@ def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: flo
 
 
 @inlined
-def goals_settled(rules: Rules, status: Statuses) -> bool:
+def goals_settled(rules: Rules, status: Int8s) -> bool:
     for k in range(status.shape[0]):
         if status[k] == BROKEN or (rules.kind[k] != ALWAYS and status[k] == PENDING):
             return False
@@ -153,7 +149,7 @@ def goals_settled(rules: Rules, status: Statuses) -> bool:
 
 
 @inlined
-def is_broken(status: Statuses) -> bool:
+def is_broken(status: Int8s) -> bool:
     broken = False
     for k in range(status.shape[0]):
         broken = broken or status[k] == BROKEN
@@ -162,8 +158,8 @@ def is_broken(status: Statuses) -> bool:
 
 @inlined
 def score(
-    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Statuses,
-    run: Ints, wait: int, last: int, scores: NDArray[np.float64],
+    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
+    run: Ints, wait: int, last: int, scores: Floats,
 ) -> None:  # fmt: skip
     """L after each motion (M,) from x_t, contact and the step's own progress left out: a cheap order to try
     motions in.

@@ -7,8 +7,8 @@ predicate says so. This runs once for each first motion of each decision, so not
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import SHORTEST_MOVE
@@ -25,10 +25,6 @@ from specshield.policy.reachability.guide import (
 from specshield.policy.reachability.tables import HOPELESS, goals_settled, is_broken, score, slack
 from specshield.robot.dynamics import step
 from specshield.rule.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Statuses = NDArray[np.int8]
 
 # Chosen by hand; nothing measured.
 STUCK_AFTER = 5  # [steps] without a gain after which a climb is taken to go round in a circle
@@ -124,7 +120,7 @@ def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: S
 
 
 @inlined
-def _pending(status: Statuses) -> int:
+def _pending(status: Int8s) -> int:
     count = 0
     for k in range(status.shape[0]):
         count += status[k] == PENDING

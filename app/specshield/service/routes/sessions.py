@@ -136,8 +136,7 @@ async def trajectory(
     server: ServerState,
     accept: Annotated[str, Header(include_in_schema=False)] = "",
     format: Annotated[
-        Literal["json", "ndjson"] | None,
-        Query(description="Or by `Accept: application/x-ndjson`."),
+        Literal["json", "ndjson"] | None, Query(description="Or by `Accept: application/x-ndjson`.")
     ] = None,
 ) -> Response:
     """x_0 to x_t with the answers, streamed: as one JSON object, or newline-delimited."""

@@ -6,15 +6,14 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from specshield.arrays import Bools, Floats
 from specshield.errors import HistoryConflict, HistoryGap, PoseError
 
 TOLERANCE = 1e-6  # m or rad
-Poses = npt.NDArray[np.float64]
 
 
-def join(stored: Poses, t: int, poses: Poses) -> Poses:
+def join(stored: Floats, t: int, poses: Floats) -> Floats:
     """The poses to add to `stored` so that it reaches step t; empty where it does already.
 
     stored: [n, 3], x_0 .. x_{n-1}, in [m, m, rad].  poses: [k, 3], x_{t-k+1} .. x_t.
@@ -53,7 +52,7 @@ def join(stored: Poses, t: int, poses: Poses) -> Poses:
     return poses[overlap:]
 
 
-def agree(a: Poses, b: Poses) -> npt.NDArray[np.bool_]:
+def agree(a: Floats, b: Floats) -> Bools:
     """Element by element, for [..., 3] poses: equal within `TOLERANCE`, headings modulo 2 pi."""
     difference: Any = np.abs(a - b)
     turn = np.mod(difference[..., 2], 2 * math.pi)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from specshield.arrays import Floats
 from specshield.errors import InputError, SessionFinished, StepConflict
 from specshield.service.library import files
 from specshield.service.schemas.steps import StepRequest
@@ -19,7 +19,6 @@ from specshield.service.sessions import history
 from specshield.service.storage.store import Record
 from specshield.shield.decision import Decision
 
-Floats = npt.NDArray[np.float64]
 DIGEST = 32  # bytes that stand before each stored answer: of the request that it answers
 
 

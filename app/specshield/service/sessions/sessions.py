@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from specshield.arrays import Floats
 from specshield.errors import Conflict, FragmentError, InfeasibleStart, InputError, LimitReached, NotFound
 from specshield.lookahead.lookahead import AHEADS
 from specshield.lookahead.preferences import PROJECTION, check_shaping, prepare
@@ -26,7 +27,6 @@ from specshield.service.library.policies import Description, Policies
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import CloseRequest, StepRequest
 from specshield.service.sessions.session import (
-    Floats,
     Session,
     State,
     check_step,

@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Singles
 from specshield.errors import NotFound, PolicyError
 from specshield.policy.tensors import read_tensors
 from specshield.shipped import MODELS
-from specshield.sim.learned.network import KINDS, NOTHING, Array, Network, check, decoded, features
+from specshield.sim.learned.network import KINDS, NOTHING, Network, check, decoded, features
 from specshield.sim.learned.reckoning import Reckoning
 from specshield.sim.robot import SimulatedRobot
 
@@ -31,7 +31,7 @@ FOLDER, WEIGHTS, CARD = "fm", "model.safetensors", "model.json"  # in models/
 class LearnedModel:
     """weights: as `check` returns them. target: one of KINDS. temperature: what the logits are divided by."""
 
-    def __init__(self, weights: Mapping[str, Array], target: str, temperature: float) -> None:
+    def __init__(self, weights: Mapping[str, Singles], target: str, temperature: float) -> None:
         self._network, self._kind, self._temperature = Network(weights), KINDS.index(target), temperature
         self._reckoning = Reckoning(1)
 
@@ -40,7 +40,7 @@ class LearnedModel:
         self._network.reset()
         self._reckoning = Reckoning(1)
 
-    def logits(self, robot: SimulatedRobot) -> NDArray[np.float64]:
+    def logits(self, robot: SimulatedRobot) -> Floats:
         """Finite logits (A,) of what to do next."""
         senses = robot.sense()
         seen = (float(senses.seen), senses.distance, senses.bearing)
@@ -50,7 +50,7 @@ class LearnedModel:
         place = self._reckoning.place[0]
         x = features(np.array([*senses.ranges, *seen]), place[2])
         raw = self._network.step(x, place, last, self._kind)
-        out: NDArray[np.float64] = decoded(raw[None], lasts, self._reckoning.futile, self._temperature)[0]
+        out: Floats = decoded(raw[None], lasts, self._reckoning.futile, self._temperature)[0]
         return out
 
 
@@ -74,7 +74,7 @@ def target_of(instruction: str) -> str:
 class Shipped(NamedTuple):
     """A model as it is in a folder: checked weights, temperature, and the card."""
 
-    weights: dict[str, Array]
+    weights: dict[str, Singles]
     temperature: float
     card: dict[str, Any]
 

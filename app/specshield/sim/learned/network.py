@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.arrays import Floats, Ints, Singles
 from specshield.errors import PolicyError
 from specshield.robot import STRETCH
 from specshield.sim.senses import RAYS, REACH, SIGHT
@@ -37,10 +38,8 @@ PATIENCE = 2.0  # [nats] off an action for each time, TIRED at most, that it has
 TIRED = 4
 OPPOSITE = np.array([3, 2, 1, 0, -1, -1, 7, 6, *[-1] * (ACTIONS - 7)])  # of each last action, -1 for none
 
-Array = NDArray[np.float32]
 
-
-def features(senses: NDArray[np.floating], heading: NDArray[np.floating]) -> Array:
+def features(senses: NDArray[np.floating], heading: NDArray[np.floating]) -> Singles:
     """What the network is given: ranges on a scale from 0 to 1, finest nearby, and where the target is seen.
 
     The ranges are given once more as from the heading it began with, and its heading beside them: what it
@@ -64,16 +63,14 @@ def features(senses: NDArray[np.floating], heading: NDArray[np.floating]) -> Arr
     return np.concatenate([ranges, target, turned, compass], axis=-1).astype(np.float32)
 
 
-def decoded(
-    raw: Array, last: NDArray[np.int64], futile: NDArray[np.int64], temperature: float
-) -> NDArray[np.float64]:
+def decoded(raw: Singles, last: Ints, futile: Ints, temperature: float) -> Floats:
     """The logits that are drawn from, [N, A]. raw [N, A]; last [N]; futile [N, A + 1]: as reckoned."""
     logits = raw - PATIENCE * np.minimum(futile[:, :ACTIONS], TIRED)
     undo = OPPOSITE[last]
     some = np.nonzero(undo >= 0)[0]
     logits[some, undo[some]] -= RELUCTANCE
     logits /= temperature
-    floored: NDArray[np.float64] = np.maximum(logits, logits.max(axis=1, keepdims=True) - FLOOR)
+    floored: Floats = np.maximum(logits, logits.max(axis=1, keepdims=True) - FLOOR)
     return floored
 
 
@@ -99,7 +96,7 @@ SHAPES = _shapes()
 """The tensors of a weights file: w [inputs, outputs], b [outputs]; last, kind: a row for each token."""
 
 
-def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Array]:
+def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Singles]:
     """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
     if sorted(weights) != sorted(SHAPES):
         raise PolicyError(
@@ -121,7 +118,7 @@ def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Array]:
 class Network:
     """An episode step by step, with a memory of WINDOW steps; `reset` empties it. weights: checked."""
 
-    def __init__(self, weights: Mapping[str, Array]) -> None:
+    def __init__(self, weights: Mapping[str, Singles]) -> None:
         self._w = weights
         heads = len(SLOPES)
         self._keys = np.zeros(
@@ -137,7 +134,7 @@ class Network:
     def reset(self) -> None:
         self._t = 0
 
-    def step(self, x: Array, place: NDArray[np.floating], last: int, kind: int) -> Array:
+    def step(self, x: Singles, place: NDArray[np.floating], last: int, kind: int) -> Singles:
         """Logits (ACTIONS,) of the next step. x (FEATURES,); place (3,), as counted; last, kind: tokens."""
         w, heads = self._w, len(SLOPES)
         slot, held = self._t % WINDOW, min(self._t + 1, WINDOW)
@@ -165,11 +162,11 @@ class Network:
             up = np.maximum(n @ w[f"{i}.up.w"] + w[f"{i}.up.b"], 0.0)
             h = h + up @ w[f"{i}.down.w"] + w[f"{i}.down.b"]
         self._t += 1
-        logits: Array = _norm(h, w["norm.w"], w["norm.b"]) @ w["head.w"] + w["head.b"]
+        logits: Singles = _norm(h, w["norm.w"], w["norm.b"]) @ w["head.w"] + w["head.b"]
         return logits
 
 
-def _norm(h: Array, w: Array, b: Array) -> Array:
+def _norm(h: Singles, w: Singles, b: Singles) -> Singles:
     centred = h - h.mean()
-    out: Array = centred / np.sqrt(np.mean(centred * centred) + np.float32(1e-5)) * w + b
+    out: Singles = centred / np.sqrt(np.mean(centred * centred) + np.float32(1e-5)) * w + b
     return out

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from specshield.arrays import Ints
 from specshield.robot import STRETCH
 from specshield.sim.senses import RAYS
 
@@ -28,7 +29,7 @@ class Reckoning:
         self.futile = np.zeros((n, len(MOVES)), np.int64)
         self._ranges = np.full((n, RAYS), np.inf)
 
-    def count(self, ranges: NDArray[np.floating], last: NDArray[np.int64]) -> None:
+    def count(self, ranges: NDArray[np.floating], last: Ints) -> None:
         """Goes on after `last` [n] was executed, and `ranges` [n, RAYS] [m] scanned."""
         moved = (np.abs(ranges - self._ranges) > CHANGED).any(axis=1)
         translate, rotate = (MOVES[last] * moved[:, None]).T

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from specshield.world.geodesic import geodesic_distance
+from specshield.policy.geodesic import geodesic_distance
 
 
 def one(shape, cell):

@@ -6,8 +6,8 @@ import heapq
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 
 # [cells] around the goal within which straight lines give the distance, since upwinding errs most near a
@@ -15,9 +15,7 @@ from specshield.compiled import kernel
 EXACT_WITHIN = 12
 
 
-def geodesic_distance(
-    free: NDArray[np.bool_], goal: NDArray[np.bool_], resolution: float
-) -> NDArray[np.float64]:
+def geodesic_distance(free: Bools, goal: Bools, resolution: float) -> Floats:
     """Metres from each cell centre to the nearest goal cell's centre through free cells. [height, width].
 
     free, goal: bool[height, width]; goal cells that are not free do not count. The distance is 0 in the goal
@@ -28,14 +26,12 @@ def geodesic_distance(
     goal = np.ascontiguousarray(goal & free)
     blocked = np.zeros((free.shape[0] + 1, free.shape[1] + 1), dtype=np.int64)
     blocked[1:, 1:] = np.cumsum(np.cumsum(~free, axis=0), axis=1)
-    result: NDArray[np.float64] = _march(np.ascontiguousarray(free), goal, blocked) * resolution
+    result: Floats = _march(np.ascontiguousarray(free), goal, blocked) * resolution
     return result
 
 
 @kernel
-def _march(
-    free: NDArray[np.bool_], goal: NDArray[np.bool_], blocked: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _march(free: Bools, goal: Bools, blocked: Ints) -> Floats:
     h, w = free.shape
     distance = np.full((h, w), np.inf)
     done = np.zeros((h, w), dtype=np.bool_)
@@ -69,7 +65,7 @@ def _march(
 
 
 @kernel
-def _straight_lines(i: int, j: int, blocked: NDArray[np.int64], distance: NDArray[np.float64]) -> None:
+def _straight_lines(i: int, j: int, blocked: Ints, distance: Floats) -> None:
     """Exact distances from goal cell (i, j) to nearby cells, where the whole rectangle between is free."""
     h, w = distance.shape
     for y in range(max(0, i - EXACT_WITHIN), min(h, i + EXACT_WITHIN + 1)):
@@ -83,7 +79,7 @@ def _straight_lines(i: int, j: int, blocked: NDArray[np.int64], distance: NDArra
 
 
 @kernel
-def _upwind(distance: NDArray[np.float64], done: NDArray[np.bool_], i: int, j: int) -> float:
+def _upwind(distance: Floats, done: Bools, i: int, j: int) -> float:
     """d with (d - a)^2 + (d - b)^2 = 1 over the smaller settled neighbour of each axis, or min + 1."""
     h, w = distance.shape
     a = b = np.inf
