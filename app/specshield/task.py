@@ -40,8 +40,8 @@ class Task:
     regions: Mapping[str, Region]
     signals: Mapping[str, float]
 
-    @property
-    def horizon(self) -> int:
+    @cached_property
+    def horizon(self) -> int:  # walked once: every decision asks for it several times
         return self.formula.horizon
 
     @cached_property
