@@ -30,7 +30,7 @@ run: .venv/.server
 	$(BIN)/specshield serve
 
 test: .venv/.dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile  # each module's tests stay in one of two processes
 
 # The wheel, in an empty folder and a new environment, with no compiled kernels: what a newcomer has.
 wheel-check: .venv/bin/python

@@ -19,7 +19,7 @@ from specshield.service.schemas.steps import StepResponse
 
 @pytest.fixture
 def client(server):
-    with ShieldClient(server.url, timeout=5.0) as client:
+    with ShieldClient(server.url, timeout=60.0) as client:
         yield client
 
 
@@ -121,7 +121,7 @@ def test_lost_answers_change_nothing(client, server):
     with session:
         expected, _ = drive(session, pose, seed=2)
     with (
-        ShieldClient(server.url, timeout=5.0, transport=Lossy()) as lossy,
+        ShieldClient(server.url, timeout=60.0, transport=Lossy()) as lossy,
         lossy.sessions.create(policy_id="case1", initial_pose=pose, seed=2) as again,
     ):
         decisions, _ = drive(again, pose, seed=2)
@@ -227,7 +227,7 @@ def test_maps_are_addressed_by_content(client):
 
 def test_policies_of_the_repository_are_ready(client):
     ready = {policy.id: policy for policy in client.policies.list() if policy.status == "ready"}
-    assert client.policies.wait("case1", timeout=5).id in ready
+    assert client.policies.wait("case1", timeout=60).id in ready
 
 
 def test_async_sessions_run_side_by_side(client, server):
@@ -245,7 +245,7 @@ def test_async_sessions_run_side_by_side(client, server):
             return session.id, session.t
 
     async def main():
-        async with AsyncShieldClient(server.url, timeout=5.0) as client:
+        async with AsyncShieldClient(server.url, timeout=60.0) as client:
             episodes = await asyncio.gather(*(episode(client, pose, i) for i, pose in enumerate(starts)))
             ids = {info.id async for info in client.sessions.list()}
             return episodes, ids

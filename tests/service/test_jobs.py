@@ -42,7 +42,7 @@ def server(tmp_path_factory):
 
 @pytest.fixture
 def client(server):
-    with httpx.Client(base_url=server.url, timeout=20.0) as client:
+    with httpx.Client(base_url=server.url, timeout=None) as client:
         yield client
 
 
@@ -142,7 +142,7 @@ def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, cli
 
 def test_nothing_trains_on_without_its_server(tmp_path):
     with serving(tmp_path, SPECSHIELD_WORKER="true") as server:
-        with httpx.Client(base_url=server.url, timeout=20.0) as client:
+        with httpx.Client(base_url=server.url, timeout=None) as client:
             policy = ask(client, options=LONG)
             reach(client, policy, "training")
         worker = worker_of(server)

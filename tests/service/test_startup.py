@@ -59,7 +59,7 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
         for path in ("/livez", "/metrics", "/docs", "/openapi.json"):
             assert httpx.get(f"{server.url}{path}").status_code == 200, path
         assert told["kernels"]["compiled"] == 0 < told["kernels"]["expected"]
-        assert told["parts"] == {"reachability": "compiling", "dqn": "compiling"}
+        assert told["parts"] == {"reachability": "compiling", "shield and dqn": "compiling"}
         with ShieldClient(server.url, timeout=0.1) as client, pytest.raises(Starting):
             client.policies.get("case1")
         fcntl.flock(lock, fcntl.LOCK_UN)

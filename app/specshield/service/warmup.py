@@ -2,7 +2,8 @@
 
     python -m specshield.service.warmup PART     # compiles one part, for `startup`; the disk keeps it
 
-What only a planner's or a look-ahead session needs is compiled when the first of them is made.
+The parts have few kernels in common, so that two processes can compile them side by side. What only a
+planner's or a look-ahead session needs is compiled when the first of them is made.
 """
 
 from __future__ import annotations
@@ -24,7 +25,6 @@ from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.shield import episode
 from specshield.shield.decision import make_shield
-from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -35,21 +35,28 @@ REGIONS = {
     "C": {"type": "polygon", "vertices": [[1.8, 1.8], [1.9, 1.8], [1.9, 1.9]]},
 }
 START = (1.0, 1.0, 0.0)
-# What can be compiled side by side, what takes longest first. Each gives the policy to decide with.
-PARTS: dict[str, Callable[[Task], Proposer]] = {
-    "reachability": lambda task: synthesise(task),
-    "dqn": lambda task: Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task))),
-}
 
 
 def warm_up(part: str) -> None:
-    """Decides twice with this part's policy: compiles its kernels, or takes them from the disk."""
-    task = _task()
-    shield = make_shield([PARTS[part](task)])
-    logits = np.zeros(len(STRETCH.actions))
+    """Runs this part's kernels once: compiles them, or takes them from the disk."""
+    PARTS[part](_task())
+
+
+def _propose(task: Task) -> None:
+    """What reachability takes to make its tables and to propose. Nothing else takes as long to compile."""
+    synthesise(task).propose(np.array([START]), {}, 0.0)
+
+
+def _decide(task: Task) -> None:
+    """What the shield takes to begin a session and to decide, with a DQN that proposes."""
+    policy = Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))
+    shield, logits = make_shield([policy]), np.zeros(len(STRETCH.actions))
     episode.start(shield, START)
     first = episode.decide(shield, [START], logits)
     episode.decide(shield, [START, first.next_poses[0].tolist()], logits, carry=first.carry)
+
+
+PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
 
 
 def _task() -> Task:
