@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
-from specshield.robot.dynamics import in_collision, successors, wrap
+from specshield.robot.dynamics import Body, in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
 from specshield.shield.feasibility import futures, prefix_of
@@ -102,7 +102,7 @@ def decide(
     t, signals = len(poses) - 1, signals or {}
     log_prior = _log_prior(shield, logits, main_task_done)
     nexts = np.empty((len(robot.motions), 3))
-    successors(shield.body, poses[-1], nexts)
+    touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
     memory, weights = None if carry is None else carry.memory, None
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
@@ -142,7 +142,7 @@ def decide(
         finished=(spec_status != "pending" and main_task_done) or t >= shield.max_steps,
         next_poses=np.where(robot.terminal[:, None], poses[-1], nexts[robot.motion_of]),
         residual=residual,
-        in_collision=bool(in_collision(shield.body, *poses[-1])),
+        in_collision=touches,
         witness=as_actions(shield, certified, moved),
         witnesses=tuple(as_actions(shield, certified, a) for a in range(len(robot.actions)))
         if witnesses
@@ -219,6 +219,13 @@ def _history(poses: ArrayLike) -> Floats:
         got = str(poses)[:80]
         raise PoseError("not poses", path="poses", got=got, expected="a list of finite [x, y, theta]")
     return array
+
+
+@leaf
+def _look_around(body: Body, pose: Floats, nexts: Floats) -> bool:
+    """Writes where each motion leads from a pose (3,) into nexts (M, 3). Whether the pose is in collision."""
+    successors(body, pose, nexts)
+    return in_collision(body, pose[0], pose[1], pose[2])
 
 
 @leaf

@@ -176,9 +176,11 @@ def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ..
     robot = shield.task.robot
     if judged is None:
         return (None,) * len(robot.actions)
-    binary = shield.config.evaluation == "feasibility"
-    values = judged.feasible.astype(np.float64) if binary else judged.values
-    return _as_numbers(np.where(robot.terminal, values.max(), values))
+    if shield.config.evaluation == "feasibility":
+        highest = 1.0 if judged.feasible.any() else 0.0
+        pairs = zip(robot.terminal.tolist(), judged.feasible.tolist(), strict=True)
+        return tuple([highest if terminal else float(feasible) for terminal, feasible in pairs])
+    return _as_numbers(np.where(robot.terminal, judged.values.max(), judged.values))
 
 
 def robustness_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
