@@ -74,6 +74,7 @@ async def prepare(startup: Startup) -> None:
         for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here
             await asyncio.to_thread(warmup.warm_up, part)
         startup.ready = True
+        log.info("ready")
     except Exception as error:
         log.exception("the kernels cannot be compiled")
         startup.failure = (
