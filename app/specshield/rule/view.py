@@ -80,7 +80,7 @@ def read_step(
     stack: Floats,
     buffer: Floats,
 ) -> float:
-    """The leaves at step start + k, at poses[k], into `buffer`. What the step before read is used again.
+    """The leaves at step start + k, at poses[k], into `buffer`. What is unchanged is not read again.
 
     poses (n, 3), the first of them at step `start`; signals (m, S): of the same steps, the last held. Returns
     the least value of the leaves that bind, inf where none does, NaN where some leaf is no number. values

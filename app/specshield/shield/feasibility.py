@@ -209,7 +209,7 @@ def _simulate_and_rate(
 
 @inlined
 def _slot(x: float, y: float, theta: float, motion: int, slots: int) -> int:
-    """Where a motion from a pose is remembered, of `slots`, a power of two (Teschner et al., 2003)."""
+    """The slot for a motion from a pose: a hash (Teschner et al., 2003); `slots` is a power of two."""
     key = int(1e7 * x) * 73856093 ^ int(1e7 * y) * 19349663 ^ int(1e7 * theta) * 83492791 ^ motion * 40503
     return (key ^ key >> 17) & (slots - 1)
 

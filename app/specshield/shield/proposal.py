@@ -58,10 +58,10 @@ def joined(*proposals: Proposal) -> Proposal:
 def ask(
     proposer: Proposer, history: Floats, signals: Mapping[str, Floats], margin: float, count: int, steps: int
 ) -> tuple[Proposal | None, str | None]:
-    """A proposal of `steps` motions a row, all below `count`, and else what was wrong with it, as a sentence.
+    """Asks a proposer; returns its proposal and None, or None and a sentence that says why it was not used.
 
-    The proposer gets copies of the history and the signals, and its motions are copied: nothing that it does
-    later reaches the decision.
+    Each row has to hold `steps` motions, all below `count`. The proposer gets copies of the history and the
+    signals, and its motions are copied: nothing that it does later reaches the decision.
     """
     try:
         name = str(proposer.id)[:80]
