@@ -76,6 +76,9 @@ def serve(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen on.", min=0, max=65535)] = 8000,
     workers: Annotated[int, typer.Option(help="Server processes; they share one store.", min=1)] = 1,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Serve beyond this machine without asking for a key.")
+    ] = False,
 ) -> None:
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
@@ -84,6 +87,8 @@ def serve(
 
     settings = _settings()  # what is wrong with them is said here, in one line
     _check_address(host, port)
+    if not insecure:
+        _check_exposure(host, settings)
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
     if embedded is not None:
         embedded.join()  # and so is why it does not start
@@ -161,6 +166,20 @@ def _check_address(host: str, port: int) -> None:
             f"the server cannot listen on {host} at port {port}: {error.strerror}",
             expected="an address of this machine and a free port; --port 0 takes any that is free",
         ) from None
+
+
+def _check_exposure(host: str, settings: Settings) -> None:
+    """Raises InputError where anybody on the network could use the server."""
+    from specshield.service.access.site import is_loopback
+
+    if settings.api_key is None and not is_loopback(host):
+        raise InputError(
+            f"whoever reaches {host} could use this server, since it asks for no key",
+            path="--host",
+            got=host,
+            expected="SPECSHIELD_API_KEY set; or an address that only this machine reaches, as 127.0.0.1; or "
+            "--insecure, where something in front decides who may",
+        )
 
 
 def _log_config() -> dict[str, Any]:

@@ -13,7 +13,8 @@ SpecshieldError
 │   ├── PolicyError             weights or a card that do not fit their task
 │   ├── InfeasibleStart         no action from the initial pose has a satisfying future
 │   ├── Unsupported             an accepted word whose power this build lacks
-│   └── BodyTooLarge            a request body over the limit
+│   ├── BodyTooLarge            a request body over the limit
+│   └── UnsupportedMediaType    a body that is not declared as a type that is taken
 ├── NotFound                    no such map, policy, session or page
 ├── MethodNotAllowed            the page is there, the method is not
 ├── Conflict                    the request disagrees with what is stored
@@ -24,6 +25,8 @@ SpecshieldError
 │   ├── SessionExists           a session id already taken
 │   └── InUse                   a policy that sessions still use
 ├── Unauthorized                a missing or wrong API key
+├── CrossSite                   a request that a page of another origin made
+├── MisdirectedRequest          a Host that is not this server's
 ├── LimitReached                too many maps, policies or sessions kept; delete some
 ├── TrainingUnavailable         no worker is there to train
 ├── Starting                    the server is not ready yet; ask again after Retry-After
@@ -136,6 +139,10 @@ class BodyTooLarge(InputError):
     type = "body-too-large"
 
 
+class UnsupportedMediaType(InputError):
+    type = "unsupported-media-type"
+
+
 class NotFound(SpecshieldError):
     type = "not-found"
 
@@ -174,6 +181,14 @@ class InUse(Conflict):
 
 class Unauthorized(SpecshieldError):
     type = "unauthorized"
+
+
+class CrossSite(SpecshieldError):
+    type = "cross-site"
+
+
+class MisdirectedRequest(SpecshieldError):
+    type = "misdirected-request"
 
 
 class LimitReached(SpecshieldError):

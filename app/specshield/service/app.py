@@ -17,7 +17,7 @@ from specshield import __version__
 from specshield.service import problems
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
-from specshield.service.middleware import Guard, Observe, guarded
+from specshield.service.middleware import Bodies, Guard, Observe, guarded
 from specshield.service.routes import maps, policies, sessions, specs, system
 from specshield.service.schemas.base import Problem
 from specshield.service.sessions.sessions import Sessions
@@ -68,9 +68,8 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
         app.include_router(module.router)
     problems.install(app)
     api_key = None if settings.api_key is None else settings.api_key.get_secret_value()
-    app.add_middleware(
-        Guard, api_key=api_key, max_body=settings.max_body_bytes, max_upload=settings.max_upload_bytes
-    )
+    app.add_middleware(Bodies, max_body=settings.max_body_bytes, max_upload=settings.max_upload_bytes)
+    app.add_middleware(Guard, api_key=api_key, allowed_hosts=settings.hosts)
     app.add_middleware(Observe)  # the outermost
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
@@ -131,12 +130,16 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
         schema["security"] = [{}, {"key": []}]
         for path, methods in schema["paths"].items():  # what the middleware may answer
             for operation in methods.values():
-                said = {"_401": "The server asks for a key, and this is not it."} if guarded(path) else {}
+                said = {"_403": "`cross-site`: a page of another origin asks."}
+                said["_421"] = "`misdirected-request`: Host does not name this server."
+                if guarded(path):
+                    said["_401"] = "The server asks for a key, and this is not it."
                 if path.startswith("/v1/"):
                     said["_503"] = operation["responses"].get("503", {}).get("description", "")
                     said["_503"] = f"{said['_503']} `starting`: the server is not ready yet.".strip()
                 if "requestBody" in operation:
                     said["_413"] = "The body is over the limit."
+                    said["_415"] = "The body is not declared as a type that is taken here."
                 added = problem_documents(**said)
                 operation["responses"] |= {str(status): told for status, told in added.items()}
         app.openapi_schema = schema

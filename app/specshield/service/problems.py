@@ -22,11 +22,14 @@ log = logging.getLogger("specshield")
 
 STATUS: Mapping[type[SpecshieldError], int] = {
     errors.BodyTooLarge: 413,
+    errors.UnsupportedMediaType: 415,
     errors.InputError: 422,
     errors.NotFound: 404,
     errors.MethodNotAllowed: 405,
     errors.Conflict: 409,
     errors.Unauthorized: 401,
+    errors.CrossSite: 403,
+    errors.MisdirectedRequest: 421,
     errors.LimitReached: 429,
     errors.TrainingUnavailable: 503,
     errors.Starting: 503,
@@ -100,7 +103,7 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
         what = below or "the body"
         return InputError(f"{what} is not JSON: {reason}", path=below or None, expected="a JSON object")
     if isinstance(body, bytes):  # not read at all
-        return InputError(
+        return errors.UnsupportedMediaType(
             "the body is not declared as JSON",
             path="Content-Type",
             expected="the header Content-Type: application/json",

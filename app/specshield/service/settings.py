@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 from pydantic import AliasChoices, Field, SecretStr, ValidationError, field_validator
@@ -11,6 +12,9 @@ from redis import ConnectionPool
 
 from specshield import shipped
 from specshield.errors import InputError
+from specshield.service.access.site import AUTHORITY
+
+HEADER_TEXT = re.compile(r"[!-~]([ -~]*[!-~])?")
 
 
 class Settings(BaseSettings):
@@ -37,6 +41,11 @@ class Settings(BaseSettings):
     )
     api_key: SecretStr | None = Field(
         default=None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
+    )
+    allowed_hosts: str = Field(
+        default="",
+        description="Names, with or without a port, that a request's Host may hold beside the server's own "
+        "address: that of a proxy in front, say. Separated by commas.",
     )
 
     max_horizon: int = Field(default=1000, ge=1, description="Longest horizon of a formula [steps].")
@@ -68,6 +77,25 @@ class Settings(BaseSettings):
             raise ValueError("a URL as redis://127.0.0.1:6379/0, rediss://... or unix:///path") from None
         return url
 
+    @field_validator("api_key")
+    @classmethod
+    def _fits_a_header(cls, key: SecretStr | None) -> SecretStr | None:
+        if key is not None and not HEADER_TEXT.fullmatch(key.get_secret_value()):
+            raise ValueError("printable ASCII that neither begins nor ends with a space: a header carries it")
+        return key
+
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _are_names(cls, names: str) -> str:
+        if not all(AUTHORITY.fullmatch(name) for name in _listed(names)):
+            raise ValueError("names as robots.example or robots.example:8443, separated by commas")
+        return names
+
+    @property
+    def hosts(self) -> frozenset[str]:
+        """`allowed_hosts`, one by one."""
+        return frozenset(_listed(self.allowed_hosts))
+
     def environment(self) -> dict[str, str]:
         """The environment that gives a child process these same settings."""
         values = {f"SPECSHIELD_{name.upper()}": value for name, value in self if value is not None}
@@ -80,15 +108,26 @@ class Settings(BaseSettings):
         return {**os.environ, **{name: str(value) for name, value in values.items()}}
 
 
+def _listed(names: str) -> list[str]:
+    return [name.strip().lower() for name in names.split(",") if name.strip()]
+
+
 def read_settings() -> Settings:
     """Those of this process's environment. Raises InputError, which names the variable at fault."""
+    if os.environ.get("SPECSHIELD_API_KEY") == "":  # empty counts as unset: nobody means an open server by it
+        raise InputError(
+            "SPECSHIELD_API_KEY is empty",
+            path="SPECSHIELD_API_KEY",
+            expected="a key, or the variable not set",
+        )
     try:
         return Settings()
     except ValidationError as invalid:
         wrong = invalid.errors(include_url=False)[0]
         field = str(wrong["loc"][0]).lower()
         name = "REDIS_URL" if field == "redis_url" else f"SPECSHIELD_{field.upper()}"
-        shown = "" if field == "redis_url" else f": {wrong['input']!r}"  # a URL may hold a password
+        secret = field in ("redis_url", "api_key")  # a URL may hold a password
+        shown = "" if secret else f": {wrong['input']!r}"
         raise InputError(
             f"{name} is not valid{shown}",
             path=name,

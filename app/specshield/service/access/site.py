@@ -1,0 +1,116 @@
+"""Where a request was sent to and which page sent it: what a browser's own rules do not keep out.
+
+Any web page may make its visitor's browser send requests to this machine. The page cannot read the answers,
+unless its own name is made to point here (DNS rebinding): the Host header then holds that name. So:
+
+- Host has to name the server. On a connection to a loopback address: `localhost`, `127.0.0.1` or `[::1]`, with
+  the server's port. On any other, where a balancer or a port mapping may stand in between: any literal
+  address or `localhost`, since neither can be made to point elsewhere; so a probe may ask a pod by its
+  address. Other names are those of SPECSHIELD_ALLOWED_HOSTS. A unix socket takes any: no browser reaches it.
+- Origin, which a browser sends with whatever may change something, has to be the server itself. So has the
+  page by Sec-Fetch-Site, unless a person follows a link.
+- A body has to be declared as what it is. The types that a page may send without asking first are not taken,
+  but for the multipart of an upload, which the rule on Origin covers.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+from specshield.errors import CrossSite, MisdirectedRequest, UnsupportedMediaType
+
+UPLOADS = ("/v1/maps", "/v1/policies")
+AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::([0-9]{1,5}))?", re.IGNORECASE)
+JSON = re.compile(r"application/(json|[a-z0-9!#$&^_.+-]+\+json)")
+WITH_BODY = ("POST", "PUT", "PATCH")
+
+Headers = Mapping[bytes, bytes]  # names in lower case
+
+
+def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[str]) -> None:
+    """Raises MisdirectedRequest, CrossSite or UnsupportedMediaType. allowed: names with or without a port."""
+    host = headers.get(b"host", b"").decode("latin-1").lower()
+    server = scope.get("server") or ("", None)
+    if not names_server(host, server[0], server[1], allowed):
+        raise MisdirectedRequest(
+            "this server does not answer for the host that was asked for",
+            path="Host",
+            got=host,
+            expected="the address that the server listens on, or a name in SPECSHIELD_ALLOWED_HOSTS",
+        )
+    if _from_elsewhere(scope.get("method", ""), headers, host, allowed):
+        raise CrossSite(
+            "a page of another origin may not use this server",
+            path="Origin",
+            got=headers.get(b"origin", b"").decode("latin-1") or None,
+            expected="a program, or a page that comes from this server",
+        )
+    if scope.get("method") in WITH_BODY and scope["path"].startswith("/v1/") and _has_body(headers):
+        _check_type(scope["path"], headers.get(b"content-type", b"").decode("latin-1"))
+
+
+@lru_cache(4096)
+def names_server(host: str, address: str, port: int | None, allowed: frozenset[str]) -> bool:
+    """Whether `host`, as in the header, names the server behind a socket of this address.
+
+    >>> names_server("localhost:8000", "127.0.0.1", 8000, frozenset())
+    True
+    """
+    found = AUTHORITY.fullmatch(host)
+    if found is None:
+        return False
+    name, named_port = found[1], int(found[2] or 80)
+    if port is None or name in allowed or host in allowed:
+        return True
+    if is_loopback(address):
+        return name in ("localhost", "127.0.0.1", "[::1]") and named_port == port
+    return name == "localhost" or _literal(name.strip("[]")) is not None
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches what listens on this address or name."""
+    found = _literal(host)
+    if found is None:
+        return host == "localhost"
+    return (getattr(found, "ipv4_mapped", None) or found).is_loopback
+
+
+def _literal(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(text)
+    except ValueError:
+        return None
+
+
+def _from_elsewhere(method: str, headers: Headers, host: str, allowed: frozenset[str]) -> bool:
+    origin = headers.get(b"origin")
+    if origin is not None:
+        scheme, _, authority = origin.decode("latin-1").lower().partition("://")
+        if scheme not in ("http", "https") or (authority != host and authority not in allowed):
+            return True
+    if headers.get(b"sec-fetch-site", b"none") in (b"same-origin", b"none"):
+        return False
+    fetched = (method, headers.get(b"sec-fetch-mode"), headers.get(b"sec-fetch-dest"))
+    return fetched != ("GET", b"navigate", b"document")  # a link that somebody follows, not a frame
+
+
+def _has_body(headers: Headers) -> bool:
+    return headers.get(b"content-length", b"0") != b"0" or b"transfer-encoding" in headers
+
+
+def _check_type(path: str, declared: str) -> None:
+    kind = declared.partition(";")[0].strip().lower()
+    taken = ["application/json", "application/msgpack"]
+    if path.rstrip("/") in UPLOADS:
+        taken[1] = "multipart/form-data"
+    if kind not in taken and not JSON.fullmatch(kind):
+        raise UnsupportedMediaType(
+            "the body is not declared as a type that is taken here",
+            path="Content-Type",
+            got=declared,
+            expected=f"the header Content-Type: {' or '.join(taken)}",
+        )

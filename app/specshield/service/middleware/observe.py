@@ -1,0 +1,52 @@
+"""Request ids, Server-Timing and metrics."""
+
+from __future__ import annotations
+
+import re
+import secrets
+import time
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from specshield.service import metrics
+
+REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+
+
+class Observe:
+    """Request ids, Server-Timing, metrics. Routes add their parts [s] to `scope["state"]["timing"]`."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        start = time.perf_counter()
+        timing: dict[str, float] = {}
+        scope.setdefault("state", {})["timing"] = timing
+        asked = Headers(scope=scope).get("x-request-id", "")
+        request_id = asked if REQUEST_ID.fullmatch(asked) else secrets.token_hex(8)
+        status = 500
+
+        async def answer(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-Id"] = request_id
+                parts = {"total": time.perf_counter() - start, **timing}
+                headers["Server-Timing"] = ", ".join(
+                    f"{name};dur={1000 * dur:.3f}" for name, dur in parts.items()
+                )
+            await send(message)
+
+        try:
+            await self.app(scope, receive, answer)
+        finally:
+            route = getattr(scope.get("route"), "path", "other")
+            method = scope["method"] if route != "other" else "other"  # what a caller makes up is no label
+            metrics.requests.labels(method, route, status).inc()
+            metrics.request_seconds.labels(method, route).observe(time.perf_counter() - start)
