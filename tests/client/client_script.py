@@ -3,7 +3,7 @@
 import json
 
 from specshield import errors
-from specshield.client.core import Wait
+from specshield.client.core import Wait, Within
 from specshield.client.wire import Failure, Reply
 
 
@@ -26,7 +26,9 @@ def drive(flow, *outcomes):
     try:
         command = next(flow)
         while True:
-            if isinstance(command, Wait):
+            if isinstance(command, Within):
+                command = next(flow)
+            elif isinstance(command, Wait):
                 waits.append(command.seconds)
                 command = next(flow)
             else:

@@ -151,6 +151,7 @@ def test_what_goes_over_the_wire(use):
     assert request.headers["authorization"] == "Bearer secret"
     assert request.headers["content-type"] == "application/json"
     assert json.loads(request.content) == {"formula": "F[0,3] a"}
+    assert request.headers["accept-encoding"] == "identity"
     assert request.extensions["timeout"] == {"connect": 0.25, "read": 0.25, "write": 0.25, "pool": 0.25}
 
 

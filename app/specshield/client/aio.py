@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from types import TracebackType
@@ -11,11 +12,11 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
 import httpx
 
-from specshield.client import calls
+from specshield.client import bounded, calls
 from specshield.client.core import Flow, Wait, looks_like, page_of
 from specshield.client.models import Map, Policy, SessionInfo
 from specshield.client.state import SessionState
-from specshield.client.transport import address, allowed, arguments, check_open, failure, headers, reply
+from specshield.client.transport import STALE, Exchange, address, check_open, headers
 from specshield.client.wire import TRIES, Failure, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
@@ -39,8 +40,9 @@ class AsyncShieldClient:
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
+        url = address(base_url)
         self._http = httpx.AsyncClient(
-            base_url=address(base_url), headers=headers(api_key), transport=transport
+            base_url=url, headers=headers(api_key), transport=transport or bounded.AsyncTransport(url)
         )
         self.specs = AsyncSpecs(self._run)
         self.maps = AsyncMaps(self._run)
@@ -65,25 +67,49 @@ class AsyncShieldClient:
         await self._http.aclose()
 
     async def _run(self, flow: Flow[T], /) -> T:
+        began, ends = time.monotonic(), math.inf
         try:
             command = next(flow)
             while True:
+                if isinstance(command, Request):
+                    command = flow.send(await self._perform(command, ends))
+                    continue
                 if isinstance(command, Wait):
-                    await asyncio.sleep(command.seconds)
-                    command = next(flow)
+                    await asyncio.sleep(max(0.0, min(command.seconds, ends - time.monotonic())))
                 else:
-                    command = flow.send(await self._perform(command))
+                    ends = command.ends(began, self._timeout)
+                command = next(flow)
         except StopIteration as stop:
             return cast(T, stop.value)
 
-    async def _perform(self, request: Request) -> Reply | Failure:
+    async def _perform(self, request: Request, ends: float) -> Reply | Failure:
         check_open(self._http)
-        start, limit = time.monotonic(), allowed(request, self._timeout)
+        exchange = Exchange(request, self._http.base_url, self._timeout, ends)
+        if exchange.seconds <= 0.0:
+            return exchange.failure(httpx.PoolTimeout(""))
+        bounded.ENDS.set(exchange.ends)
         try:
-            response = await self._http.request(**arguments(request, self._timeout))
+            reply = await asyncio.wait_for(self._exchanged(exchange), exchange.ends - time.monotonic())
+        except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
+            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
         except httpx.RequestError as error:
-            return failure(error, request, self._http.base_url, time.monotonic() - start, limit)
-        return reply(response, time.monotonic() - start, limit)
+            return exchange.failure(error)
+        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
+
+    async def _exchanged(self, exchange: Exchange) -> Reply | None:
+        async with self._http.stream(**exchange.arguments(self._timeout)) as response:
+            exchange.begin(response)
+            async for chunk in response.aiter_bytes():
+                exchange.take(chunk)
+            reply = exchange.reply(response)
+            if reply is None:
+                await hang_up(response)
+            return reply
+
+
+async def hang_up(response: httpx.Response) -> None:
+    if "network_stream" in response.extensions:
+        await response.extensions["network_stream"].aclose()
 
 
 class Resource:

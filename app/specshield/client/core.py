@@ -4,7 +4,8 @@ A shell (sync.py, aio.py) performs a `Request` and sends its `Reply` or `Failure
 `Wait`; the generator's return value is the call's. So requests, parsing and retries exist once.
 
 Retries: a lost answer, 502, 503 or 504 is followed by the same bytes again, at most `tries` times,
-after 0.05 s, 0.1 s, 0.2 s, ..., and no try starts later than four timeouts after the first. All that
+after 0.05 s, 0.1 s, 0.2 s, ..., and no try starts later than four timeouts after the first, nor after the
+deadline of the call. All that
 is repeated is safe to repeat: steps are locked by t and content, maps and policies are addressed by
 content, and a session is created under an id the client chose. A server that says it is starting has
 done nothing yet: it is asked again when it says so (Retry-After), within the same four timeouts, and such
@@ -33,7 +34,18 @@ class Wait:
     seconds: float
 
 
-Flow = Generator[Request | Wait, Reply | Failure, T]
+@dataclass(frozen=True)
+class Within:
+    """From its beginning to its end, this call may take so many seconds; None: five timeouts."""
+
+    seconds: float | None
+
+    def ends(self, began: float, timeout: float) -> float:
+        """On the clock on which the call began at `began`."""
+        return began + ((PATIENCE + 1) * timeout if self.seconds is None else self.seconds)
+
+
+Flow = Generator[Request | Wait | Within, Reply | Failure, T]
 
 
 @dataclass(frozen=True)
@@ -56,7 +68,8 @@ def deliver(request: Request) -> Flow[Delivery]:
         else:
             tries += 1
             wait = BACKOFF * 2 ** (tries - 1)
-        if not _passing(outcome) or tries == request.tries or seconds + wait > PATIENCE * outcome.timeout:
+        late = seconds + wait > PATIENCE * outcome.timeout or wait >= outcome.left
+        if not _passing(outcome) or tries == request.tries or late:
             if isinstance(outcome, Failure):
                 outcome.error.details.update(tries=tries, seconds=round(seconds, 3))
                 raise outcome.error

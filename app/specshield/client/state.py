@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from specshield.client.core import Flow, call, deliver
+from specshield.client.core import Flow, Within, call, deliver
 from specshield.client.models import (
     Decision,
     Page,
@@ -23,6 +23,7 @@ from specshield.client.wire import (
     Numbers,
     Reply,
     check,
+    deadline_value,
     get,
     json_object,
     logit_values,
@@ -69,14 +70,18 @@ class SessionState:
         main_task_done: bool | None = None,
         signals: Mapping[str, float] | None = None,
         witnesses: bool = False,
+        deadline: float | None = None,
     ) -> Flow[Decision]:
         """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
 
         `main_task_done`: leave it None to run `decision.execute`; the session then remembers a drawn
         terminal action. A caller that draws from `decision.distribution` itself says True or False.
-        `logits` may be None once it is true. Raises whatever went wrong and stays at t: call again
-        with the same pose and logits, or `record` the pose and move on.
+        `logits` may be None once it is true. `deadline` [s] is a hard limit on the whole call, retries
+        included, whatever the server does; without one it is five timeouts of the client.
+        Raises whatever went wrong and stays at t: call again with the same pose and logits, or `record`
+        the pose and move on.
         """
+        yield Within(None if deadline is None else deadline_value(deadline))
         t, own = self.t, main_task_done is None
         over = self.main_task_done if main_task_done is None else main_task_done
         body: dict[str, Any] = {
@@ -103,6 +108,7 @@ class SessionState:
 
     def _close(self, pose: Numbers | None, tries: int) -> Flow[Verdict]:
         """With no pose at hand (a session read back, not stepped) it closes on what the server has."""
+        yield Within(None)
         poses = self._poses if pose is None else {**self._poses, self.t: pose_values(pose)}
         if poses:
             reply = yield from self._send("close", poses, max(poses), {}, tries)
@@ -126,7 +132,14 @@ class SessionState:
 
         def since(start: int) -> Flow[Reply]:
             newest = [poses[i] for i in range(start, t + 1)]
-            request = post("sessions", self.id, action, body={"t": t, "poses": newest, **body}, tries=tries)
+            request = post(
+                "sessions",
+                self.id,
+                action,
+                body={"t": t, "poses": newest, **body},
+                tries=tries,
+                t=t if action == "steps" else None,
+            )
             reply = (yield from deliver(request)).reply
             check(reply)
             return reply

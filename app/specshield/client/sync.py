@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
@@ -10,11 +11,11 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
 
 import httpx
 
-from specshield.client import calls
+from specshield.client import bounded, calls
 from specshield.client.core import Flow, Wait, looks_like, page_of
 from specshield.client.models import Map, Policy, SessionInfo
 from specshield.client.state import SessionState
-from specshield.client.transport import address, allowed, arguments, check_open, failure, headers, reply
+from specshield.client.transport import STALE, Exchange, address, check_open, headers
 from specshield.client.wire import TRIES, Failure, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
@@ -29,9 +30,11 @@ class Run(Protocol):
 class ShieldClient:
     """The service at `base_url`.
 
-    `timeout` [s] is what a decision may take, one try; what prepares something (a map, a policy, a
-    session) gets at least 30 s. Lost answers are asked for again (see `core`), so a call returns or
-    raises within five timeouts. Every error is a `SpecshieldError`; no answer is a `TransportError`.
+    `timeout` [s] is what a decision may take, one try, from looking up the server's name to the last byte;
+    what prepares something (a map, a policy, a session) gets at least 30 s. Lost answers are asked for again
+    (see `core`), so a call returns or raises within five timeouts, a step within its `deadline`. A
+    `transport` of your own has to keep these times itself. Every error is a `SpecshieldError`; no answer is
+    a `TransportError`.
     """
 
     def __init__(
@@ -43,7 +46,10 @@ class ShieldClient:
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
-        self._http = httpx.Client(base_url=address(base_url), headers=headers(api_key), transport=transport)
+        url = address(base_url)
+        self._http = httpx.Client(
+            base_url=url, headers=headers(api_key), transport=transport or bounded.Transport(url)
+        )
         self.specs = Specs(self._run)
         self.maps = Maps(self._run)
         self.policies = Policies(self._run)
@@ -67,25 +73,46 @@ class ShieldClient:
         self._http.close()
 
     def _run(self, flow: Flow[T], /) -> T:
+        began, ends = time.monotonic(), math.inf
         try:
             command = next(flow)
             while True:
+                if isinstance(command, Request):
+                    command = flow.send(self._perform(command, ends))
+                    continue
                 if isinstance(command, Wait):
-                    time.sleep(command.seconds)
-                    command = next(flow)
+                    time.sleep(max(0.0, min(command.seconds, ends - time.monotonic())))
                 else:
-                    command = flow.send(self._perform(command))
+                    ends = command.ends(began, self._timeout)
+                command = next(flow)
         except StopIteration as stop:
             return cast(T, stop.value)
 
-    def _perform(self, request: Request) -> Reply | Failure:
+    def _perform(self, request: Request, ends: float) -> Reply | Failure:
         check_open(self._http)
-        start, limit = time.monotonic(), allowed(request, self._timeout)
+        exchange = Exchange(request, self._http.base_url, self._timeout, ends)
+        if exchange.seconds <= 0.0:
+            return exchange.failure(httpx.PoolTimeout(""))
+        token = bounded.ENDS.set(exchange.ends)
         try:
-            response = self._http.request(**arguments(request, self._timeout))
+            with self._http.stream(**exchange.arguments(self._timeout)) as response:
+                exchange.begin(response)
+                for chunk in response.iter_bytes():
+                    exchange.take(chunk)
+                reply = exchange.reply(response)
+                if reply is None:
+                    hang_up(response)
         except httpx.RequestError as error:
-            return failure(error, request, self._http.base_url, time.monotonic() - start, limit)
-        return reply(response, time.monotonic() - start, limit)
+            return exchange.failure(error)
+        finally:
+            bounded.ENDS.reset(token)
+        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
+
+
+def hang_up(response: httpx.Response) -> None:
+    """Close the connection under a response, so that nothing more is read from it."""
+    if "network_stream" in response.extensions:
+        response.extensions["network_stream"].close()
 
 
 class Resource:

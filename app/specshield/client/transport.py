@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import re
+import secrets
+import time
 from typing import Any
 
 import httpx
 
-from specshield.client.wire import Failure, Reply, Request
+from specshield.client.wire import Failure, Reply, Request, stale
 from specshield.errors import InputError, TransportError, TransportTimeout
 
 PREPARING = 30.0  # s at least for what prepares something: a map, a policy, a session
+MOST = 64 << 20  # bytes of an answer; chosen by hand: a step of 256 actions with all its witnesses has 1 MB
+MOST_PREPARED = 1 << 30  # bytes of what prepares something, such as a long trajectory; chosen by hand
+UNDERSTANDING = 1e-7  # s a byte that are kept for parsing; json.loads of a step's answer took 55 ns a byte
+STALE = "the answer is to another request"
+MINE = "X-Request-Id"  # the server sends back what it was sent
 
 
 def address(base_url: str) -> httpx.URL:
@@ -37,7 +44,8 @@ def headers(api_key: str | None) -> dict[str, str]:
             path="api_key",
             expected="ASCII without control characters",
         )
-    return {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
+    plain = {"Accept-Encoding": "identity"}  # what is compressed could be larger than it looks
+    return plain if api_key is None else {**plain, "Authorization": f"Bearer {api_key}"}
 
 
 def allowed(request: Request, timeout: float) -> float:
@@ -45,41 +53,78 @@ def allowed(request: Request, timeout: float) -> float:
     return max(timeout, PREPARING) if request.slow else timeout
 
 
-def arguments(request: Request, timeout: float) -> dict[str, Any]:
-    """The keywords of httpx's `request`; connecting never gets more than `timeout`."""
-    return {
-        "method": request.method,
-        "url": request.path,
-        "params": request.params,
-        "content": request.body,
-        "files": request.files,
-        "headers": None if request.body is None else {"Content-Type": "application/json"},
-        "timeout": httpx.Timeout(allowed(request, timeout), connect=timeout),
-    }
+class Exchange:
+    """One try: what httpx is to send, and what is made of that which comes back, in the time there is.
+
+    timeout: the client's. ends: of the call, on the clock of time.monotonic().
+    """
+
+    def __init__(self, request: Request, base_url: httpx.URL, timeout: float, ends: float) -> None:
+        self.request, self.began, self._ends, self._base_url = request, time.monotonic(), ends, base_url
+        self._allowed = allowed(request, timeout)
+        self.seconds = min(self._allowed, ends - self.began)  # what this try has; none if not above 0
+        self.ends = self.began + self.seconds
+        self._most = MOST_PREPARED if request.slow else MOST
+        self._id = secrets.token_hex(8)
+        self._chunks: list[bytes] = []
+        self._size = 0
+
+    def arguments(self, timeout: float) -> dict[str, Any]:
+        """The keywords of httpx's `stream`; connecting never gets more than `timeout`."""
+        request, headers = self.request, {MINE: self._id}
+        if request.body is not None:
+            headers["Content-Type"] = "application/json"
+        return {
+            "method": request.method,
+            "url": request.path,
+            "params": request.params,
+            "content": request.body,
+            "files": request.files,
+            "headers": headers,
+            "timeout": httpx.Timeout(self.seconds, connect=min(timeout, self.seconds)),
+        }
+
+    def begin(self, response: httpx.Response) -> None:
+        """Raises httpx.DecodingError for a compressed body, which nobody asked for and may be a bomb."""
+        encoding = response.headers.get("Content-Encoding", "identity")
+        if encoding != "identity":
+            raise httpx.DecodingError(f"the answer is compressed by {encoding}, which was not asked for")
+
+    def take(self, chunk: bytes) -> None:
+        """A piece of the body. Raises httpx.ReadTimeout where too little time is left to understand it."""
+        self._size += len(chunk)
+        if self._size > self._most:
+            raise httpx.ReadError(f"the answer has more than {self._most} bytes")
+        if time.monotonic() + UNDERSTANDING * self._size > self.ends:
+            raise httpx.ReadTimeout("the time of this try is over")
+        self._chunks.append(chunk)
+
+    def reply(self, response: httpx.Response) -> Reply | None:
+        """None for an answer to another request: it came late, and its connection has to go."""
+        if response.headers.get(MINE, self._id) != self._id:
+            return None
+        names = {name.lower(): value for name, value in response.headers.items()}
+        now, content = time.monotonic(), b"".join(self._chunks)
+        taken = (now - self.began, self._allowed, self._ends - now)
+        reply = Reply(response.status_code, names, content, *taken)
+        return None if stale(self.request, reply) else reply
+
+    def failure(self, error: httpx.RequestError) -> Failure:
+        """Every way httpx can fail to bring an answer is a TransportError; its own error is the cause."""
+        what = f"{self.request.method} {str(self._base_url).rstrip('/')}{self.request.path}"
+        mapped: TransportError
+        if isinstance(error, httpx.TimeoutException):
+            mapped = TransportTimeout(f"no answer within {max(self.seconds, 0.0):.3g} s: {what}")
+        else:
+            mapped = TransportError(
+                f"the server cannot be reached: {str(error) or type(error).__name__}: {what}",
+                expected="a specshield server that runs at this address",
+            )
+        mapped.__cause__ = error
+        now = time.monotonic()
+        return Failure(mapped, now - self.began, self._allowed, self._ends - now)
 
 
 def check_open(http: httpx.Client | httpx.AsyncClient) -> None:
     if http.is_closed:
         raise TransportError("the client is closed", expected="a client that is still open")
-
-
-def reply(response: httpx.Response, seconds: float, timeout: float) -> Reply:
-    names = {name.lower(): value for name, value in response.headers.items()}
-    return Reply(response.status_code, names, response.content, seconds, timeout)
-
-
-def failure(
-    error: httpx.RequestError, request: Request, base_url: httpx.URL, seconds: float, timeout: float
-) -> Failure:
-    """Every way httpx can fail to bring an answer is a TransportError; its own error is the cause."""
-    what = f"{request.method} {str(base_url).rstrip('/')}{request.path}"
-    mapped: TransportError
-    if isinstance(error, httpx.TimeoutException):
-        mapped = TransportTimeout(f"no answer within {timeout:g} s: {what}")
-    else:
-        mapped = TransportError(
-            f"the server cannot be reached: {str(error) or type(error).__name__}: {what}",
-            expected="a specshield server that runs at this address",
-        )
-    mapped.__cause__ = error
-    return Failure(mapped, seconds, timeout)

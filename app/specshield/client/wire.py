@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import quote
@@ -43,7 +44,10 @@ Content = bytes | str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class Request:
-    """One request. `slow`: the server prepares something; `tries`: how often it may be sent at most."""
+    """One request. `slow`: the server prepares something; `tries`: how often it may be sent at most.
+
+    `t`: the step that the answer has to be about; an answer about another one is none (see `stale`).
+    """
 
     method: str
     path: str
@@ -52,34 +56,47 @@ class Request:
     params: Mapping[str, str] | None = None
     slow: bool = False
     tries: int = TRIES
+    t: int | None = None
 
 
 @dataclass(frozen=True)
 class Reply:
-    """What the server answered, after `seconds`, where `timeout` were allowed."""
+    """What the server answered, after `seconds`, where `timeout` were allowed; `left`: of the call's time."""
 
     status: int
     headers: Mapping[str, str]  # names in lower case
     content: bytes
     seconds: float
     timeout: float
+    left: float = math.inf
+
+    @cached_property
+    def document(self) -> Any:
+        """What the body says; None where it is not JSON."""
+        try:
+            return json.loads(self.content)
+        except (ValueError, RecursionError):
+            return None
 
 
 @dataclass(frozen=True)
 class Failure:
-    """No answer: the error, after `seconds`, where `timeout` were allowed."""
+    """No answer: the error, after `seconds`, where `timeout` were allowed; `left`: of the call's time."""
 
     error: TransportError
     seconds: float
     timeout: float
+    left: float = math.inf
 
 
 def get(*segments: str, slow: bool = False, params: Mapping[str, str] | None = None) -> Request:
     return Request("GET", path(*segments), params=params, slow=slow)
 
 
-def post(*segments: str, body: Mapping[str, Any], slow: bool = False, tries: int = TRIES) -> Request:
-    return Request("POST", path(*segments), body=encode(body), slow=slow, tries=tries)
+def post(
+    *segments: str, body: Mapping[str, Any], slow: bool = False, tries: int = TRIES, t: int | None = None
+) -> Request:
+    return Request("POST", path(*segments), body=encode(body), slow=slow, tries=tries, t=t)
 
 
 def path(*segments: str) -> str:
@@ -175,6 +192,15 @@ def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
     return values
 
 
+def deadline_value(deadline: float) -> float:
+    """InputError unless it is a positive number of seconds."""
+    if not (isinstance(deadline, int | float) and 0.0 < deadline < math.inf):
+        raise InputError(
+            "a deadline is a time in seconds", path="deadline", got=deadline, expected="a number above 0"
+        )
+    return float(deadline)
+
+
 def _floats(values: Any, error: type[InputError], where: str, expected: str) -> list[float]:
     """None is minus infinity, which only a logit may be."""
     try:
@@ -198,10 +224,7 @@ _GATEWAY: dict[int, type[TransportError]] = {502: TransportError, 503: Transport
 def json_object(reply: Reply) -> dict[str, Any]:
     """The object a successful reply holds; the error an unsuccessful one stands for is raised."""
     check(reply)
-    try:
-        body = json.loads(reply.content)
-    except ValueError:
-        body = None
+    body = reply.document
     if not isinstance(body, dict):
         raise ServerError(
             "the answer is not a JSON object; is this a specshield server?", status=reply.status
@@ -241,11 +264,14 @@ def error_of(reply: Reply) -> SpecshieldError:
 def _problem(reply: Reply) -> dict[str, Any] | None:
     if not reply.headers.get("content-type", "").startswith("application/problem+json"):
         return None
-    try:
-        document = json.loads(reply.content)
-    except ValueError:
-        return None
-    return document if isinstance(document, dict) else None
+    return reply.document if isinstance(reply.document, dict) else None
+
+
+def stale(request: Request, reply: Reply) -> bool:
+    """Whether the reply decides another step than the one that was asked for."""
+    if request.t is None or reply.status != 200 or not isinstance(reply.document, dict):
+        return False
+    return bool(reply.document.get("t") != request.t)
 
 
 def timings(reply: Reply) -> dict[str, float]:

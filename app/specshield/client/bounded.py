@@ -1,0 +1,195 @@
+"""A network on which no try of the blocking client outlasts its time, whatever the other side does.
+
+httpx limits each read and each write, so a server that drips bytes holds a call for ever. Here every
+operation on a connection, from looking up its name to the last byte, gets what is left of the whole try.
+With asyncio a try is cancelled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Iterable
+from contextvars import ContextVar
+from ipaddress import ip_address
+from typing import Any
+from urllib.request import getproxies, proxy_bypass
+
+import httpcore
+import httpx
+
+ENDS: ContextVar[float] = ContextVar("ENDS", default=float("inf"))  # when this try ends, time.monotonic() [s]
+PARSING = (
+    6e-6  # s a byte: h11 takes 1.3 to 3 us a byte of endless "100 Continue" (benchmarks/deadline.py)
+)
+LEAST = 512  # bytes to read at once
+OPTIONS = [(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
+
+
+def left(error: type[httpcore.TimeoutException], most: float | None = None) -> float:
+    """Seconds that are left of this try, at most `most`; `error` where none are."""
+    seconds = ENDS.get() - time.monotonic()
+    if seconds <= 0.0:
+        raise error("the time of this try is over")
+    return min(seconds, threading.TIMEOUT_MAX if most is None else most)
+
+
+def paced(most: int) -> int:
+    """How many bytes to read at once: no more than can be parsed in the time that is left."""
+    return max(min(most, LEAST), int(min(left(httpcore.ReadTimeout) / PARSING, most)))
+
+
+class Stream(httpcore.NetworkStream):
+    """One connection; `inner` is httpcore's own, plain or TLS."""
+
+    def __init__(self, inner: httpcore.NetworkStream) -> None:
+        self._inner = inner
+
+    def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
+        return self._inner.read(paced(max_bytes), left(httpcore.ReadTimeout, timeout))
+
+    def write(self, buffer: bytes, timeout: float | None = None) -> None:
+        """Piece by piece, as the other side takes them."""
+        connection: socket.socket = self._inner.get_extra_info("socket")
+        unsent = memoryview(buffer)
+        try:
+            while unsent:
+                connection.settimeout(left(httpcore.WriteTimeout, timeout))
+                unsent = unsent[connection.send(unsent) :]
+        except TimeoutError as error:
+            raise httpcore.WriteTimeout(str(error)) from error
+        except OSError as error:
+            raise httpcore.WriteError(str(error)) from error
+
+    def close(self) -> None:
+        self._inner.close()
+
+    def start_tls(
+        self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
+    ) -> Stream:
+        if self.get_extra_info("ssl_object") is not None:
+            raise httpcore.UnsupportedProtocol("https through a proxy that is itself reached by https")
+        limit = left(httpcore.ConnectTimeout, timeout)
+        return Stream(self._inner.start_tls(ssl_context, server_hostname, limit))
+
+    def get_extra_info(self, info: str) -> Any:
+        return self._inner.get_extra_info(info)
+
+
+class Network(httpcore.NetworkBackend):
+    """Connections to a server, tried at each of its addresses with an equal share of the time."""
+
+    def connect_tcp(
+        self,
+        host: str,
+        port: int,
+        timeout: float | None = None,
+        local_address: str | None = None,
+        socket_options: Iterable[Any] | None = None,
+    ) -> Stream:
+        by = time.monotonic() + left(httpcore.ConnectTimeout, timeout)
+        addresses = look_up(host, port, by)
+        for number, address in enumerate(addresses):
+            share = max(by - time.monotonic(), 1e-3) / (len(addresses) - number)
+            try:
+                return Stream(
+                    httpcore.SyncBackend().connect_tcp(
+                        address, port, left(httpcore.ConnectTimeout, share), local_address, OPTIONS
+                    )
+                )
+            except (httpcore.ConnectError, httpcore.ConnectTimeout):
+                if number + 1 == len(addresses):
+                    raise
+        raise httpcore.ConnectError(f"{host} has no address")
+
+
+def look_up(host: str, port: int, by: float) -> list[str]:
+    """The addresses of a host. Nothing can limit the resolver's time, so a name is asked for in a thread."""
+    with contextlib.suppress(ValueError):
+        return [str(ip_address(host))]
+    found: list[Any] = []
+
+    def ask() -> None:
+        try:
+            found.append(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
+        except OSError as error:
+            found.append(error)
+
+    asking = threading.Thread(target=ask, daemon=True, name="specshield-look-up")
+    asking.start()
+    asking.join(max(by - time.monotonic(), 0.0))
+    if not found:
+        raise httpcore.ConnectTimeout(f"the address of {host} could not be looked up in time")
+    if isinstance(found[0], OSError):
+        raise httpcore.ConnectError(str(found[0])) from found[0]
+    return list(dict.fromkeys(str(entry[4][0]) for entry in found[0]))
+
+
+class AsyncStream(httpcore.AsyncNetworkStream):
+    """One connection for asyncio, where a try is cancelled; only the size of what is read is bounded here."""
+
+    def __init__(self, inner: httpcore.AsyncNetworkStream) -> None:
+        self._inner = inner
+
+    async def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
+        return await self._inner.read(paced(max_bytes), timeout)
+
+    async def write(self, buffer: bytes, timeout: float | None = None) -> None:
+        await self._inner.write(buffer, timeout)
+
+    async def aclose(self) -> None:
+        await self._inner.aclose()
+
+    async def start_tls(
+        self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
+    ) -> AsyncStream:
+        return AsyncStream(await self._inner.start_tls(ssl_context, server_hostname, timeout))
+
+    def get_extra_info(self, info: str) -> Any:
+        return self._inner.get_extra_info(info)
+
+
+class AsyncNetwork(httpcore.AnyIOBackend):
+    async def connect_tcp(self, *args: Any, **options: Any) -> AsyncStream:
+        return AsyncStream(await super().connect_tcp(*args, **options))
+
+
+class Transport(httpx.HTTPTransport):
+    """httpx's own transport with the network above; an HTTP proxy of the environment is used."""
+
+    def __init__(self, url: httpx.URL) -> None:
+        super().__init__()
+        _check(self)
+        proxy: dict[str, Any] = _proxy(url)
+        pool = httpcore.HTTPProxy if proxy else httpcore.ConnectionPool
+        self._pool = pool(**proxy, ssl_context=httpx.create_ssl_context(), network_backend=Network())
+
+
+class AsyncTransport(httpx.AsyncHTTPTransport):
+    def __init__(self, url: httpx.URL) -> None:
+        super().__init__()
+        _check(self)
+        proxy: dict[str, Any] = _proxy(url)
+        pool = httpcore.AsyncHTTPProxy if proxy else httpcore.AsyncConnectionPool
+        self._pool = pool(**proxy, ssl_context=httpx.create_ssl_context(), network_backend=AsyncNetwork())
+
+
+def _check(transport: httpx.HTTPTransport | httpx.AsyncHTTPTransport) -> None:
+    """httpx takes a network only with a pool, which it keeps there."""
+    if "_pool" not in vars(transport):
+        raise RuntimeError(f"httpx {httpx.__version__} cannot be given a network; expected 0.27 or 0.28")
+
+
+def _proxy(url: httpx.URL) -> dict[str, Any]:
+    """What httpcore's proxies want to know, where the environment names one for this address."""
+    proxies = getproxies()
+    named = proxies.get(url.scheme) or proxies.get("all")
+    if not named or proxy_bypass(url.host):
+        return {}
+    proxy = httpx.Proxy(named if "://" in named else f"http://{named}")
+    at = proxy.url
+    place = httpcore.URL(scheme=at.raw_scheme, host=at.raw_host, port=at.port, target=b"/")
+    return {"proxy_url": place, "proxy_auth": proxy.raw_auth}
