@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ class Apartment:
     """walls: centre lines (x0, y0, x1, y1); doors: the stretches of them that are open, likewise.
 
     rooms, furniture: boxes. targets: what the robot may be sent to find, each at (x, y) in free space.
+    variants: cases that differ in their formula alone, by name.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Apartment:
     targets: Mapping[str, tuple[float, float]]
     formula: str
     instruction: str
+    variants: Mapping[str, str] = field(default_factory=dict)
 
 
 CASE1 = Apartment(
@@ -134,6 +136,10 @@ CASE2 = Apartment(
     targets={"pan": (8.0, 4.9)},
     formula="F[0,50] Region1 and F[50,100] Region2 and F[100,150] Region3 and G[0,150] not Forbidden",
     instruction="find a pan",
+    variants={
+        "case2b": "F[0,50] Region1 and F[50,100] Region2 and F[100,150] Region3"
+        " and G[0,150] not touches(Forbidden)"  # no part of the body, not the origin alone
+    },
 )
 
 APARTMENTS = {apartment.name: apartment for apartment in (CASE1, CASE2)}
@@ -178,6 +184,7 @@ def files(apartment: Apartment) -> dict[str, bytes]:
         "targets": {name: list(point) for name, point in apartment.targets.items()},
         "formula": apartment.formula,
         "instruction": apartment.instruction,
+        **({"variants": apartment.variants} if apartment.variants else {}),
     }
     return {
         f"{apartment.name}.yaml": metadata.encode(),

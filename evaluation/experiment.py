@@ -23,7 +23,7 @@ from specshield.robot.dynamics import Body, make_body
 from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
 from specshield.shipped import MODELS
-from specshield.sim.cases import Case, case_name, load_case, shipped
+from specshield.sim.cases import Case, case_name, case_names, load_case, shipped
 from specshield.sim.learned.model import FOLDER, WEIGHTS, read
 from specshield.sim.model import FoundationModel
 from specshield.task import Task
@@ -161,8 +161,9 @@ def experiments(case: str, house: str | None, model: str, noise: str, seed: int)
 
 
 def available(case: str) -> list[str]:
-    """The methods that a case has what they need for: `paper` needs a DQN, and houses have none."""
-    return [name for name in METHODS if name != "paper" or case != "house"]
+    """The methods that a case has what they need for: `paper` needs a DQN, which only case1 and case2 have."""
+    learned = case_name(case) in case_names()
+    return [name for name in METHODS if name != "paper" or learned]
 
 
 def split(method: str) -> tuple[str, float, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -40,6 +41,33 @@ def test_samples_of_a_trajectory():
     }
     # min(max A, min(1 - theta over 0..2), max load - 0.5 over 0..1) = min(0.5, 1 - pi, 0.4)
     assert robustness(task_of().formula, samples) == pytest.approx(1 - math.pi)
+
+
+def test_a_rule_may_be_about_the_body_instead_of_its_origin():
+    formula = "F[0,3] inside(A) and G[0,2] not touches(Door)"
+    task = task_of(formula, robot=CART, rooms={"Door": Circle((2.0, 2.0), 0.5)}, signals={})
+    assert sorted(task.regions) == ["A", "Door"]
+    # The disc about A has a radius of 0.5 m and the cart one of 0.2: inside up to 0.3 m from A's centre.
+    samples = task.samples(np.array([[1.0, 1.0, 0.5], [1.4, 1.0, 0.5], [1.7, 1.0, 0.5]]))
+    np.testing.assert_allclose(samples["inside(A)"], [0.3, -0.1, -0.4])
+    np.testing.assert_allclose(samples["touches(Door)"][0], 0.7 - math.sqrt(2))
+    # The Stretch's body lies 0.109 m behind its origin, so that it matters where the robot looks.
+    ahead, back = task_of("F[0,1] touches(A)", signals={}).samples([[0.3, 1.0, 0.0], [0.3, 1.0, math.pi]])[
+        "touches(A)"
+    ]
+    assert (ahead, back) == pytest.approx((0.5 - 0.809 + 0.1855, 0.5 - 0.591 + 0.1855))
+
+
+def test_a_body_lies_to_regions_alone():
+    for formula, said in (
+        ("F[0,3] touches(load)", "'load' is not a region"),
+        ("F[0,3] inside(x)", "'x' is not a region"),
+        ("F[0,3] inside(Nowhere)", "nothing declares 'Nowhere'"),
+        ("F[0,3] inside()", "expected the name of a region after 'inside('"),
+        ("F[0,3] near(A)", "nothing declares 'near'"),
+    ):
+        with pytest.raises(FormulaError, match=re.escape(said)):
+            task_of(formula)
 
 
 def test_only_what_the_formula_names_is_kept_and_the_specs_own_comes_first():

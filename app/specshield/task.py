@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Floats
 from specshield.errors import FormulaError, InputError, MapError, SampleError
 from specshield.robot import Robot, robot_to_json
-from specshield.stl import Formula, is_name, parse
+from specshield.stl import BODY_WORDS, Formula, body_name, is_name, parse, region_named
 from specshield.world.occupancy import OccupancyGrid
-from specshield.world.regions import Region, region_from_json, region_to_json, signed_distance
+from specshield.world.regions import Area, Region, area_distance, region_from_json, region_to_json
 
 POSE_NAMES = ("x", "y", "theta")
 MAX_REGIONS = 256  # of one spec
@@ -45,6 +45,22 @@ class Task:
         return self.formula.horizon
 
     @cached_property
+    def areas(self) -> Mapping[str, Area]:
+        """What the formula reads of the regions, by the name that it reads it by: `R`, `touches(R)` or
+        `inside(R)`. Plain `R` is measured at the robot's origin, as in the paper, the others at the centre of
+        its round footprint.
+        """
+        found: dict[str, Area] = {}
+        for name in self.formula.names:
+            how, region = region_named(name)
+            if how is None and name in self.regions:
+                found[name] = Area(self.regions[name])
+            elif how is not None:
+                grown = self.robot.radius if how == "touches" else -self.robot.radius
+                found[name] = Area(self.regions[region], grown, self.robot.offset)
+        return found
+
+    @cached_property
     def content_hash(self) -> str:
         """sha256 of everything that decides what the task means, as hex."""
         content = {
@@ -65,8 +81,8 @@ class Task:
         array = np.asarray(poses, dtype=np.float64)
         result: dict[str, Floats] = {}
         for name in self.formula.names:
-            if name in self.regions:
-                result[name] = signed_distance(self.regions[name], array[..., :2])
+            if name in self.areas:
+                result[name] = area_distance(self.areas[name], array)
             elif name in POSE_NAMES:
                 result[name] = array[..., POSE_NAMES.index(name)]
             else:
@@ -112,7 +128,7 @@ def make_task(
     declared = parse_regions(regions or {})
     initial = parse_signals(signals or {}, declared)
     known = {name: room for name, room in (rooms or {}).items() if name not in initial} | declared
-    tree = parse(formula, names=[*known, *POSE_NAMES, *initial], max_horizon=max_horizon)
+    tree = parse(formula, names=names_for(known, initial), max_horizon=max_horizon)
     if tree.horizon < 1:
         raise FormulaError(
             "the formula says nothing of any step after the first",
@@ -120,8 +136,16 @@ def make_task(
             got=formula,
             expected="a horizon of at least 1",
         )
-    used = {name: known[name] for name in tree.names if name in known}
+    named = [region_named(name)[1] for name in tree.names]
+    used = {name: known[name] for name in named if name in known}
     return Task(grid, robot, tree, used, {name: initial[name] for name in tree.names if name in initial})
+
+
+def names_for(regions: Iterable[str], signals: Iterable[str]) -> list[str]:
+    """Every name that a formula may use where these regions and signals are declared."""
+    areas = list(regions)
+    bodies = [body_name(how, region) for region in areas for how in BODY_WORDS]
+    return [*areas, *bodies, *POSE_NAMES, *signals]
 
 
 def parse_regions(regions: Mapping[str, Any]) -> dict[str, Region]:

@@ -7,11 +7,13 @@ from hypothesis import strategies as st
 
 from specshield.errors import MapError
 from specshield.world.regions import (
+    Area,
     Circle,
     Polygon,
     Rectangle,
     Union,
-    pack_regions,
+    area_distance,
+    pack_areas,
     region_distance,
     region_from_json,
     region_to_json,
@@ -94,9 +96,30 @@ def test_moving_by_d_changes_the_distance_by_at_most_d(region, point, angle, d):
 @settings(deadline=None)  # numba compiles on the first call
 @given(st.lists(REGION, min_size=1, max_size=4), POINT)
 def test_packed_regions_give_the_very_same_numbers(regions, point):
-    packed = pack_regions(regions)
+    packed = pack_areas([Area(region) for region in regions])
     for i, region in enumerate(regions):
-        assert region_distance(packed, i, *point) == signed_distance(region, point)
+        assert region_distance(packed, i, *point, 0.3) == signed_distance(region, point)
+
+
+FOOTPRINT = 0.01 * np.stack(np.meshgrid(np.arange(-100, 101), np.arange(-100, 101)), axis=-1).reshape(-1, 2)
+DISC = FOOTPRINT[np.hypot(*FOOTPRINT.T) <= 1.0]  # points of the unit disc, at most 0.01 apart on either axis
+
+
+@settings(deadline=None)  # numba compiles on the first call
+@given(SIMPLE, POINT, st.floats(-3, 3), st.floats(0.1, 2.0), st.tuples(st.floats(-1, 1), st.floats(-1, 1)))
+def test_a_body_against_the_points_of_its_footprint(region, point, theta, radius, offset):
+    """Each point of the footprint by itself says whether the body touches the region, or lies inside it."""
+    x, y = point
+    c, s = math.cos(theta), math.sin(theta)
+    centre = np.array([x + c * offset[0] - s * offset[1], y + s * offset[0] + c * offset[1]])
+    rim = np.array([[math.cos(a), math.sin(a)] for a in np.linspace(0, 2 * math.pi, 1000)])
+    depths = signed_distance(region, centre + radius * np.concatenate([DISC, rim]))
+    touches, inside = (
+        float(area_distance(Area(region, grown, offset), (x, y, theta))) for grown in (radius, -radius)
+    )
+    near = 0.02 * radius  # how far the footprint's points lie from one another
+    assert (touches > 0) == (depths.max() > 0) or abs(touches) <= near
+    assert (inside > 0) == (depths.min() > 0) or abs(inside) <= near
 
 
 @settings(deadline=None)  # numba compiles on the first call

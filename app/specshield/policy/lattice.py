@@ -255,6 +255,7 @@ def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
     out = np.zeros((rules.kind.shape[0], ny, nx, headings), np.uint8)
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
     turns_matter = np.any((rules.programs.ops == VALUE) & (rules.programs.args == HEADING))
+    turns_matter = turns_matter or np.any(rules.regions.point != 0.0)
     for j in range(ny):
         for i in range(nx):
             fresh = True

@@ -1,6 +1,6 @@
 """What a formula's predicates read at one state, as one array: the pose, the regions, the signals.
 
-`values` holds x, y [m] and theta [rad], then the signed distance to each of the task's R regions [m], then
+`values` holds x, y [m] and theta [rad], then what the task reads of each of its R areas [m], then
 each of its S signals. Programs (stl/program.py) name what they read by its place in this array. Everything
 that evaluates predicates fills it here, so that the places mean the same to all.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.compiled import inlined
 from specshield.task import POSE_NAMES, Task
-from specshield.world.regions import PackedRegions, pack_regions, region_distance
+from specshield.world.regions import PackedRegions, pack_areas, region_distance
 
 HEADING = POSE_NAMES.index("theta")
 REGIONS = len(POSE_NAMES)  # the place of the first region
@@ -20,12 +20,12 @@ REGIONS = len(POSE_NAMES)  # the place of the first region
 
 def places(task: Task) -> dict[str, int]:
     """The place of every name that the task's formula may use."""
-    return {name: i for i, name in enumerate([*POSE_NAMES, *task.regions, *task.signals])}
+    return {name: i for i, name in enumerate([*POSE_NAMES, *task.areas, *task.signals])}
 
 
 def regions_of(task: Task) -> PackedRegions:
-    """The task's regions in the order of their places."""
-    return pack_regions(list(task.regions.values()))
+    """The task's areas in the order of their places."""
+    return pack_areas(list(task.areas.values()))
 
 
 def initial_signals(task: Task) -> Floats:
@@ -44,9 +44,9 @@ def fill_pose(x: float, y: float, theta: float, values: Floats) -> None:
 
 
 @inlined
-def fill_region(regions: PackedRegions, r: int, x: float, y: float, values: Floats) -> None:
-    """The signed distance of (x, y) to region r. Formulas often need only some: regions cost the most."""
-    values[REGIONS + r] = region_distance(regions, r, x, y)
+def fill_region(regions: PackedRegions, r: int, x: float, y: float, theta: float, values: Floats) -> None:
+    """What is read of area r at a pose. Formulas often need only some: they cost the most."""
+    values[REGIONS + r] = region_distance(regions, r, x, y, theta)
 
 
 @inlined
@@ -54,7 +54,7 @@ def fill_place(regions: PackedRegions, x: float, y: float, theta: float, values:
     """The pose and every region; the signals are left as they are."""
     fill_pose(x, y, theta, values)
     for r in range(region_count(regions)):
-        fill_region(regions, r, x, y, values)
+        fill_region(regions, r, x, y, theta, values)
 
 
 @inlined

@@ -16,7 +16,7 @@ from specshield.stl import Always, And, Formula, Node, Until
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
 from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_bounds, tree_value
 from specshield.task import Task
-from specshield.world.regions import PackedRegions
+from specshield.world.regions import PackedRegions, turns_with_robot
 
 
 class View(NamedTuple):
@@ -36,7 +36,7 @@ class View(NamedTuple):
 @lru_cache(maxsize=256)
 def view_of(task: Task, formula: Formula) -> View:
     """The formula, or a part of it, prepared once."""
-    names = list(task.regions)
+    names = list(task.areas)
     tree = compile_tree(formula, places(task))
     first, last = np.full(len(names), np.iinfo(np.int64).max), np.full(len(names), -1)
     programs = tree.programs
@@ -89,14 +89,16 @@ def read_step(
     tree, regions, held = view.tree, view.first.shape[0], signals.shape[0] - 1
     t, x, y, theta = start + k, poses[k, 0], poses[k, 1], poses[k, 2]
     placed = k > 0 and x == poses[k - 1, 0] and y == poses[k - 1, 1]
-    same = placed and theta == poses[k - 1, 2] and k > held
+    still = placed and theta == poses[k - 1, 2]
+    same = still and k > held
     if not same:
         fill_pose(x, y, theta, values)
         for s in range(signals.shape[1]):
             values[REGIONS + regions + s] = signals[min(k, held), s]
     for r in range(regions):
-        if view.first[r] <= t <= view.last[r] and not (placed and t > view.first[r]):
-            fill_region(view.regions, r, x, y, values)
+        known = still if turns_with_robot(view.regions, r) else placed
+        if view.first[r] <= t <= view.last[r] and not (known and t > view.first[r]):
+            fill_region(view.regions, r, x, y, theta, values)
     least = np.inf
     for n in range(tree.leaf_at.shape[0]):
         if tree.leaf_start[n] <= t < tree.leaf_stop[n]:

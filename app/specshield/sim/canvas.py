@@ -13,7 +13,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from specshield.arrays import Bools, Singles
 from specshield.sim.robot import Pose
-from specshield.stl import Formula, Implies, Not
+from specshield.stl import BODY_WORDS, Formula, Implies, Not, body_name
 from specshield.task import Task
 from specshield.world.regions import signed_distance
 
@@ -54,7 +54,7 @@ class Canvas:
         """Every region of the task with its name in letters of `size` below it."""
         bad = avoided(self.task.formula)
         for name, region in self.task.regions.items():
-            color = AVOID if name in bad else VISIT
+            color = AVOID if bad & {name, *(body_name(how, name) for how in BODY_WORDS)} else VISIT
             coarse = signed_distance(region, self._points).astype(np.float32)
             depth = self._refined(coarse, Image.Resampling.BILINEAR)
             self._paint(depth > 0.0, color, TINT)
@@ -74,6 +74,16 @@ class Canvas:
         u, v = self._at(point)
         r = radius * FINE
         self._pen.ellipse((u - r, v - r, u + r, v + r), fill=fill, outline=edge, width=round(1.5 * FINE))
+
+    def footprints(self, poses: Sequence[Sequence[float]], color: str) -> None:
+        """The outline of the footprint at each pose, for rules that are about the body."""
+        robot = self.task.robot
+        for x, y, theta in poses:
+            c, s = np.cos(theta), np.sin(theta)
+            ahead, left = robot.offset
+            u, v = self._at((x + c * ahead - s * left, y + s * ahead + c * left))
+            r = robot.radius * self._scale * FINE
+            self._pen.ellipse((u - r, v - r, u + r, v + r), outline=color, width=FINE)
 
     def start(self, pose: Pose) -> None:
         """A triangle that points where the robot looks."""

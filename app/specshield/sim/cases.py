@@ -75,13 +75,23 @@ def shipped(case: Case, method: str) -> Proposer:
 
 
 def case_name(said: str) -> str:
-    """Of a case that may be called by its number: 1 is case1."""
-    return f"case{said}" if said.isdigit() else said
+    """Of a case that may be called by its number: 1 is case1, 2b is case2b."""
+    return f"case{said}" if said[:1].isdigit() else said
+
+
+def variants(folder: Path = MAPS) -> dict[str, str]:
+    """Cases that differ from one of `case_names` in their rule alone, each with the name of that one."""
+    return {
+        variant: name
+        for name in case_names(folder)
+        for variant in json.loads((folder / f"{name}.regions.json").read_text()).get("variants", {})
+    }
 
 
 def load_case(name: str, folder: Path = MAPS) -> Case:
-    """The case of that name, or number, in `folder`. Raises NotFound."""
-    name, names = case_name(name), case_names(folder)
+    """The case of that name or number, such as case2 or 2b, in `folder`. Raises NotFound."""
+    asked, others = case_name(name), variants(folder)
+    name, names = others.get(asked, asked), [*case_names(folder), *others]
     if name not in names:
         raise NotFound(
             f"there is no case {name!r} in {folder}",
@@ -92,7 +102,8 @@ def load_case(name: str, folder: Path = MAPS) -> Case:
     grid = load_map((folder / f"{name}.yaml").read_text(), (folder / f"{name}.pgm").read_bytes())
     beside = json.loads((folder / f"{name}.regions.json").read_text())
     rooms = {room: region_from_json(spec, f"rooms.{room}") for room, spec in beside["rooms"].items()}
-    spec = {"formula": beside["formula"], "regions": beside["regions"]}
+    formula = beside["formula"] if asked == name else beside["variants"][asked]
+    spec = {"formula": formula, "regions": beside["regions"]}
     task = make_task(grid, STRETCH, spec["formula"], spec["regions"], rooms)
     target = next(tuple(point) for name, point in beside["targets"].items() if name in beside["instruction"])
-    return Case(name, task, rooms, spec, beside["instruction"], target)
+    return Case(asked, task, rooms, spec, beside["instruction"], target)

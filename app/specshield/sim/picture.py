@@ -11,7 +11,7 @@ from specshield.sim import canvas
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode
 from specshield.sim.robot import Pose
-from specshield.stl import SATISFIED_ABOVE, obligations, robustness
+from specshield.stl import SATISFIED_ABOVE, obligations, region_named, robustness
 from specshield.world.regions import signed_distance
 
 SCALE = 110  # pixels a metre
@@ -25,6 +25,8 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
     plan.walls()
     _rooms(plan, case)
     plan.regions(13)
+    if any(region_named(name)[0] for name in case.task.formula.names):  # the rule is about the body
+        plan.footprints(shielded.poses[: case.task.horizon + 1], SHIELDED)
     plan.way(unshielded.poses, UNSHIELDED, 2.2)
     plan.way(shielded.poses, SHIELDED, 3.0)
     for t, pose in _visits(case, shielded.poses):

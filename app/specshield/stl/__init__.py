@@ -1,6 +1,7 @@
 """Signal Temporal Logic over discrete time: text, robustness, bounds on prefixes, the synthesis fragment."""
 
 from specshield.stl.formula import (
+    BODY_WORDS,
     Abs,
     Always,
     And,
@@ -18,13 +19,16 @@ from specshield.stl.formula import (
     Or,
     Term,
     Until,
+    body_name,
     is_name,
+    region_named,
 )
 from specshield.stl.fragment import Obligation, conjuncts, obligations
 from specshield.stl.parser import parse
 from specshield.stl.robustness import SATISFIED_ABOVE, Verdict, robustness, robustness_bounds, verdict
 
 __all__ = [
+    "BODY_WORDS",
     "SATISFIED_ABOVE",
     "Abs",
     "Always",
@@ -45,10 +49,12 @@ __all__ = [
     "Term",
     "Until",
     "Verdict",
+    "body_name",
     "conjuncts",
     "is_name",
     "obligations",
     "parse",
+    "region_named",
     "robustness",
     "robustness_bounds",
     "verdict",

@@ -16,6 +16,7 @@ from typing import Any, Literal
 from specshield.errors import FormulaError
 
 KEYWORDS = frozenset({"F", "G", "U", "not", "always", "eventually", "until", "and", "or", "implies", "abs"})
+BODY_WORDS = ("touches", "inside")  # touches(R): some part of the footprint is in R; inside(R): all of it is
 MAX_BOUND = 100_000  # steps; bounds the memory that a formula's samples take where no horizon limit is set
 
 # How tightly each kind of expression binds. An operand that binds less tightly than its place asks is printed
@@ -28,6 +29,17 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 def is_name(text: str) -> bool:
     """Whether `text` can be a name in a formula: letters, digits and _, no digit in front, no keyword."""
     return _NAME.fullmatch(text) is not None and text not in KEYWORDS
+
+
+def body_name(how: str, region: str) -> str:
+    """The name under which a formula reads how the footprint lies to a region: `touches(Dock)`."""
+    return f"{how}({region})"
+
+
+def region_named(name: str) -> tuple[str | None, str]:
+    """What a name asks of a region: `touches`, `inside` or None for the robot's origin, and the region."""
+    how, opened, rest = name.partition("(")
+    return (how, rest[:-1]) if opened else (None, name)
 
 
 @dataclass(frozen=True)
@@ -83,7 +95,8 @@ class Number(Term):
 
 @dataclass(frozen=True)
 class Name(Term):
-    """The sampled value of a name: a region's signed distance, a coordinate, a signal."""
+    """The sampled value of a name: a region's signed distance, `touches` or `inside` of a region, a
+    coordinate, a signal."""
 
     name: str
 
@@ -264,7 +277,8 @@ def _check_window(a: Any, b: Any) -> None:
 
 
 def _check_name(name: str) -> None:
-    if not is_name(name):
+    how, region = region_named(name)
+    if not (is_name(region) and (how is None or (how in BODY_WORDS and name == body_name(how, region)))):
         expected = "letters, digits and _, not starting with a digit, and not a keyword"
         problem = f"{name!r} cannot be a name in a formula; expected {expected}"
         raise FormulaError(problem, got=name, expected=expected)

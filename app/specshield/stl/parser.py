@@ -15,6 +15,7 @@
     product    = factor { ("*" | "/") factor }
     factor     = "-" factor | number | name | "abs" "(" sum ")" | "(" sum ")"
     window     = "[" bound ("," | ":") bound "]"                   whole steps, 0 <= a <= b
+               | ("touches" | "inside") "(" name ")"              how the robot's footprint lies to a region
     name       = letter or "_", then letters, digits, "_"; not a keyword
 
 So `F[0,3] a and b` is `(F[0,3] a) and b`, and `not a > 0` is `not (a > 0)`. `-3` is one number.
@@ -32,6 +33,7 @@ from typing import Any, TypeVar
 from specshield.errors import FormulaError, HorizonError
 from specshield.stl.formula import (
     AND,
+    BODY_WORDS,
     COMPARISON,
     IMPLIES,
     KEYWORDS,
@@ -59,6 +61,7 @@ from specshield.stl.formula import (
     Or,
     Term,
     Until,
+    body_name,
 )
 from specshield.stl.tokens import Token, tokens
 
@@ -219,13 +222,26 @@ class _Parser:
         return Number(value)
 
     def _name(self, token: Token) -> Name:
+        if self._token.kind == "(" and token.text in BODY_WORDS:
+            return self._body_name(token)
         if self._names is not None and token.text not in self._names:
-            known = sorted(self._names)
+            known = sorted(name for name in self._names if "(" not in name)
             more = f" and {len(known) - 20} more" if len(known) > 20 else ""
             expected = f"one of {', '.join(known[:20])}{more}" if known else "no names at all"
             expected += _lower_case(token.text)
             raise self._error(f"nothing declares '{_clip(token.text)}'", token, expected)
         return Name(token.text)
+
+    def _body_name(self, word: Token) -> Name:
+        """`touches(R)` or `inside(R)`: `names` holds them for every region."""
+        self._next()
+        region = self._take("name", f"the name of a region after '{word.text}('")
+        found = self._name(region).name
+        self._take(")", f"')' after the region of '{word.text}'")
+        name = body_name(word.text, found)
+        if self._names is not None and name not in self._names:
+            raise self._error(f"'{_clip(found)}' is not a region", region, "a region or a room of the map")
+        return Name(name)
 
     def _window(self, operator: Token) -> tuple[int, int]:
         opening = self._take("[", f"a window such as [0,10]: '{operator.text}' has to be bounded")

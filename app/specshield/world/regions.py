@@ -96,34 +96,57 @@ Region = Circle | Rectangle | Polygon | Union
 def signed_distance(region: Region, points: ArrayLike) -> Floats:
     """Metres to the region's boundary, positive inside. points [..., 2] in the map frame, result [...]."""
     array = np.asarray(points, dtype=np.float64)
-    flat = np.ascontiguousarray(array.reshape(-1, 2))
-    result: Floats = _distances(_packed(region), flat).reshape(array.shape[:-1])
+    return area_distance(Area(region), np.concatenate([array, np.zeros((*array.shape[:-1], 1))], axis=-1))
+
+
+def area_distance(area: Area, poses: ArrayLike) -> Floats:
+    """What a formula reads of a region at poses [..., 3] of the robot, in metres: shape [...]."""
+    array = np.asarray(poses, dtype=np.float64)
+    flat = np.ascontiguousarray(array.reshape(-1, 3))
+    result: Floats = _distances(_packed(area), flat).reshape(array.shape[:-1])
     return result
 
 
+@dataclass(frozen=True)
+class Area:
+    """What a formula reads of a region: the signed distance of a point that the robot carries, plus `grown`.
+
+    point: metres ahead and to the left of the robot's origin. With the centre of a round footprint and its
+    radius, a positive sum says that the footprint touches the region; with minus its radius, that the
+    footprint lies inside it.
+    """
+
+    region: Region
+    grown: float = 0.0
+    point: Point = (0.0, 0.0)
+
+
 class PackedRegions(NamedTuple):
-    """Regions as flat arrays for compiled code.
+    """Areas as flat arrays for compiled code.
 
     starts: int64[regions + 1], region i has the parts starts[i]:starts[i + 1].
     kinds: int64[parts], CIRCLE, RECTANGLE or POLYGON.
     offsets: int64[parts + 1], part p has the numbers data[offsets[p]:offsets[p + 1]].
     data: float64, in metres: circle x, y, radius; rectangle xmin, ymin, xmax, ymax; polygon x, y, x, y, ...
+    grown [regions], point [regions, 2]: as in `Area`, in metres.
     """
 
     starts: Ints
     kinds: Ints
     offsets: Ints
     data: Floats
+    grown: Floats
+    point: Floats
 
 
 @lru_cache(maxsize=1024)
-def _packed(region: Region) -> PackedRegions:
-    return pack_regions([region])
+def _packed(area: Area) -> PackedRegions:
+    return pack_areas([area])
 
 
-def pack_regions(regions: Sequence[Region]) -> PackedRegions:
+def pack_areas(areas: Sequence[Area]) -> PackedRegions:
     starts, kinds, offsets, data = [0], [], [0], list[float]()
-    for region in regions:
+    for region in (area.region for area in areas):
         for part in region.members if isinstance(region, Union) else (region,):
             if isinstance(part, Circle):
                 kinds.append(CIRCLE)
@@ -141,13 +164,24 @@ def pack_regions(regions: Sequence[Region]) -> PackedRegions:
         np.array(kinds, dtype=np.int64),
         np.array(offsets, dtype=np.int64),
         np.array(data, dtype=np.float64),
+        np.array([area.grown for area in areas], dtype=np.float64),
+        np.array([area.point for area in areas], dtype=np.float64).reshape(-1, 2),
     )
 
 
 @inlined
-def region_distance(regions: PackedRegions, i: int, x: float, y: float) -> float:
-    """Signed distance of the point (x, y) to packed region i, metres, positive inside."""
+def turns_with_robot(regions: PackedRegions, i: int) -> bool:
+    """Whether what is read of packed region i depends on the robot's heading."""
+    return bool(regions.point[i, 0] != 0.0 or regions.point[i, 1] != 0.0)
+
+
+@inlined
+def region_distance(regions: PackedRegions, i: int, x: float, y: float, theta: float) -> float:
+    """What a formula reads of packed region i at a pose of the robot (`Area`), in metres."""
     data, best = regions.data, -np.inf
+    if turns_with_robot(regions, i):
+        ahead, left, cos, sin = regions.point[i, 0], regions.point[i, 1], math.cos(theta), math.sin(theta)
+        x, y = x + ahead * cos - left * sin, y + ahead * sin + left * cos
     for part in range(regions.starts[i], regions.starts[i + 1]):
         begin, end, kind = regions.offsets[part], regions.offsets[part + 1], regions.kinds[part]
         if kind == CIRCLE:
@@ -159,7 +193,7 @@ def region_distance(regions: PackedRegions, i: int, x: float, y: float) -> float
         else:
             d = _polygon_distance(data, begin, end, x, y)
         best = max(best, d)
-    return best
+    return best + regions.grown[i] if regions.grown[i] != 0.0 else best
 
 
 @leaf
@@ -182,10 +216,10 @@ def _polygon_distance(data: Floats, begin: int, end: int, x: float, y: float) ->
 
 
 @kernel
-def _distances(regions: PackedRegions, points: Floats) -> Floats:
-    out = np.empty(points.shape[0])
-    for k in range(points.shape[0]):
-        out[k] = region_distance(regions, 0, points[k, 0], points[k, 1])
+def _distances(regions: PackedRegions, poses: Floats) -> Floats:
+    out = np.empty(poses.shape[0])
+    for k in range(poses.shape[0]):
+        out[k] = region_distance(regions, 0, poses[k, 0], poses[k, 1], poses[k, 2])
     return out
 
 

@@ -70,8 +70,8 @@ def make_scene(task: Task) -> Scene:
         half=(0.5 * (xmax - xmin), 0.5 * (ymax - ymin)),
         horizon=task.horizon,
         stride=max(longest_motions(body)[0], SHORTEST_STRIDE),
-        guards=np.array([r for r in range(len(task.regions)) if REGIONS + r in read], dtype=np.int64),
-        guards_turn=HEADING in read,
+        guards=np.array([r for r in range(len(task.areas)) if REGIONS + r in read], dtype=np.int64),
+        guards_turn=HEADING in read or bool(np.any(rules.regions.point != 0.0)),
         wait=task.robot.wait_motion,
     )
 

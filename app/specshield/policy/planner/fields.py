@@ -58,6 +58,7 @@ def values_at(
     count = programs.starts.shape[0] - 1
     out = np.full((count, ny, nx, headings), -np.inf, np.float32)
     values = np.empty(REGIONS + region_count(areas) + signals.shape[0])
+    turns_matter = np.any(areas.point != 0.0)
     stack = np.empty(STACK_SIZE)
     fill_signals(areas, signals, values)
     for j in range(ny):
@@ -67,7 +68,7 @@ def values_at(
                 if not lattice.valid[j, i, h]:
                     continue
                 x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
-                if fresh:  # regions do not turn with the robot
+                if fresh or turns_matter:  # most areas do not turn with the robot
                     fill_place(areas, x, y, theta, values)
                     fresh = False
                 fill_pose(x, y, theta, values)

@@ -248,7 +248,7 @@ def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> 
     """
     size = packed.formula.tree.size
     bounds = make_bounds(size)
-    values = np.concatenate([np.zeros(REGIONS + len(task.regions)), initial_signals(task)])
+    values = np.concatenate([np.zeros(REGIONS + len(task.areas)), initial_signals(task)])
     held = np.empty(len(packed.leaf))
     read_signals(packed, values, np.empty(STACK_SIZE), held)
     foresee(packed, -1, np.empty(size), held, bounds)

@@ -10,7 +10,7 @@ from specshield.errors import FormulaError
 from specshield.service.schemas.specs import SpecRequest, SpecResponse
 from specshield.service.state import ServerState, problems
 from specshield.stl import parse
-from specshield.task import POSE_NAMES, parse_regions, parse_signals
+from specshield.task import names_for, parse_regions, parse_signals
 
 router = APIRouter(prefix="/v1/specs", tags=["specifications"])
 
@@ -31,7 +31,7 @@ def _validate(request: SpecRequest, server: ServerState) -> SpecResponse:
     signals = parse_signals(body["signals"] or {}, regions)
     rooms = server.maps.get(request.map_id).rooms if request.map_id else {}
     declared = any(given is not None for given in (request.regions, request.signals, request.map_id))
-    names = [*regions, *rooms, *POSE_NAMES, *signals] if declared else None
+    names = names_for({**rooms, **regions}, signals) if declared else None
     try:
         formula = parse(request.formula, names=names, max_horizon=server.settings.max_horizon)
     except FormulaError as error:
