@@ -161,7 +161,7 @@ def experiments(case: str, house: str | None, model: str, noise: str, seed: int)
 
 
 def available(case: str) -> list[str]:
-    """The methods that a case has what they need for: `paper` needs a DQN, which only case1 and case2 have."""
+    """The methods that a case has what they need for: `paper` needs a DQN, which case1 and case2 have."""
     learned = case_name(case) in case_names()
     return [name for name in METHODS if name != "paper" or learned]
 
