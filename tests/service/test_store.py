@@ -16,7 +16,7 @@ import redis
 from specshield.errors import StoreError
 from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.service.storage.store import Change, Store
+from specshield.service.storage.store import Change, Record, Store
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
 from tests.serving import serving, wait_for
 
@@ -245,14 +245,17 @@ def test_an_answer_that_is_late_is_not_written_into_the_next_session_of_its_name
         change = Change(b"state", bytes(24))
         await store.create("a", b"the first", change)
         seen = await store.load("a", 0)
-        assert await store.append("a", seen.version, change)
-        assert not await store.append("a", seen.version, change)
+        assert isinstance(await store.append("a", seen.version, change), bytes)
+        assert isinstance(await store.append("a", seen.version, change), Record)
         await store.delete("a")
         await store.create("a", b"the second", change)
-        assert not await store.append("a", seen.version, Change(b"late", bytes(24)))
+        there = await store.append("a", seen.version, Change(b"late", bytes(24)))
+        assert (there.config, there.state) == (b"the second", b"state")
         new = await store.load("a", 0)
         assert (new.config, new.state) == (b"the second", b"state")
-        assert await store.append("a", new.version, change)
+        assert isinstance(await store.append("a", new.version, change), bytes)
+        await store.delete("a")
+        assert await store.append("a", new.version, change) is None
         await store.aclose()
 
     try:
@@ -283,12 +286,12 @@ def test_a_server_that_fails_says_no_more_than_that(tmp_path):
     with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
         session = begin(client)
         with redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket")) as connection:
-            connection.hset(f"specshield:{{{session['id']}}}:session", "state", "broken")
+            connection.hset(f"specshield:v2:{{{session['id']}}}:session", "state", "broken")
         response = client.get(f"/v1/sessions/{session['id']}")
         assert (response.status_code, response.json()["type"]) == (500, "internal-error")
         assert response.headers["content-type"] == "application/problem+json"
-        assert "JSONDecodeError" not in response.text
-        wait_for(lambda: "JSONDecodeError" in server.log.read_text(), 5.0)
+        assert "ValidationError" not in response.text
+        wait_for(lambda: "ValidationError" in server.log.read_text(), 5.0)
         assert client.get("/readyz").status_code == 200
 
 

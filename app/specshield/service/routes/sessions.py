@@ -9,6 +9,7 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from specshield.service import examples, metrics
+from specshield.service.schemas.answers import to_json
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse
 from specshield.service.schemas.steps import (
@@ -97,12 +98,12 @@ async def step(session_id: SessionId, body: StepRequest, request: Request, serve
     for byte, so a lost answer can be asked for again. Nothing is stored on an error.
     """
     timing = request.scope["state"]["timing"]
-    answer, mode = await server.sessions.step(session_id, body, timing)
+    answer, mode = await server.sessions.steps.decide(session_id, body, timing)
     if mode is not None:
         metrics.decisions.labels(mode).inc()
         for part, seconds in timing.items():
             metrics.part_seconds.labels(part).observe(seconds)
-    return Response(answer, media_type="application/json")
+    return Response(to_json(answer), media_type="application/json")
 
 
 @router.post(

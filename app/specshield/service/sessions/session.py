@@ -2,58 +2,46 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import InputError, SessionFinished, StepConflict
+from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
 from specshield.service.library import files
+from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.schemas.steps import StepRequest
-from specshield.service.sessions import history
-from specshield.service.storage.store import Record
-from specshield.shield.decision import Decision
+from specshield.service.sessions import history, record
+from specshield.service.sessions.state import State
+from specshield.service.storage.store import Dump, Record
 
-DIGEST = 32  # bytes that stand before each stored answer: of the request that it answers
-
-
-@dataclass(frozen=True)
-class State:
-    """What changes in a session. length: of the stored poses. next_t: the step after the last decided one."""
-
-    length: int
-    next_t: int
-    feasible: bool
-    spec_status: str
-    expires_at: float
-    main_task_done: bool = False
-    finished: bool = False
-    closed: bool = False
-    carry: Any = None
+CONFIG = ("seed", "threshold", "margin", "slack", "evaluation", "max_steps")  # what a `Shield` is set by
+RACES = 10  # writes lost to others before a caller is told so
 
 
 @dataclass(frozen=True)
 class Session:
-    """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held."""
+    """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held.
 
-    config: dict[str, Any]
+    signal_names: in alphabetical order, as in the rows.
+    """
+
+    config: Mapping[str, Any]
     state: State
     version: bytes
     rows: Floats
-    step: bytes | None
+    signal_names: list[str]
 
     @staticmethod
-    def of(record: Record) -> Session:
-        config, state = json.loads(record.config), State(**json.loads(record.state))
-        rows = np.frombuffer(record.rows, "<f8").reshape(-1, 3 + len(config["spec"]["signals"]))[
-            : state.length
-        ]
-        return Session(config, state, record.version, rows, record.step)
+    def of(stored: Record | Dump) -> Session:
+        config, state = json.loads(stored.config), State.of(stored.state)
+        names = sorted(config["spec"]["signals"])
+        rows = np.frombuffer(stored.rows, "<f8").reshape(-1, 3 + len(names))
+        return Session(config, state, stored.version, rows[: state.length], names)
 
     @property
     def id(self) -> str:
@@ -63,10 +51,6 @@ class Session:
     def poses(self) -> Floats:
         return self.rows[:, :3]
 
-    @property
-    def signal_names(self) -> list[str]:
-        return sorted(self.config["spec"]["signals"])
-
     def extended(self, t: int, poses: Floats, signals: Mapping[str, float]) -> Session:
         """The session with its history up to t; signals that are not sent hold their last value."""
         added = history.join(self.poses, t, poses)
@@ -74,6 +58,13 @@ class Session:
         for name, value in signals.items():
             rows[t, 3 + self.signal_names.index(name)] = value
         return replace(self, rows=rows)
+
+    def added(self) -> tuple[bytes, int]:
+        """The rows that a change has to write, and the byte where they begin: only what is new, and row 0
+        once more with the first step, which brings its signals.
+        """
+        first = min(self.state.length, len(self.rows) - 1)
+        return pack(self.rows[first:]), first * 8 * self.rows.shape[1]
 
     @property
     def signals(self) -> dict[str, Floats]:
@@ -117,10 +108,16 @@ def check_step(session: Session, request: StepRequest) -> None:
         )
 
 
-def replay(session: Session, request: StepRequest, digest: bytes) -> bytes:
+def replay(session: Session, step: bytes, request: StepRequest) -> StepAnswer:
     """The stored answer. Raises StepConflict where it answered another request."""
-    assert session.step is not None
-    if session.step[:DIGEST] != digest:
+    kept, row = record.decode(step), session.rows[request.t]
+    same = (
+        request.poses[-1] == kept.pose_sent(row).tolist()
+        and (request.signals or {}) == kept.signals_sent(row, session.signal_names)
+        and request.main_task_done == kept.main_task_done
+        and _equal(logits_of(request), kept.logits_sent())
+    )
+    if not same:
         raise StepConflict(
             f"step {request.t} was decided for another x_t, logits, signals or main_task_done",
             path="t",
@@ -129,38 +126,30 @@ def replay(session: Session, request: StepRequest, digest: bytes) -> bytes:
             expected_t=session.state.next_t,
         )
     history.join(session.poses, request.t, np.array(request.poses))
-    return session.step[DIGEST:]
+    return record.answer(kept, row, session.config["actions"])
 
 
-def digest_of(request: StepRequest) -> bytes:
-    """The digest of what makes two requests the same: x_t, logits, main_task_done and signals, as float64."""
-    logits = None if request.logits is None else [-math.inf if v is None else v + 0.0 for v in request.logits]
-    signals = sorted((request.signals or {}).items())
-    content = repr([[float(v) + 0.0 for v in request.poses[-1]], logits, request.main_task_done, signals])
-    return hashlib.sha256(content.encode()).digest()
+def logits_of(request: StepRequest) -> Floats | None:
+    """[A], -inf for null."""
+    if request.logits is None:
+        return None
+    return np.array([-np.inf if value is None else value for value in request.logits], np.float64)
 
 
-def encode(decision: Decision, witnesses: bool) -> bytes:
-    residual = decision.residual
-    answer = {
-        field.name: getattr(decision, field.name) for field in fields(decision) if field.name != "carry"
-    }
-    answer |= {
-        "distribution": decision.distribution.tolist(),
-        "next_poses": decision.next_poses.tolist(),
-        "residual": None if residual is None else {"translation": residual[0], "rotation": residual[1]},
-    }
-    if not witnesses:
-        del answer["witnesses"]
-    return files.to_json(answer)
+def _equal(a: Floats | None, b: Floats | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
 
 
-def lines(session: Session, steps: Mapping[int, bytes]) -> Iterator[bytes]:
-    for t, row in enumerate(session.rows.tolist()):
-        head = files.to_json(
-            {"t": t, "pose": row[:3], "signals": dict(zip(session.signal_names, row[3:], strict=True))}
-        )
-        yield head[:-1] + b',"decision":' + (steps[t][DIGEST:] if t in steps else b"null") + b"}"
+def lines(session: Session, steps: Sequence[bytes]) -> Iterator[bytes]:
+    """One JSON object a step: t, pose, signals, and the answer that was given."""
+    names = session.config["actions"]
+    for t, row in enumerate(session.rows):
+        held = row.tolist()
+        signals = dict(zip(session.signal_names, held[3:], strict=True))
+        head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals})
+        step = steps[t] if t < len(steps) else b""
+        told = to_json(record.answer(record.decode(step), row, names)) if step else b"null"
+        yield head[:-1] + b',"decision":' + told + b"}"
 
 
 def columns(rows: Floats, names: Iterable[str]) -> dict[str, Floats]:
@@ -177,4 +166,19 @@ def over(session: Session, t: int) -> SessionFinished:
         path="t",
         got=t,
         expected="a step already decided, to read it again",
+    )
+
+
+def missing(id: str) -> NotFound:
+    return NotFound(
+        f"there is no session {id!r}; it may have expired",
+        path="id",
+        got=id,
+        expected="an id from /v1/sessions",
+    )
+
+
+def contended(id: str) -> Conflict:
+    return Conflict(
+        f"several callers write to session {id!r} at once", path="id", got=id, expected="one caller a session"
     )

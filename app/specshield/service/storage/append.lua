@@ -1,17 +1,22 @@
 -- Appends to a session, or begins one: all of it or nothing, and only to the state the caller looked at.
--- KEYS: session (hash), history (string), steps (hash), all of one slot.
--- ARGV: version looked at ('' to begin), first byte to write, rows, step ('' for none), its answer, state,
+-- KEYS: session (hash), rows (string), steps (list), all of one slot.
+-- ARGV: version looked at ('' to begin), first byte to write, rows, step ('' for none), its record, state,
 --       config ('' where there is one already), time to live in ms.
--- Returns 1, or 0 where the session is no longer the one looked at.
+-- Returns the new version; where the session is no longer the one looked at, what there is instead:
+--         {config, state, version, rows, what that step left}, each false where there is none.
 if (redis.call('HGET', KEYS[1], 'version') or '') ~= ARGV[1] then
-  return 0
+  local found = redis.call('HMGET', KEYS[1], 'config', 'state', 'version')
+  found[4] = redis.call('GET', KEYS[2])
+  found[5] = ARGV[4] ~= '' and redis.call('LINDEX', KEYS[3], ARGV[4])
+  return found
 end
 -- A version tells apart two sessions of one id too: no other has this config.
 local begun, n = string.match(ARGV[1], '^(%x+):(%d+)$')
 if ARGV[1] == '' then
   begun = redis.sha1hex(ARGV[7])
 end
-redis.call('HSET', KEYS[1], 'version', (begun or '0') .. ':' .. (tonumber(n) or 0) + 1, 'state', ARGV[6])
+local version = (begun or '0') .. ':' .. (tonumber(n) or 0) + 1
+redis.call('HSET', KEYS[1], 'version', version, 'state', ARGV[6])
 if ARGV[7] ~= '' then
   redis.call('HSET', KEYS[1], 'config', ARGV[7])
 end
@@ -19,9 +24,12 @@ if ARGV[3] ~= '' then
   redis.call('SETRANGE', KEYS[2], ARGV[2], ARGV[3])
 end
 if ARGV[4] ~= '' then
-  redis.call('HSET', KEYS[3], ARGV[4], ARGV[5])
+  for _ = redis.call('LLEN', KEYS[3]) + 1, ARGV[4] do
+    redis.call('RPUSH', KEYS[3], '') -- a step that was passed over
+  end
+  redis.call('RPUSH', KEYS[3], ARGV[5])
 end
 for _, key in ipairs(KEYS) do
   redis.call('PEXPIRE', key, ARGV[8])
 end
-return 1
+return version

@@ -1,7 +1,8 @@
 """Sessions in a store of the Redis protocol. Bytes in, bytes out; what they mean is for sessions.py.
 
-A session is three keys of one slot, `specshield:{id}:session`, `:history` and `:steps`, expiring together.
-Ids are also in `specshield:sessions`, a sorted set for listing; it may name sessions that have expired.
+A session is three keys of one slot, expiring together: `specshield:v2:{id}:session`, a hash of config, state
+and version; `:rows`, its poses and signals; `:steps`, the list of what each step left, by t. Ids are also in
+`specshield:sessions`, a sorted set for listing; it may name sessions that have expired.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from specshield.errors import SessionExists, StoreError
 
 INDEX = "specshield:sessions"
 APPEND = Path(__file__).with_name("append.lua").read_text()
+DROP = """\
+if redis.call('HGET', KEYS[1], 'version') ~= ARGV[1] then return 0 end
+return redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])"""
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,19 @@ class Record:
 
 
 @dataclass(frozen=True)
+class Dump:
+    """All of a session. steps: what each step left, by t; b"" for one that was passed over."""
+
+    config: bytes
+    state: bytes
+    version: bytes
+    rows: bytes
+    steps: list[bytes]
+
+
+@dataclass(frozen=True)
 class Change:
-    """What one write adds: `rows` from byte `offset` on, the answer to step `t`, the state after it."""
+    """What one write adds: `rows` from byte `offset` on, what step `t` left, the state after it."""
 
     state: bytes
     rows: bytes = b""
@@ -62,7 +77,7 @@ class Store:
         self.redis: Any = redis.Redis(
             connection_pool=pool
         )  # redis-py's types admit str where bytes come back
-        self._append = self.redis.register_script(APPEND)
+        self._append, self._drop = self.redis.register_script(APPEND), self.redis.register_script(DROP)
         self._timeout, self._ttl = timeout, ttl
 
     async def aclose(self) -> None:
@@ -82,25 +97,29 @@ class Store:
         async with self._reaching():
             await self.redis.ping()
 
-    async def create(self, id: str, config: bytes, change: Change) -> None:
-        """Raises SessionExists. `config` has to be unlike any other, so that a retry knows its own."""
+    async def create(self, id: str, config: bytes, change: Change) -> bytes:
+        """The first version. Raises SessionExists. `config` has to be unlike any other, so that a retry knows
+        its own.
+        """
         async with self._reaching():
             begun = await self._write(id, b"", change, config)
-            if (
-                begun or await self.redis.hget(_keys(id)[0], "config") == config
-            ):  # a try whose answer was lost
+            if isinstance(begun, Record) and begun.config == config:  # a try whose answer was lost
+                begun = begun.version
+            if isinstance(begun, bytes):
                 await self.redis.zadd(INDEX, {id: 0})
-                return
+                return begun
         raise SessionExists(
             f"there is a session {id!r} already", path="id", got=id, expected="an id not in use"
         )
 
-    async def append(self, id: str, version: bytes, change: Change) -> bool:
-        """All of the change, or nothing and False where `version` is no longer the latest."""
+    async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
+        """All of the change, and the new version; or nothing where `version` is no longer the latest: then
+        the session as it is, with what step `change.t` left, or None where it is gone.
+        """
         async with self._reaching():
             return await self._write(id, version, change, b"")
 
-    async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bool:
+    async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bytes | Record | None:
         field = "" if change.t is None else change.t
         args: list[Any] = [
             version,
@@ -112,27 +131,39 @@ class Store:
             config,
             self._ttl * 1000,
         ]
-        return bool(await self._append(keys=_keys(id), args=args))
+        written = await self._append(keys=_keys(id), args=args)
+        return written if isinstance(written, bytes) else _record(*written)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """The session, with what step t left; None where there is none. One round trip."""
-        session, history, steps = _keys(id)
+        session, rows, steps = _keys(id)
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
             # In this order a write in between is harmless: rows past what the state counts are not looked at,
             # and a step that is there is the answer, whatever the state says.
             pipe.hmget(session, "config", "state", "version")
-            pipe.get(history)
+            pipe.get(rows)
             if t is not None:
-                pipe.hget(steps, t)
-            (config, state, version), rows, *step = await pipe.execute()
-        if config is None or rows is None:
-            return None
-        return Record(config, state, version, rows, step[0] if step else None)
+                pipe.lindex(steps, t)
+            (config, state, version), found, *step = await pipe.execute()
+        return _record(config, state, version, found, step[0] if step else None)
 
-    async def steps(self, id: str) -> dict[int, bytes]:
-        """What every decided step left."""
+    async def dump(self, id: str) -> Dump | None:
+        """All of a session as it is at one moment; None where there is none."""
+        session, rows, steps = _keys(id)
+        async with self._reaching(), self.redis.pipeline(transaction=True) as pipe:
+            pipe.hmget(session, "config", "state", "version")
+            pipe.get(rows)
+            pipe.lrange(steps, 0, -1)
+            (config, state, version), found, left = await pipe.execute()
+        return None if config is None or found is None else Dump(config, state, version, found, left)
+
+    async def drop(self, id: str, version: bytes) -> bool:
+        """Erase all of it if `version` is still the latest. False where it is not."""
         async with self._reaching():
-            return {int(t): step for t, step in (await self.redis.hgetall(_keys(id)[2])).items()}
+            if not await self._drop(keys=_keys(id), args=[version]):
+                return False
+            await self.redis.zrem(INDEX, id)
+        return True
 
     async def delete(self, id: str) -> bool:
         """Erase all of it. False where there was nothing."""
@@ -171,4 +202,10 @@ class Store:
 
 
 def _keys(id: str) -> list[str]:
-    return [f"specshield:{{{id}}}:{part}" for part in ("session", "history", "steps")]
+    return [f"specshield:v2:{{{id}}}:{part}" for part in ("session", "rows", "steps")]
+
+
+def _record(
+    config: bytes | None, state: bytes, version: bytes, rows: bytes | None, step: bytes | None
+) -> Record | None:
+    return None if config is None or rows is None else Record(config, state, version, rows, step or None)

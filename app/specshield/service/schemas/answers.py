@@ -1,0 +1,45 @@
+"""The answer to a step as it is written, which is what `steps.StepResponse` describes."""
+
+from __future__ import annotations
+
+import msgspec
+
+
+class Residual(msgspec.Struct, frozen=True):
+    translation: float
+    rotation: float
+
+
+class StepAnswer(msgspec.Struct, frozen=True, kw_only=True):
+    """The members in the order in which they are written; what they mean is said in `StepResponse`."""
+
+    t: int
+    mode: str
+    distribution: list[float]
+    j_values: list[float | None]
+    robustness: list[float | None]
+    action: int
+    action_name: str
+    completion_action: int | None
+    spec_status: str
+    feasible_mass: float | None
+    kl: float | None
+    reason: str | None
+    finished: bool
+    next_poses: list[list[float]]
+    residual: Residual | None
+    in_collision: bool
+    witness: list[int] | None
+    witnesses: tuple[list[int] | None, ...] | msgspec.UnsetType = msgspec.UNSET
+    warnings: tuple[str, ...]
+
+
+_json, _msgpack = msgspec.json.Encoder(), msgspec.msgpack.Encoder()
+
+
+def to_json(answer: StepAnswer) -> bytes:
+    return _json.encode(answer)
+
+
+def to_msgpack(answer: StepAnswer) -> bytes:
+    return _msgpack.encode(answer)

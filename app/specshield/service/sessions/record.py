@@ -1,0 +1,246 @@
+"""The record of a decided step: what was asked, what was answered, and the hash of what came before (pure).
+
+A record is opaque bytes to the store and the archive. With the stored row of its step (pose and signals) it
+gives the answer again, byte for byte, and what is needed to decide the step again. All numbers are float64,
+to the last bit.
+
+The records of a session are a chain. `before` is `link(SHA-256 of the previous record, rows)`, where `rows`
+are those from the step after the previous record's up to this step's; for the first record it is
+`link(SHA-256 of the config, x_0 .. x_t)`. So none of config, poses, signals and records can be changed
+afterwards without its being seen.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.service.schemas.answers import Residual, StepAnswer
+from specshield.shield.decision import Decision
+
+FORMAT = 1
+COLUMNS = 5  # of an action's row in the table: J, rho, x, y, theta
+
+
+class StepRecord(msgspec.Struct, frozen=True, array_like=True):
+    """One decided step; A actions.
+
+    format: `FORMAT`, of records of this layout. before: SHA-256, as `link` has it.
+
+    Asked: pose, x_t as it was sent, three float64, None where it is the stored one to the bit. logits: as
+    `_pack_logits` has them. signals: which of the declared names (in alphabetical order) were sent, bit i
+    for name i; their values are in the row. all_witnesses: whether one was asked for each action.
+
+    Answered: distribution, as `_sparse` has it. rows: for each action, which distinct row of the table is
+    its own. table: each distinct row's J, rho and next pose (x, y, theta), as indices into `pool`, in one
+    byte each, or two where the pool is larger. pool: float64 beside the six that `_known` lists. Actions
+    are one byte each: an action set has at most 256.
+    """
+
+    format: int
+    before: bytes
+    t: int
+    pose: bytes | None
+    logits: bytes | None
+    main_task_done: bool
+    signals: int
+    all_witnesses: bool
+    mode: str
+    distribution: bytes
+    rows: bytes
+    table: bytes
+    pool: bytes
+    action: int
+    completion_action: int | None
+    spec_status: str
+    feasible_mass: float | None
+    kl: float | None
+    reason: str | None
+    finished: bool
+    residual: tuple[float, float] | None
+    in_collision: bool
+    witness: bytes | None
+    witnesses: tuple[bytes | None, ...]
+    warnings: tuple[str, ...]
+
+    def logits_sent(self) -> Floats | None:
+        """[A], -inf where the logit was null; None where none were sent."""
+        return None if self.logits is None else _unpack_logits(self.logits, len(self.rows))
+
+    def pose_sent(self, row: Floats) -> Floats:
+        """x_t [3] as the caller sent it; row: the stored one of this step."""
+        return row[:3] if self.pose is None else np.frombuffer(self.pose, "<f8")
+
+    def signals_sent(self, row: Floats, names: Sequence[str]) -> dict[str, float]:
+        """names: those that the session declares, in alphabetical order."""
+        return {name: float(row[3 + i]) for i, name in enumerate(names) if self.signals >> i & 1}
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(StepRecord)
+
+
+def encode(record: StepRecord) -> bytes:
+    return _encoder.encode(record)
+
+
+def decode(content: bytes) -> StepRecord:
+    return _decoder.decode(content)
+
+
+def digest(content: bytes) -> bytes:
+    """SHA-256 of a record or a config."""
+    return hashlib.sha256(content).digest()
+
+
+def link(last: bytes, rows: Floats) -> bytes:
+    """SHA-256 of `last`, the digest of the previous record or of the config, and of the rows since then."""
+    return hashlib.sha256(last + rows.astype("<f8").tobytes()).digest()
+
+
+def make(
+    decision: Decision,
+    row: Floats,
+    before: bytes,
+    pose: Sequence[float],
+    logits: Floats | None,
+    main_task_done: bool,
+    signals: Mapping[str, float],
+    names: Sequence[str],
+    all_witnesses: bool,
+) -> StepRecord:
+    """The record of `decision`, made at the stored `row` for a caller who sent what follows.
+
+    logits [A], -inf for null. names: of the signals that the session declares, in alphabetical order.
+    """
+    sent = np.array(pose, "<f8").tobytes()
+    actions = np.empty((len(decision.distribution), COLUMNS))
+    actions[:, 0], actions[:, 1], actions[:, 2:] = decision.j_values, decision.robustness, decision.next_poses
+    rows, table, pool = _pack_table(actions, row)
+    return StepRecord(
+        format=FORMAT,
+        before=before,
+        t=decision.t,
+        pose=None if sent == row[:3].tobytes() else sent,
+        logits=None if logits is None else _pack_logits(logits),
+        main_task_done=main_task_done,
+        signals=sum(1 << i for i, name in enumerate(names) if name in signals),
+        all_witnesses=all_witnesses,
+        mode=decision.mode,
+        distribution=_sparse(decision.distribution),
+        rows=rows,
+        table=table,
+        pool=pool,
+        action=decision.action,
+        completion_action=decision.completion_action,
+        spec_status=decision.spec_status,
+        feasible_mass=decision.feasible_mass,
+        kl=decision.kl,
+        reason=decision.reason,
+        finished=decision.finished,
+        residual=decision.residual,
+        in_collision=decision.in_collision,
+        witness=None if decision.witness is None else bytes(decision.witness),
+        witnesses=tuple(None if w is None else bytes(w) for w in decision.witnesses),
+        warnings=decision.warnings,
+    )
+
+
+def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
+    """What the caller was answered. row: the stored one of this step; names: of the actions."""
+    table = _unpack_table(record, row)
+    asked: dict[str, tuple[list[int] | None, ...]] = {}
+    if record.all_witnesses:
+        asked["witnesses"] = tuple(None if w is None else list(w) for w in record.witnesses)
+    return StepAnswer(
+        t=record.t,
+        mode=record.mode,
+        distribution=_full(record.distribution, len(record.rows)).tolist(),
+        j_values=[None if value != value else value for value in table[:, 0].tolist()],
+        robustness=[None if value != value else value for value in table[:, 1].tolist()],
+        action=record.action,
+        action_name=names[record.action],
+        completion_action=record.completion_action,
+        spec_status=record.spec_status,
+        feasible_mass=record.feasible_mass,
+        kl=record.kl,
+        reason=record.reason,
+        finished=record.finished,
+        next_poses=table[:, 2:].tolist(),
+        residual=None if record.residual is None else Residual(*record.residual),
+        in_collision=record.in_collision,
+        witness=None if record.witness is None else list(record.witness),
+        warnings=record.warnings,
+        **asked,
+    )
+
+
+def _known(row: Floats) -> Floats:
+    """[6]: numbers that need no room of their own. Where an action does not turn, theta is that of x_t."""
+    return np.array([row[0], row[1], row[2], 0.0, 1.0, np.nan], "<f8")
+
+
+def _pack_table(actions: Floats, row: Floats) -> tuple[bytes, bytes, bytes]:
+    """`rows`, `table` and `pool` of a record. actions [A, 5]; NaN stands for null."""
+    content, width, distinct = actions.astype("<f8").tobytes(), 8 * COLUMNS, dict[bytes, int]()
+    rows = bytes(
+        distinct.setdefault(content[i : i + width], len(distinct)) for i in range(0, len(content), width)
+    )
+    known = _known(row).view("<i8").tolist()
+    place = dict(zip(reversed(known), reversed(range(len(known))), strict=True))
+    room, pool = len(known) - len(place), list[int]()
+    index: list[int] = []
+    for word in np.frombuffer(b"".join(distinct), "<i8").tolist():
+        at = place.setdefault(word, len(place) + room)
+        if at == len(known) + len(pool):
+            pool.append(word)
+        index.append(at)
+    wide = "<u1" if len(known) + len(pool) <= 256 else "<u2"
+    return rows, np.array(index, wide).tobytes(), np.array(pool, "<i8").tobytes()
+
+
+def _unpack_table(record: StepRecord, row: Floats) -> Floats:
+    """[A, 5]: J, rho, x, y, theta."""
+    words = np.concatenate([_known(row), np.frombuffer(record.pool, "<f8")])
+    wide = "<u1" if len(words) <= 256 else "<u2"
+    distinct = words[np.frombuffer(record.table, wide)].reshape(-1, COLUMNS)
+    table: Floats = distinct[np.frombuffer(record.rows, "<u1")]
+    return table
+
+
+def _sparse(values: Floats) -> bytes:
+    """float64 with the zeros left out: a bit for each value, then those whose bit is set."""
+    content = np.ascontiguousarray(values, "<f8")
+    there = content.view("<i8") != 0
+    return bytes(np.packbits(there)) + bytes(content[there])
+
+
+def _full(content: bytes, size: int) -> Floats:
+    head = (size + 7) // 8
+    there = np.unpackbits(np.frombuffer(content, np.uint8, head), count=size).view(np.bool_)
+    values = np.zeros(size)
+    values[there] = np.frombuffer(content, "<f8", offset=head)
+    return values
+
+
+def _pack_logits(logits: Floats) -> bytes:
+    """A bit for each that is finite, then those: as float32 where that loses nothing, else as float64."""
+    finite = logits != -np.inf
+    values = np.ascontiguousarray(logits[finite], "<f8")
+    with np.errstate(over="ignore"):
+        short = values.astype("<f4")
+    exact = short.astype("<f8").tobytes() == values.tobytes()
+    return np.packbits(finite).tobytes() + (short if exact else values).tobytes()
+
+
+def _unpack_logits(content: bytes, size: int) -> Floats:
+    head = (size + 7) // 8
+    finite = np.unpackbits(np.frombuffer(content, np.uint8, head), count=size).view(np.bool_)
+    values = np.full(size, -np.inf)
+    short = len(content) - head == 4 * int(finite.sum())
+    values[finite] = np.frombuffer(content, "<f4" if short else "<f8", offset=head)
+    return values

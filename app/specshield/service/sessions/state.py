@@ -1,0 +1,56 @@
+"""What changes in a session, as it is stored: MessagePack, since every step writes it."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from specshield.shield.decision import Carry
+
+
+class State(msgspec.Struct, frozen=True, array_like=True):
+    """Of a session after its last change.
+
+    length: of the stored poses. next_t: the step after the last decided one. expires_at [s since 1970]. head:
+    SHA-256 of the last step's record, of the config where none was decided. carry: as `pack_carry` has it.
+    """
+
+    length: int
+    next_t: int
+    feasible: bool
+    spec_status: str
+    expires_at: float
+    head: bytes
+    main_task_done: bool = False
+    finished: bool = False
+    closed: bool = False
+    carry: PackedCarry | None = None
+
+    @staticmethod
+    def of(content: bytes) -> State:
+        """Raises msgspec.DecodeError for what `packed` did not make."""
+        return _decoder.decode(content)
+
+    def packed(self) -> bytes:
+        return _encoder.encode(self)
+
+
+class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
+    """A `Carry` with its next poses as float64 bytes, three a motion."""
+
+    t: int
+    next_poses: bytes
+    witnesses: tuple[bytes | None, ...]
+    memory: bytes | None
+
+    def unpacked(self) -> Carry:
+        poses = np.frombuffer(self.next_poses, "<f8").reshape(-1, 3)
+        return Carry(self.t, poses, self.witnesses, self.memory)
+
+
+def pack_carry(carry: Carry) -> PackedCarry:
+    return PackedCarry(carry.t, carry.next_poses.astype("<f8").tobytes(), carry.witnesses, carry.memory)
+
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(State)

@@ -1,0 +1,115 @@
+"""Deciding steps: the session is read, the step decided and both written, all of it or nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import msgspec
+import numpy as np
+
+from specshield.service.schemas.answers import StepAnswer
+from specshield.service.schemas.steps import StepRequest
+from specshield.service.sessions import record
+from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.session import (
+    RACES,
+    Session,
+    check_step,
+    contended,
+    logits_of,
+    missing,
+    replay,
+)
+from specshield.service.sessions.shields import Shields
+from specshield.service.sessions.state import pack_carry
+from specshield.service.storage.store import Change, Store
+from specshield.shield import episode
+from specshield.shield.decision import Decision
+
+
+class Steps:
+    """Decisions run in threads (the rollouts release the interpreter); the store is awaited.
+
+    ttl: how long a session is kept after its last change [s].
+    """
+
+    def __init__(self, store: Store, shields: Shields, threads: ThreadPoolExecutor, ttl: int) -> None:
+        self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
+
+    async def decide(
+        self, id: str, request: StepRequest, timing: dict[str, float]
+    ) -> tuple[StepAnswer, str | None]:
+        """The answer, and its mode; None for a replay. `timing` collects the seconds of rollout and store."""
+        for _ in range(RACES):
+            with _clock(timing, "store"):
+                found = await self._store.load(id, request.t)
+            if found is None:
+                raise missing(id)
+            session = Session.of(found)
+            if found.step is not None:
+                return replay(session, found.step, request), None
+            check_step(session, request)
+            loop = asyncio.get_running_loop()
+            session, decision, made = await loop.run_in_executor(
+                self._threads, self._decide, session, request, timing
+            )
+            content = record.encode(made)
+            state = msgspec.structs.replace(
+                session.state,
+                length=len(session.rows),
+                next_t=len(session.rows),
+                spec_status=decision.spec_status,
+                expires_at=time.time() + self._ttl,
+                head=record.digest(content),
+                main_task_done=request.main_task_done,
+                finished=decision.finished,
+                carry=pack_carry(decision.carry),
+            )
+            change = Change(state.packed(), *session.added(), request.t, content)
+            with _clock(timing, "store"):
+                if isinstance(await self._store.append(id, session.version, change), bytes):
+                    answer = record.answer(made, session.rows[-1], session.config["actions"])
+                    return answer, decision.mode
+        raise contended(id)
+
+    def _decide(
+        self, session: Session, request: StepRequest, timing: dict[str, float]
+    ) -> tuple[Session, Decision, StepRecord]:
+        shield, signals = self._shields.of(session), request.signals or {}
+        shield.task.check_signals(signals)
+        state, logits = session.state, logits_of(request)
+        session = session.extended(request.t, np.array(request.poses, np.float64), signals)
+        carry = None if state.carry is None else state.carry.unpacked()
+        with _clock(timing, "rollout"):
+            decision = episode.decide(
+                shield,
+                session.poses,
+                logits,
+                request.main_task_done,
+                session.signals,
+                carry,
+                request.witnesses,
+            )
+        made = record.make(
+            decision,
+            session.rows[-1],
+            record.link(state.head, session.rows[state.next_t :]),
+            request.poses[-1],
+            logits,
+            request.main_task_done,
+            signals,
+            session.signal_names,
+            request.witnesses,
+        )
+        return session, decision, made
+
+
+@contextmanager
+def _clock(timing: dict[str, float], name: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    timing[name] = timing.get(name, 0.0) + time.perf_counter() - start
