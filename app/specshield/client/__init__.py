@@ -14,6 +14,7 @@ Errors are those of `specshield.errors`. Needs httpx and nothing else.
 from specshield.client.aio import AsyncSession, AsyncShieldClient
 from specshield.client.models import (
     Decision,
+    LocalDecision,
     Map,
     Policy,
     Residual,
@@ -28,6 +29,7 @@ __all__ = [
     "AsyncSession",
     "AsyncShieldClient",
     "Decision",
+    "LocalDecision",
     "Map",
     "Policy",
     "Residual",

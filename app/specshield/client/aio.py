@@ -6,19 +6,42 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Concatenate,
+    Generic,
+    Literal,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    cast,
+    overload,
+)
 
 import httpx
 
 from specshield.client import bounded, calls
+from specshield.client.away import OnFailure
 from specshield.client.core import Flow, Wait, looks_like, page_of
-from specshield.client.models import Map, Policy, SessionInfo
+from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
+from specshield.client.stream import AsyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Numbers, Reply, Request
+from specshield.client.wire import TRIES, Failure, Logits, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar as Defaulted
+    from typing_extensions import Unpack
+
+    from specshield.client.models import Beginning
+
+    D = Defaulted("D", default=Decision)
+else:
+    D = TypeVar("D")
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -37,6 +60,7 @@ class AsyncShieldClient:
         api_key: str | None = None,
         timeout: float = 0.5,
         *,
+        stream: bool = False,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
@@ -44,6 +68,7 @@ class AsyncShieldClient:
         self._http = httpx.AsyncClient(
             base_url=url, headers=headers(api_key), transport=transport or bounded.AsyncTransport(url)
         )
+        self._streams = AsyncStreams(self._http) if stream else None
         self.specs = AsyncSpecs(self._run)
         self.maps = AsyncMaps(self._run)
         self.policies = AsyncPolicies(self._run)
@@ -64,6 +89,8 @@ class AsyncShieldClient:
         await self._run(calls.wait_until_ready(timeout))
 
     async def close(self) -> None:
+        if self._streams is not None:
+            self._streams.close()
         await self._http.aclose()
 
     async def _run(self, flow: Flow[T], /) -> T:
@@ -87,6 +114,9 @@ class AsyncShieldClient:
         exchange = Exchange(request, self._http.base_url, self._timeout, ends)
         if exchange.seconds <= 0.0:
             return exchange.failure(httpx.PoolTimeout(""))
+        message = None if self._streams is None else packed(request)
+        if self._streams is not None and message is not None:
+            return await self._streams.perform(exchange, message)
         bounded.ENDS.set(exchange.ends)
         try:
             reply = await asyncio.wait_for(self._exchanged(exchange), exchange.ends - time.monotonic())
@@ -149,7 +179,12 @@ def opening(
     @looks_like(flow)
     async def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> AsyncSession:
         info = await self._run(flow(*args, **kwargs))
-        return AsyncSession(self._run, info, cast(Any, kwargs.get("initial_pose")))
+        given = cast(dict[str, Any], kwargs)
+        begun = AsyncSession[Any](
+            self._run, info, given.get("initial_pose"), given.get("on_failure", "raise")
+        )
+        await self._run(begun._recall())
+        return begun
 
     return method
 
@@ -170,14 +205,20 @@ def pages(cls: type[T], resource: str) -> Callable[[Resource], AsyncIterator[T]]
     return method
 
 
-class AsyncSession(SessionState):
+class AsyncSession(SessionState, Generic[D]):
     """`Session` for asyncio."""
 
-    def __init__(self, run: Run, info: SessionInfo, initial_pose: Numbers | None = None) -> None:
-        super().__init__(info, initial_pose)
+    def __init__(
+        self,
+        run: Run,
+        info: SessionInfo,
+        initial_pose: Numbers | None = None,
+        on_failure: OnFailure = "raise",
+    ) -> None:
+        super().__init__(info, initial_pose, on_failure)
         self._run = run
 
-    async def __aenter__(self) -> AsyncSession:
+    async def __aenter__(self) -> AsyncSession[D]:
         return self
 
     async def __aexit__(
@@ -188,7 +229,20 @@ class AsyncSession(SessionState):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             await self._run(self._close(None, TRIES if error is None else 1))
 
-    step = awaiting_step(SessionState._step)
+    if TYPE_CHECKING:
+
+        def step(
+            self,
+            pose: Numbers,
+            logits: Logits | None = None,
+            *,
+            main_task_done: bool | None = None,
+            signals: Mapping[str, float] | None = None,
+            witnesses: bool = False,
+            deadline: float | None = None,
+        ) -> Coroutine[Any, Any, D]: ...
+    else:
+        step = awaiting_step(SessionState._step)
     trajectory = awaiting_step(SessionState._trajectory)
     close = awaiting_step(SessionState._end)
 
@@ -217,7 +271,29 @@ class AsyncPolicies(Resource):
 
 
 class AsyncSessions(Resource):
-    create = opening(calls.create_session)
-    get = opening(calls.get_session)
+    if TYPE_CHECKING:
+
+        @overload
+        def create(
+            self, *, on_failure: Literal["raise"] = "raise", **options: Unpack[Beginning]
+        ) -> Coroutine[Any, Any, AsyncSession[Decision]]: ...
+        @overload
+        def create(
+            self, *, on_failure: Literal["witness", "stop"], **options: Unpack[Beginning]
+        ) -> Coroutine[Any, Any, AsyncSession[Decision | LocalDecision]]: ...
+        def create(self, **options: Any) -> Any: ...
+
+        @overload
+        def get(
+            self, id: str, *, on_failure: Literal["raise"] = "raise"
+        ) -> Coroutine[Any, Any, AsyncSession[Decision]]: ...
+        @overload
+        def get(
+            self, id: str, *, on_failure: Literal["witness", "stop"]
+        ) -> Coroutine[Any, Any, AsyncSession[Decision | LocalDecision]]: ...
+        def get(self, id: str, **options: Any) -> Any: ...
+    else:
+        create = opening(calls.create_session)
+        get = opening(calls.get_session)
     delete = awaiting(calls.delete_session)
     list = pages(SessionInfo, "sessions")

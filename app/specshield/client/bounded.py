@@ -22,9 +22,7 @@ import httpcore
 import httpx
 
 ENDS: ContextVar[float] = ContextVar("ENDS", default=float("inf"))  # when this try ends, time.monotonic() [s]
-PARSING = (
-    6e-6  # s a byte: h11 takes 1.3 to 3 us a byte of endless "100 Continue" (benchmarks/deadline.py)
-)
+PARSING = 6e-6  # s a byte: h11 takes 1.3 to 3 us a byte of endless "100 Continue" (benchmarks/deadline.py)
 LEAST = 512  # bytes to read at once
 OPTIONS = [(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
 

@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
+from specshield.client.away import OnFailure, on_failure_value
 from specshield.client.core import Flow, Wait, call, deliver, erase
 from specshield.client.models import Map, Policy, SessionInfo, Spec, build
 from specshield.client.wire import (
@@ -204,6 +205,7 @@ def create_session(
     shaping: str = "projection",
     max_steps: int | None = None,
     allow_infeasible: bool = False,
+    on_failure: OnFailure = "raise",
 ) -> Flow[SessionInfo]:
     """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
 
@@ -212,7 +214,12 @@ def create_session(
     `slack` are the robustness [m] and the steps to keep in hand. `shaping` is "projection" or one of the
     preferences that the server's /docs lists.
     Raises InfeasibleStart where no action has a satisfying future, unless `allow_infeasible`.
+
+    `on_failure` says what a step is when the service cannot answer it in time. "raise": its error. "witness":
+    a `LocalDecision` that follows the certified continuation received last; it says to stop where there is
+    none, where it has ended, and where the robot is not where it leads. "stop": one that says to stop.
     """
+    on_failure_value(on_failure)
     if (policy_id is None) == (policy_ids is None):
         raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
     key = str(uuid.uuid4()) if id is None else id
@@ -241,11 +248,15 @@ def create_session(
         return info
 
 
-def get_session(id: str) -> Flow[SessionInfo]:
+def get_session(id: str, *, on_failure: OnFailure = "raise") -> Flow[SessionInfo]:
     """A session begun earlier, ready for its next step.
 
     If the last action run was a terminal one, say `main_task_done=True` there: only the caller knows.
+    `on_failure` is as in `create`. With "witness" the certified continuation received last is read back too.
+    The poses of steps that the service has not heard of are not: `record` them again (`session.unsent`), or
+    the rule's clock falls behind.
     """
+    on_failure_value(on_failure)
     return build(SessionInfo, (yield from call(get("sessions", id))))
 
 

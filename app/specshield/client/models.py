@@ -6,11 +6,11 @@ know are ignored, so a newer server may add some.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any, Generic, Literal, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Generic, Literal, TypedDict, TypeVar
 
-from specshield.errors import ServerError
+from specshield.errors import ServerError, SpecshieldError
 
 T = TypeVar("T")
 Pose = tuple[float, float, float]
@@ -71,6 +71,24 @@ class SessionInfo:
     main_task_done: bool
     finished: bool
     expires_at: str
+    margin: float = 0.0
+
+
+class Beginning(TypedDict, total=False):
+    """What `sessions.create` takes beside `on_failure`, for type checkers (calls.py says what each is)."""
+
+    initial_pose: Any
+    policy_id: str | None
+    policy_ids: Sequence[str] | None
+    id: str | None
+    seed: int
+    threshold: float
+    margin: float
+    slack: int
+    evaluation: Literal["feasibility", "robustness"]
+    shaping: str
+    max_steps: int | None
+    allow_infeasible: bool
 
 
 @dataclass(frozen=True)
@@ -111,6 +129,29 @@ class Decision:
     timings: Mapping[str, float]  # [ms], from the Server-Timing header
     witnesses: tuple[tuple[int, ...] | None, ...] | None = None
     warnings: tuple[str, ...] = ()  # what did not go as it should, such as a policy that was not used
+    source: Literal["service"] = "service"
+
+
+@dataclass(frozen=True)
+class LocalDecision:
+    """What a step is when the service cannot answer it, and `on_failure` is not "raise". Nothing was shaped.
+
+    source "witness": `execute` is the next action of the certified continuation received last. The step
+    counts: its pose is recorded, and told to the service later. source "stop": there is nothing certified to
+    do, so `execute` is None: the robot should stand. The step does not count: `t` stays, and the next `step`
+    asks for it anew. `reason` says why there is nothing, `error` why the service did not answer (None: it was
+    away a moment ago and was not asked this time).
+    """
+
+    t: int
+    source: Literal["witness", "stop"]
+    execute: int | None
+    reason: str
+    spec_status: SpecStatus  # as the service said last
+    witness: tuple[int, ...] | None = None  # the actions that follow `execute` to the horizon
+    next_pose: Pose | None = None  # where `execute` should lead
+    finished: bool = False
+    error: SpecshieldError | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

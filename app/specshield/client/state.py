@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
 from specshield.client.core import Flow, Within, call, deliver
 from specshield.client.models import (
     Decision,
+    LocalDecision,
     Page,
     Pose,
     Residual,
@@ -32,7 +34,7 @@ from specshield.client.wire import (
     signal_values,
     timings,
 )
-from specshield.errors import HistoryGap
+from specshield.errors import HistoryGap, SpecshieldError, StepConflict
 
 
 class SessionState:
@@ -43,8 +45,11 @@ class SessionState:
     reaches the server delivers it.
     """
 
-    def __init__(self, info: SessionInfo, initial_pose: Numbers | None = None) -> None:
+    def __init__(
+        self, info: SessionInfo, initial_pose: Numbers | None = None, on_failure: OnFailure = "raise"
+    ) -> None:
         self.info = info
+        self.on_failure = on_failure
         self.t = info.next_t
         self.spec_status: SpecStatus = info.spec_status
         self.finished = info.finished
@@ -52,10 +57,18 @@ class SessionState:
         self.closed = False
         self._stored = info.next_t  # poses the server has, as far as is known
         self._poses: dict[int, Pose] = {} if initial_pose is None else {0: pose_values(initial_pose)}
+        self._continuation = Continuation(info.margin)
+        self._circuit = Circuit()
+        self._unanswered = -1  # the step that was asked for last without an answer, and not passed over
 
     @property
     def id(self) -> str:
         return self.info.id
+
+    @property
+    def unsent(self) -> dict[int, Pose]:
+        """The poses, by step, of steps that the service has not confirmed; `record` them after a restart."""
+        return {t: pose for t, pose in self._poses.items() if self._stored <= t < self.t}
 
     def record(self, pose: Numbers) -> None:
         """Note x_t of a step that goes without a decision (the service was away), and move on to t + 1."""
@@ -71,7 +84,7 @@ class SessionState:
         signals: Mapping[str, float] | None = None,
         witnesses: bool = False,
         deadline: float | None = None,
-    ) -> Flow[Decision]:
+    ) -> Flow[Decision | LocalDecision]:
         """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
 
         `main_task_done`: leave it None to run `decision.execute`; the session then remembers a drawn
@@ -79,28 +92,90 @@ class SessionState:
         `logits` may be None once it is true. `deadline` [s] is a hard limit on the whole call, retries
         included, whatever the server does; without one it is five timeouts of the client.
         Raises whatever went wrong and stays at t: call again with the same pose and logits, or `record`
-        the pose and move on.
+        the pose and move on. With `on_failure` "witness" or "stop" it raises only what the caller got wrong;
+        where the service cannot answer, a `LocalDecision` says what to do. A `main_task_done` of True said
+        there is remembered; signals sent there are lost. While the service is known to be away, it is asked
+        again at pauses of 0.25 to 4 s, once, and steps in between cost nothing.
         """
         yield Within(None if deadline is None else deadline_value(deadline))
-        t, own = self.t, main_task_done is None
-        over = self.main_task_done if main_task_done is None else main_task_done
+        x_t = pose_values(pose)
         body: dict[str, Any] = {
             "logits": None if logits is None else logit_values(logits),
-            "main_task_done": over,
+            "main_task_done": self.main_task_done if main_task_done is None else main_task_done,
             "witnesses": witnesses,
         }
         if signals is not None:
             body["signals"] = signal_values(signals)
-        poses = {**self._poses, t: pose_values(pose)}
-        reply = yield from self._send("steps", poses, t, body)
+        own = main_task_done is None
+        if self.on_failure == "raise":
+            return (yield from self._ask(x_t, body, own, TRIES))
+        way: Branch | str = "the session was begun with on_failure='stop'"
+        if self.on_failure == "witness":
+            way = self._continuation.at(x_t)
+        error: SpecshieldError | None = None
+        if isinstance(way, str) or self._circuit.due:
+            try:
+                once = self._circuit.open and not isinstance(way, str)
+                decision = yield from self._ask(x_t, body, own, 1 if once else TRIES)
+            except SpecshieldError as failed:
+                if not is_away(failed):
+                    raise
+                error = failed
+                self._circuit.failed()
+            else:
+                self._circuit.answered()
+                return decision
+        if isinstance(way, str):
+            self._unanswered = self.t
+            return LocalDecision(self.t, "stop", None, way, self.spec_status, error=error)
+        return self._alone(x_t, way, body["main_task_done"], error)
 
-        decision = _decision(reply, self.info.terminal_actions, over)
-        self._poses, self._stored, self.t = poses, t + 1, t + 1
+    def _alone(self, x_t: Pose, way: Branch, over: bool, error: SpecshieldError | None) -> LocalDecision:
+        """Follow the certified continuation through this step."""
+        t, self.main_task_done = self.t, over
+        leads = self._continuation.follow(way)
+        self.record(x_t)
+        reason = "the service cannot answer; the certified continuation is followed"
+        return LocalDecision(
+            t, "witness", way.plan[0], reason, self.spec_status, way.plan[1:], leads, error=error
+        )
+
+    def _ask(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
+        """The service's decision at t. One that it took here unheard, for another pose or other logits, is
+        passed over: the robot stood meanwhile, so x_t is the pose of the step after.
+        """
+        try:
+            return (yield from self._decided(x_t, body, own, tries))
+        except StepConflict:
+            if self._unanswered != self.t:
+                raise
+        self.record(x_t)
+        self._stored = max(self._stored, self.t)
+        return (yield from self._decided(x_t, body, own, tries))
+
+    def _decided(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
+        t, over, poses = self.t, body["main_task_done"], {**self._poses, self.t: x_t}
+        reply = yield from self._send("steps", poses, t, body, tries)
+        decision = _decision(json_object(reply), self.info.terminal_actions, over, timings(reply))
+        self._poses, self._stored, self.t, self._unanswered = poses, t + 1, t + 1, -1
         self.spec_status = decision.spec_status
         ends = own and decision.action in self.info.terminal_actions
         self.main_task_done = over or ends
         self.finished = decision.finished or (ends and decision.spec_status != "pending")
+        if self.on_failure == "witness":
+            self._continuation.learn(decision, x_t)
         return decision
+
+    def _recall(self) -> Flow[None]:
+        """After a restart of the robot's process: the certified continuation, from the answers kept."""
+        if self.on_failure != "witness" or self.finished:
+            return
+        for item in (yield from self._trajectory()) if self.t else ():
+            self._continuation.branches = ()
+            if item.decision is not None:
+                over = self.info.main_task_done
+                decision = _decision(item.decision, self.info.terminal_actions, over, {})
+                self._continuation.learn(decision, item.pose)
 
     def _end(self, pose: Numbers | None = None) -> Flow[Verdict]:
         """End the session; `pose` is the state the last action led to."""
@@ -153,15 +228,17 @@ class SessionState:
         return (yield from since(start))
 
 
-def _decision(reply: Reply, terminal: tuple[int, ...], over: bool) -> Decision:
-    body = json_object(reply)
+def _decision(
+    body: Mapping[str, Any], terminal: tuple[int, ...], over: bool, timings: Mapping[str, float]
+) -> Decision:
     residual = body.get("residual")
     return build(
         Decision,
         body,
         residual=None if residual is None else build(Residual, residual),
-        timings=timings(reply),
+        timings=timings,
         execute=_execute(body, terminal, over),
+        source="service",
     )
 
 

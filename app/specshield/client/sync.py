@@ -5,19 +5,42 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar, cast
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Concatenate,
+    Generic,
+    Literal,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    cast,
+    overload,
+)
 
 import httpx
 
 from specshield.client import bounded, calls
+from specshield.client.away import OnFailure
 from specshield.client.core import Flow, Wait, looks_like, page_of
-from specshield.client.models import Map, Policy, SessionInfo
+from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
+from specshield.client.stream import SyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Numbers, Reply, Request
+from specshield.client.wire import TRIES, Failure, Logits, Numbers, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar as Defaulted
+    from typing_extensions import Unpack
+
+    from specshield.client.models import Beginning
+
+    D = Defaulted("D", default=Decision)
+else:
+    D = TypeVar("D")
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -34,7 +57,8 @@ class ShieldClient:
     what prepares something (a map, a policy, a session) gets at least 30 s. Lost answers are asked for again
     (see `core`), so a call returns or raises within five timeouts, a step within its `deadline`. A
     `transport` of your own has to keep these times itself. Every error is a `SpecshieldError`; no answer is
-    a `TransportError`.
+    a `TransportError`. `stream`: steps go over one WebSocket a session, in MessagePack, which is faster and
+    needs `pip install 'specshield[stream]'`.
     """
 
     def __init__(
@@ -43,6 +67,7 @@ class ShieldClient:
         api_key: str | None = None,
         timeout: float = 0.5,
         *,
+        stream: bool = False,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self._timeout = timeout
@@ -50,6 +75,7 @@ class ShieldClient:
         self._http = httpx.Client(
             base_url=url, headers=headers(api_key), transport=transport or bounded.Transport(url)
         )
+        self._streams = SyncStreams(self._http) if stream else None
         self.specs = Specs(self._run)
         self.maps = Maps(self._run)
         self.policies = Policies(self._run)
@@ -70,6 +96,8 @@ class ShieldClient:
         self._run(calls.wait_until_ready(timeout))
 
     def close(self) -> None:
+        if self._streams is not None:
+            self._streams.close()
         self._http.close()
 
     def _run(self, flow: Flow[T], /) -> T:
@@ -93,6 +121,9 @@ class ShieldClient:
         exchange = Exchange(request, self._http.base_url, self._timeout, ends)
         if exchange.seconds <= 0.0:
             return exchange.failure(httpx.PoolTimeout(""))
+        message = None if self._streams is None else packed(request)
+        if self._streams is not None and message is not None:
+            return self._streams.perform(exchange, message)
         token = bounded.ENDS.set(exchange.ends)
         try:
             with self._http.stream(**exchange.arguments(self._timeout)) as response:
@@ -147,7 +178,10 @@ def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resour
 
     @looks_like(flow)
     def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> Session:
-        return Session(self._run, self._run(flow(*args, **kwargs)), cast(Any, kwargs.get("initial_pose")))
+        info, given = self._run(flow(*args, **kwargs)), cast(dict[str, Any], kwargs)
+        begun = Session[Any](self._run, info, given.get("initial_pose"), given.get("on_failure", "raise"))
+        self._run(begun._recall())
+        return begun
 
     return method
 
@@ -167,14 +201,20 @@ def pages(cls: type[T], resource: str) -> Callable[[Resource], Iterator[T]]:
     return method
 
 
-class Session(SessionState):
+class Session(SessionState, Generic[D]):
     """A session; as a context manager it is closed at the end, and its trajectory stays."""
 
-    def __init__(self, run: Run, info: SessionInfo, initial_pose: Numbers | None = None) -> None:
-        super().__init__(info, initial_pose)
+    def __init__(
+        self,
+        run: Run,
+        info: SessionInfo,
+        initial_pose: Numbers | None = None,
+        on_failure: OnFailure = "raise",
+    ) -> None:
+        super().__init__(info, initial_pose, on_failure)
         self._run = run
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Session[D]:
         return self
 
     def __exit__(
@@ -186,7 +226,20 @@ class Session(SessionState):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             self._run(self._close(None, TRIES if error is None else 1))
 
-    step = blocking_step(SessionState._step)
+    if TYPE_CHECKING:
+
+        def step(
+            self,
+            pose: Numbers,
+            logits: Logits | None = None,
+            *,
+            main_task_done: bool | None = None,
+            signals: Mapping[str, float] | None = None,
+            witnesses: bool = False,
+            deadline: float | None = None,
+        ) -> D: ...
+    else:
+        step = blocking_step(SessionState._step)
     trajectory = blocking_step(SessionState._trajectory)
     close = blocking_step(SessionState._end)
 
@@ -215,7 +268,27 @@ class Policies(Resource):
 
 
 class Sessions(Resource):
-    create = opening(calls.create_session)
-    get = opening(calls.get_session)
+    if TYPE_CHECKING:
+
+        @overload
+        def create(
+            self, *, on_failure: Literal["raise"] = "raise", **options: Unpack[Beginning]
+        ) -> Session[Decision]: ...
+        @overload
+        def create(
+            self, *, on_failure: Literal["witness", "stop"], **options: Unpack[Beginning]
+        ) -> Session[Decision | LocalDecision]: ...
+        def create(self, **options: Any) -> Any: ...
+
+        @overload
+        def get(self, id: str, *, on_failure: Literal["raise"] = "raise") -> Session[Decision]: ...
+        @overload
+        def get(
+            self, id: str, *, on_failure: Literal["witness", "stop"]
+        ) -> Session[Decision | LocalDecision]: ...
+        def get(self, id: str, **options: Any) -> Any: ...
+    else:
+        create = opening(calls.create_session)
+        get = opening(calls.get_session)
     delete = blocking(calls.delete_session)
     list = pages(SessionInfo, "sessions")

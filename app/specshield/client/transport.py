@@ -104,10 +104,22 @@ class Exchange:
         if response.headers.get(MINE, self._id) != self._id:
             return None
         names = {name.lower(): value for name, value in response.headers.items()}
-        now, content = time.monotonic(), b"".join(self._chunks)
-        taken = (now - self.began, self._allowed, self._ends - now)
-        reply = Reply(response.status_code, names, content, *taken)
+        reply = Reply(response.status_code, names, b"".join(self._chunks), *self._taken())
         return None if stale(self.request, reply) else reply
+
+    def told(self, response: httpx.Response) -> Reply:
+        """A whole answer, such as the refusal of a WebSocket's handshake."""
+        names = {name.lower(): value for name, value in response.headers.items()}
+        return Reply(response.status_code, names, response.content, *self._taken())
+
+    def streamed(self, status: int, headers: dict[str, str], document: Any) -> Reply | None:
+        """An answer that came as a message; None for one about another step."""
+        reply = Reply(status, headers, b"", *self._taken(), parsed=document)
+        return None if stale(self.request, reply) else reply
+
+    def _taken(self) -> tuple[float, float, float]:
+        now = time.monotonic()
+        return now - self.began, self._allowed, self._ends - now
 
     def failure(self, error: httpx.RequestError) -> Failure:
         """Every way httpx can fail to bring an answer is a TransportError; its own error is the cause."""
@@ -121,8 +133,7 @@ class Exchange:
                 expected="a specshield server that runs at this address",
             )
         mapped.__cause__ = error
-        now = time.monotonic()
-        return Failure(mapped, now - self.began, self._allowed, self._ends - now)
+        return Failure(mapped, *self._taken())
 
 
 def check_open(http: httpx.Client | httpx.AsyncClient) -> None:

@@ -47,6 +47,7 @@ class Request:
     """One request. `slow`: the server prepares something; `tries`: how often it may be sent at most.
 
     `t`: the step that the answer has to be about; an answer about another one is none (see `stale`).
+    `message`: the body of a step, as a stream packs it.
     """
 
     method: str
@@ -57,6 +58,7 @@ class Request:
     slow: bool = False
     tries: int = TRIES
     t: int | None = None
+    message: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -69,10 +71,13 @@ class Reply:
     seconds: float
     timeout: float
     left: float = math.inf
+    parsed: Any = None  # what came as a message is not JSON, and has been read already
 
     @cached_property
     def document(self) -> Any:
         """What the body says; None where it is not JSON."""
+        if self.parsed is not None:
+            return self.parsed
         try:
             return json.loads(self.content)
         except (ValueError, RecursionError):
@@ -96,7 +101,8 @@ def get(*segments: str, slow: bool = False, params: Mapping[str, str] | None = N
 def post(
     *segments: str, body: Mapping[str, Any], slow: bool = False, tries: int = TRIES, t: int | None = None
 ) -> Request:
-    return Request("POST", path(*segments), body=encode(body), slow=slow, tries=tries, t=t)
+    message = None if t is None else body
+    return Request("POST", path(*segments), encode(body), slow=slow, tries=tries, t=t, message=message)
 
 
 def path(*segments: str) -> str:

@@ -1,0 +1,132 @@
+"""What a robot can still know while the service cannot answer: where the certified continuation leads."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from specshield.client.models import Decision, Pose
+from specshield.errors import InputError, LimitReached, SpecshieldError, TransportError
+
+OnFailure = Literal["raise", "witness", "stop"]
+NEAR = 0.05  # [m] beside the foreseen pose that is still there, beyond the session's margin; chosen by hand
+TURNED = 0.1  # [rad] the same for the heading; chosen by hand
+FIRST_PAUSE = 0.25  # s before an absent service is asked again, doubled each time; chosen by hand
+LONGEST_PAUSE = 4.0  # s; chosen by hand: a robot goes alone for no longer than this once the service is back
+
+
+def on_failure_value(value: str) -> OnFailure:
+    """InputError for another word."""
+    if value not in ("raise", "witness", "stop"):
+        raise InputError(
+            "unknown on_failure", path="on_failure", got=value, expected="'raise', 'witness' or 'stop'"
+        )
+    return value  # type: ignore[return-value]
+
+
+def is_away(error: SpecshieldError) -> bool:
+    """Whether the error says that the service cannot answer now, and nothing of what was asked."""
+    status = error.details.get("status")
+    failed = isinstance(status, int) and status >= 500
+    return isinstance(error, TransportError | LimitReached) or failed
+
+
+@dataclass
+class Circuit:
+    """Whether it is worth asking: after a failure not before a pause, which grows up to LONGEST_PAUSE."""
+
+    clock: Callable[[], float] = time.monotonic
+    pause: float = 0.0
+    again: float = -math.inf
+
+    @property
+    def open(self) -> bool:
+        """Whether the last question was not answered."""
+        return self.pause > 0.0
+
+    @property
+    def due(self) -> bool:
+        return self.clock() >= self.again
+
+    def failed(self) -> None:
+        self.pause = min(2.0 * self.pause or FIRST_PAUSE, LONGEST_PAUSE)
+        self.again = self.clock() + self.pause
+
+    def answered(self) -> None:
+        self.pause, self.again = 0.0, -math.inf
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One way on: the pose x_t that was foreseen, and the actions from t to the rule's last step."""
+
+    pose: Pose
+    plan: tuple[int, ...]
+
+
+@dataclass
+class Continuation:
+    """The certified continuation received last, followed from pose to pose without a map.
+
+    Where an action leads is taken from the service's answers: the longest displacement in the robot's frame
+    that `next_poses` ever showed, as a wall in the way makes it shorter. A continuation that itself runs into
+    something is therefore given up where it does, and the robot is told to stop.
+    """
+
+    margin: float = 0.0  # [m]
+    branches: tuple[Branch, ...] = ()
+    motions: dict[int, Pose] = field(default_factory=dict)
+
+    def learn(self, decision: Decision, pose: Pose) -> None:
+        """From the service's answer at `pose`. With `witnesses` a caller's own draw is followed as well."""
+        for action, after in enumerate(decision.next_poses):
+            motion = _difference(pose, after)
+            if _length(motion) >= _length(self.motions.get(action, (0.0, 0.0, 0.0))):
+                self.motions[action] = motion
+        ways = {decision.execute: decision.witness}
+        if decision.witnesses:
+            ways |= dict(enumerate(decision.witnesses))
+        self.branches = tuple(
+            Branch(decision.next_poses[action], plan) for action, plan in ways.items() if plan is not None
+        )
+
+    def at(self, pose: Pose) -> Branch | str:
+        """The way on from `pose`, or why there is none."""
+        if not self.branches:
+            return "the service has certified no continuation"
+        branch = min(self.branches, key=lambda branch: _length(_difference(branch.pose, pose)))
+        x, y, turn = _difference(branch.pose, pose)
+        if math.hypot(x, y) > NEAR + self.margin or abs(turn) > TURNED:
+            return (
+                f"the robot is {math.hypot(x, y):.2f} m and {abs(turn):.2f} rad from where the certified "
+                "continuation leads"
+            )
+        return (
+            branch if branch.plan else "the certified continuation has ended: the rule's last step is reached"
+        )
+
+    def follow(self, branch: Branch) -> Pose | None:
+        """Take its first action; where that should lead, None if it was never told."""
+        motion = self.motions.get(branch.plan[0])
+        after = None if motion is None else _moved(branch.pose, motion)
+        self.branches = () if after is None else (Branch(after, branch.plan[1:]),)
+        return after
+
+
+def _difference(a: Pose, b: Pose) -> Pose:
+    """b as seen from a: ahead [m], to the left [m], turn in [-pi, pi]."""
+    dx, dy, cos, sin = b[0] - a[0], b[1] - a[1], math.cos(a[2]), math.sin(a[2])
+    return cos * dx + sin * dy, cos * dy - sin * dx, math.remainder(b[2] - a[2], 2.0 * math.pi)
+
+
+def _moved(pose: Pose, motion: Pose) -> Pose:
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
+    x, y = pose[0] + cos * motion[0] - sin * motion[1], pose[1] + sin * motion[0] + cos * motion[1]
+    return x, y, math.remainder(pose[2] + motion[2], 2.0 * math.pi)
+
+
+def _length(motion: Pose) -> float:
+    return math.hypot(motion[0], motion[1]) + abs(motion[2])

@@ -1,0 +1,207 @@
+"""Steps over one WebSocket a session, in MessagePack, for `ShieldClient(url, stream=True)`.
+
+A message is the body of a step, its answer that of the answer or a problem document. A try has the same time
+as one over HTTP. A connection on which a try failed is left, so nothing that still comes on it is ever read,
+and the next try makes another. What is longer than `SHORT` goes over HTTP: a short message fits the socket's
+buffer, so sending it cannot block.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import httpx
+
+from specshield.client.transport import STALE, Exchange
+from specshield.client.wire import Failure, Reply, Request
+from specshield.errors import InputError
+
+if TYPE_CHECKING:
+    from websockets.asyncio.client import ClientConnection as AsyncSocket
+    from websockets.sync.client import ClientConnection as Socket
+
+SHORT = 16_384  # bytes; chosen by hand, far below what the socket's buffer takes
+LONGEST = 4 << 20  # bytes of an answer; a step of 256 actions with all its witnesses has 1 MB
+PROBLEM = {"content-type": "application/problem+json"}
+
+
+def check_installed() -> None:
+    """InputError where the packages are missing."""
+    try:
+        import msgpack  # noqa: F401
+        import websockets  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            f"stream=True needs the package {error.name}, which is not installed",
+            path="stream",
+            expected="pip install 'specshield[stream]', or stream=False",
+        ) from error
+
+
+def packed(request: Request) -> bytes | None:
+    """The message of a step; None for what goes over HTTP."""
+    import msgpack
+
+    if request.message is None:
+        return None
+    message: bytes = msgpack.packb(request.message)
+    return message if len(message) <= SHORT else None
+
+
+class Streams:
+    """What both shells share: where a session's stream is, and what an answer means."""
+
+    def __init__(self, http: httpx.Client | httpx.AsyncClient) -> None:
+        check_installed()
+        self._http = http
+
+    def _address(self, request: Request) -> str:
+        base = str(self._http.base_url.copy_with(scheme=self._http.base_url.scheme.replace("http", "ws")))
+        return base.rstrip("/") + request.path.removesuffix("/steps") + "/stream"
+
+    def _options(self, seconds: float) -> dict[str, Any]:
+        key = self._http.headers.get("Authorization")
+        return {
+            "additional_headers": {} if key is None else {"Authorization": key},
+            "compression": None,
+            "ping_interval": None,
+            "open_timeout": seconds,
+            "max_size": LONGEST,
+        }
+
+    def _read(self, exchange: Exchange, message: bytes | str) -> Reply | None:
+        """None for an answer about another step."""
+        import msgpack
+
+        try:
+            document = msgpack.unpackb(message) if isinstance(message, bytes) else None
+        except (ValueError, msgpack.exceptions.UnpackException):
+            document = None
+        status = document.get("status", 200) if isinstance(document, dict) and "type" in document else 200
+        return exchange.streamed(status, PROBLEM if status != 200 else {}, document)
+
+
+def _refusal(error: Exception) -> httpx.Response | None:
+    """The HTTP answer that refuses a handshake."""
+    answer = getattr(error, "response", None)
+    if answer is None:
+        return None
+    return httpx.Response(answer.status_code, headers=dict(answer.headers.raw_items()), content=answer.body)
+
+
+class SyncStreams(Streams):
+    def __init__(self, http: httpx.Client) -> None:
+        super().__init__(http)
+        self._open: dict[str, Socket] = {}
+
+    def perform(self, exchange: Exchange, message: bytes) -> Reply | Failure:
+        import websockets
+
+        path = exchange.request.path
+        connection = self._open.pop(path, None)
+        try:
+            connection = connection or self._connected(exchange)
+            connection.send(message)
+            reply = self._read(exchange, connection.recv(max(exchange.ends - time.monotonic(), 0.0)))
+        except TimeoutError:
+            leave(connection)
+            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+        except (websockets.WebSocketException, OSError) as error:
+            leave(connection)
+            refusal = _refusal(error)
+            if refusal is not None:
+                return exchange.told(refusal)
+            return exchange.failure(httpx.ReadError(str(error)))
+        if reply is None:
+            leave(connection)
+            return exchange.failure(httpx.ReadError(STALE))
+        self._open[path] = connection
+        return reply
+
+    def _connected(self, exchange: Exchange) -> Socket:
+        """In a thread, since nothing can limit the time in which a name is looked up."""
+        from websockets.sync.client import connect
+
+        made: list[Any] = []
+        over = threading.Event()
+
+        def make() -> None:
+            try:
+                made.append(connect(self._address(exchange.request), **self._options(exchange.seconds)))
+            except BaseException as error:
+                made.append(error)
+            if over.is_set():
+                leave(made[0])
+
+        making = threading.Thread(target=make, daemon=True, name="specshield-connect")
+        making.start()
+        making.join(max(exchange.ends - time.monotonic(), 0.0))
+        if not made:
+            over.set()
+            raise TimeoutError
+        if isinstance(made[0], BaseException):
+            raise made[0]
+        connection: Socket = made[0]
+        return connection
+
+    def close(self) -> None:
+        while self._open:
+            leave(self._open.popitem()[1])
+
+
+def leave(connection: Any) -> None:
+    """Without a closing handshake, which would wait for the other side."""
+    with contextlib.suppress(OSError, AttributeError):
+        connection.socket.shutdown(socket.SHUT_RDWR)
+
+
+class AsyncStreams(Streams):
+    def __init__(self, http: httpx.AsyncClient) -> None:
+        super().__init__(http)
+        self._open: dict[str, AsyncSocket] = {}
+
+    async def perform(self, exchange: Exchange, message: bytes) -> Reply | Failure:
+        import websockets
+
+        try:
+            reply = await asyncio.wait_for(
+                self._asked(exchange, message), max(exchange.ends - time.monotonic(), 0.0)
+            )
+        except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
+            outcome: Reply | Failure = exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+        except (websockets.WebSocketException, OSError) as error:
+            refusal = _refusal(error)
+            outcome = (
+                exchange.failure(httpx.ReadError(str(error))) if refusal is None else exchange.told(refusal)
+            )
+        else:
+            if reply is not None:
+                return reply
+            outcome = exchange.failure(httpx.ReadError(STALE))
+        self._leave(exchange.request.path)
+        return outcome
+
+    async def _asked(self, exchange: Exchange, message: bytes) -> Reply | None:
+        from websockets.asyncio.client import connect
+
+        path = exchange.request.path
+        connection = self._open.get(path)
+        if connection is None:
+            options = self._options(exchange.seconds)
+            connection = self._open[path] = await connect(self._address(exchange.request), **options)
+        await connection.send(message)
+        return self._read(exchange, await connection.recv())
+
+    def _leave(self, path: str) -> None:
+        connection = self._open.pop(path, None)
+        if connection is not None:
+            connection.transport.abort()
+
+    def close(self) -> None:
+        for path in list(self._open):
+            self._leave(path)

@@ -1,0 +1,207 @@
+"""What a robot is told while the service is away, step by step, against answers written by hand."""
+
+import itertools
+import json
+import math
+
+import pytest
+from client_script import answer, drive, lost, problem
+from test_state import END, LOGITS, B, M, decided, session
+
+from specshield import errors
+from specshield.client import LocalDecision
+from specshield.client.away import LONGEST_PAUSE
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def robust(on_failure="witness", **members):
+    state = session(**members)
+    state.on_failure, state._circuit.clock = on_failure, Clock()
+    return state
+
+
+def step(state, x, *outcomes, y=0.0, logits=LOGITS, main_task_done=None):
+    """(decision or error, the bodies sent)"""
+    flow = state._step((x, y, 0), logits, main_task_done=main_task_done)
+    result, sent, _ = drive(flow, *outcomes)
+    return result, [json.loads(request.body) for request in sent]
+
+
+AWAY = [lost(0.0)] * 5
+
+
+def test_the_certified_continuation_is_followed_and_the_service_told_later():
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, B, M]))
+    first, bodies = step(state, 0.2, *AWAY)
+    assert isinstance(first, LocalDecision)
+    assert (first.source, first.t, first.execute, first.witness) == ("witness", 1, M, (B, M))
+    assert first.next_pose == pytest.approx((0.4, 0, 0))
+    assert isinstance(first.error, errors.TransportTimeout)
+    assert len(bodies) == 5
+    second, bodies = step(state, 0.4)
+    assert (second.source, second.t, second.execute, bodies) == ("witness", 2, B, [])
+    assert second.error is None, "a moment ago it was away: it is not asked"
+    assert state.unsent == {1: (0.2, 0, 0), 2: (0.4, 0, 0)}
+    state._circuit.clock.now += LONGEST_PAUSE
+    back, (body,) = step(state, 0.2, decided(3, M))
+    assert (back.source, body["t"], [pose[0] for pose in body["poses"]]) == ("service", 3, [0.2, 0.4, 0.2])
+    assert not state._circuit.open
+    assert state.unsent == {}
+
+
+def test_while_it_is_away_it_is_asked_once_at_growing_bounded_pauses():
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[B, M] * 200))
+    clock, asked = state._circuit.clock, []
+    pose = 0.2
+    for number in range(300):
+        due = state._circuit.due
+        outcomes = () if not due else AWAY if number == 0 else AWAY[:1]
+        decision, bodies = step(state, pose, *outcomes)
+        pose = decision.next_pose[0]
+        if bodies:
+            asked.append(clock.now)
+        clock.now += 0.1
+    pauses = [b - a for a, b in itertools.pairwise(asked)]
+    assert pauses[0] == pytest.approx(0.3)  # the first step after 0.25 s
+    assert max(pauses) <= LONGEST_PAUSE + 0.11
+    assert pauses[-1] == pytest.approx(LONGEST_PAUSE, abs=0.11)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.4, 0.0), (0.2, 0.1), (0.0, 0.0)])
+def test_a_robot_that_is_not_where_the_continuation_leads_is_told_to_stop(x, y):
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    decision, _ = step(state, x, *AWAY, y=y)
+    assert (decision.source, decision.execute, decision.t) == ("stop", None, 1)
+    assert "where the certified continuation leads" in decision.reason
+    assert state.t == 1, "a step on which the robot stands does not count"
+    again, bodies = step(state, x, decided(1, M), y=y)
+    assert (again.source, bodies[0]["t"]) == ("service", 1)
+
+
+def test_a_margin_is_room_for_the_robot_beside_its_way():
+    state = robust(margin=0.2)
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    decision, _ = step(state, 0.3, *AWAY, y=0.1)
+    assert decision.source == "witness"
+
+
+def test_where_the_continuation_has_ended_and_where_there_never_was_one_the_robot_stops():
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M]))
+    assert step(state, 0.2, *AWAY)[0].source == "witness"
+    ended, _ = step(state, 0.4, *AWAY)
+    assert (ended.source, "has ended" in ended.reason) == ("stop", True)
+    none, _ = step(robust(), 0.0, *AWAY)
+    assert (none.source, "no continuation" in none.reason) == ("stop", True)
+    uncertified = robust()
+    step(uncertified, 0.0, decided(0, M, witness=None))
+    assert step(uncertified, 0.2, *AWAY)[0].source == "stop"
+
+
+def test_stop_stops_although_there_is_a_continuation():
+    state = robust("stop")
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    decision, _ = step(state, 0.2, *AWAY)
+    assert (decision.source, decision.execute) == ("stop", None)
+
+
+@pytest.mark.parametrize(
+    "outcome",
+    [
+        lost(0.0),
+        answer({}, 502),
+        problem(503, "store-unavailable"),
+        problem(500, "internal-error"),
+        problem(429, "limit-reached"),
+        problem(507, "from-the-future"),
+    ],
+)
+def test_a_service_that_cannot_answer_now_is_away(outcome):
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    tries = 1 if getattr(outcome, "status", 0) in (500, 429, 507) else 5
+    assert step(state, 0.2, *[outcome] * tries)[0].source == "witness"
+
+
+@pytest.mark.parametrize(
+    ("outcome", "error"),
+    [
+        (problem(404, "not-found"), errors.NotFound),
+        (problem(401, "unauthorized"), errors.Unauthorized),
+        (problem(422, "invalid-logits"), errors.LogitsError),
+        (problem(409, "step-conflict"), errors.StepConflict),
+    ],
+)
+def test_what_the_service_does_answer_is_raised(outcome, error):
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    assert type(step(state, 0.2, outcome)[0]) is error
+    assert state.t == 1
+
+
+def test_bad_input_is_refused_also_while_the_service_is_away():
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    step(state, 0.2, *AWAY)
+    assert isinstance(step(state, math.nan)[0], errors.PoseError)
+    assert isinstance(step(state, 0.4, logits=[math.nan])[0], errors.LogitsError)
+
+
+def test_a_decision_that_was_never_heard_is_passed_over_by_a_robot_that_stood():
+    """Its first question was answered to nobody; by now its model says something else."""
+    state = robust()
+    stopped, _ = step(state, 0.0, *AWAY)
+    assert stopped.source == "stop"
+    conflict = problem(409, "step-conflict", expected_t=1)
+    decision, bodies = step(state, 0.0, conflict, decided(1, M), logits=[1.0, 0.0, 0.0])
+    assert (decision.source, decision.t, state.t) == ("service", 1, 2)
+    assert [(body["t"], len(body["poses"])) for body in bodies] == [(0, 1), (1, 1)]
+
+
+def test_the_main_task_that_ends_while_the_service_is_away_has_ended():
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M, M]))
+    decision, _ = step(state, 0.2, *AWAY, main_task_done=True)
+    assert (decision.source, decision.execute) == ("witness", M)
+    state._circuit.clock.now += LONGEST_PAUSE
+    _, (body,) = step(state, 0.4, decided(2, M), logits=None)
+    assert body["main_task_done"]
+
+
+def test_after_end_was_drawn_the_completion_is_what_is_followed():
+    state = robust()
+    decision, _ = step(state, 0.0, decided(0, END, witness=[M, M]))
+    assert decision.execute == B
+    followed, _ = step(state, -0.2, *AWAY)
+    assert (followed.source, followed.execute) == ("witness", M)
+    assert state.main_task_done
+
+
+def test_a_caller_that_draws_itself_and_asks_for_witnesses_is_followed_too():
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M], witnesses=[[M, M], [B, B], None]), main_task_done=False)
+    decision, _ = step(state, -0.2, *AWAY, main_task_done=False)
+    assert (decision.source, decision.execute) == ("witness", B)
+
+
+def test_a_session_read_back_brings_the_continuation_received_last():
+    leads = [[[0.2 * t + 0.2, 0, 0], [0.2 * t - 0.2, 0, 0], [0.2 * t, 0, 0]] for t in range(2)]
+    answers = [json.loads(decided(t, M, witness=[B, M], next_poses=leads[t]).content) for t in range(2)]
+    items = [{"t": t, "pose": [0.2 * t, 0, 0], "signals": {}, "decision": answers[t]} for t in range(2)]
+    state = robust(initial_pose=None, next_t=2)
+    drive(state._recall(), answer({"items": items, "next": None}))
+    decision, _ = step(state, 0.4, *AWAY)
+    assert (decision.source, decision.execute, decision.t) == ("witness", B, 2)
+    items.append({"t": 2, "pose": [0.4, 0, 0], "signals": {}, "decision": None})
+    state = robust(initial_pose=None, next_t=3)
+    drive(state._recall(), answer({"items": items, "next": None}))
+    assert step(state, 0.4, *AWAY)[0].source == "stop", "a step without a decision came after it"
