@@ -84,6 +84,7 @@ def serve(
     import uvicorn
 
     from specshield.service.storage.embedded import EmbeddedStore
+    from specshield.service.watch import logs
 
     settings = _settings()  # what is wrong with them is said here, in one line
     _check_address(host, port)
@@ -94,7 +95,7 @@ def serve(
         embedded.join()  # and so is why it does not start
     options: dict[str, Any] = {
         "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
-        "timeout_graceful_shutdown": 5, "log_config": _log_config(),
+        "timeout_graceful_shutdown": 5, "log_config": logs.config(settings.log_format, settings.log_level),
     }  # fmt: skip
     if workers == 1:  # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up
         from specshield.service.app import create_app
@@ -180,14 +181,6 @@ def _check_exposure(host: str, settings: Settings) -> None:
             expected="SPECSHIELD_API_KEY set; or an address that only this machine reaches, as 127.0.0.1; or "
             "--insecure, where something in front decides who may",
         )
-
-
-def _log_config() -> dict[str, Any]:
-    """uvicorn's, and the lines of specshield's own log in the same form."""
-    from uvicorn.config import LOGGING_CONFIG
-
-    own = {"handlers": ["default"], "level": "INFO", "propagate": False}
-    return {**LOGGING_CONFIG, "loggers": {**LOGGING_CONFIG["loggers"], "specshield": own}}
 
 
 def _settings() -> Settings:

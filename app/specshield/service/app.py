@@ -29,6 +29,7 @@ from specshield.service.storage.keeper import follow_parent
 from specshield.service.storage.store import Store
 from specshield.service.training.children import TrainingWorker, tend, wants_worker
 from specshield.service.training.jobs import Jobs
+from specshield.service.watch.gauges import Gauges
 
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
@@ -88,7 +89,9 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     known = Policies(settings, library)
     worker = TrainingWorker(settings) if wants_worker(settings) else None
     sessions, startup = Sessions(settings, store, known), Startup()
-    server = Server(settings, store, library, known, sessions, Jobs(url, settings), worker, startup)
+    jobs = Jobs(url, settings)
+    gauges = Gauges(store, jobs)
+    server = Server(settings, store, library, known, sessions, jobs, gauges, worker, startup)
     app.state.server = server
     tasks = [asyncio.create_task(tend(embedded, worker)), asyncio.create_task(prepare(startup))]
     try:

@@ -1,14 +1,44 @@
-"""What /metrics shows; of several server processes where `PROMETHEUS_MULTIPROC_DIR` is set (cli.py does)."""
+"""What /metrics counts and times; docs/watch.md lists it, with what is asked of the store at a scrape.
+
+Of several server processes where `PROMETHEUS_MULTIPROC_DIR` is set (cli.py does): each writes to files of its
+own there, which stay when the process ends, so no count ever goes back. What a step counts lies in `Cells`;
+the rest is prometheus_client's.
+"""
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest, multiprocess
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    disable_created_metrics,
+    generate_latest,
+    multiprocess,
+)
+from prometheus_client.metrics_core import Metric
+
+from specshield import __version__
+from specshield.errors import tree
+from specshield.service.watch import logs
+from specshield.service.watch.cells import Cells
+from specshield.shield.decision import Decision
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-SECONDS = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+SECONDS = (
+    0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0,
+)  # fmt: skip
+MASS = (1e-4, 1e-3, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.99, 1.0)
+RESIDUAL = (1e-6, 1e-3, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m] and [rad]
+MODES = ("prior", "shaped", "completion", "fallback", "violated")
+REASONS = ("infeasible", "zero_prior_mass", "margin_unattainable")
 
+disable_created_metrics()  # type: ignore[no-untyped-call]
 registry = CollectorRegistry()
 requests = Counter(
     "specshield_requests", "Requests answered.", ["method", "route", "status"], registry=registry
@@ -16,16 +46,109 @@ requests = Counter(
 request_seconds = Histogram(
     "specshield_request_seconds", "Time to answer.", ["method", "route"], buckets=SECONDS, registry=registry
 )
-decisions = Counter("specshield_decisions", "Steps decided, without replays.", ["mode"], registry=registry)
-part_seconds = Histogram(
-    "specshield_step_part_seconds", "Time of a step by part.", ["part"], buckets=SECONDS, registry=registry
+refusals = Counter("specshield_refusals", "Problem documents sent.", ["type"], registry=registry)
+watchers = Gauge(
+    "specshield_watchers", "Streams of events that are open.", registry=registry, multiprocess_mode="livesum"
 )
+build = Gauge(
+    "specshield_build_info", "1, with the version.", ["version"],
+    registry=registry, multiprocess_mode="max",
+)  # fmt: skip
+build.labels(__version__).set(1)
+_refusal = {error.type: refusals.labels(error.type) for error in tree()}
+
+cells = Cells()
+_held, _observe = cells.held, cells.observe
+decisions = cells.family("specshield_decisions", "Steps decided, without replays.", "mode", MODES)
+reasons = cells.family("specshield_reasons", "Decisions that carry a reason.", "reason", REASONS)
+uncertified = cells.family(
+    "specshield_decisions_without_witness", "Decisions on a pending rule that certify no way to keep it."
+)
+replays = cells.family("specshield_replays", "Steps answered again from the store.")
+passed_over = cells.family(
+    "specshield_steps_passed_over", "Poses told later, of steps that a robot took without a decision."
+)
+part_seconds = cells.family(
+    "specshield_step_part_seconds", "Time of a step by part.", "part", ("rollout", "store"), SECONDS
+)
+mass_ratio = cells.family(
+    "specshield_feasible_mass_ratio", "Probability that the model gave to feasible actions.", bounds=MASS
+)
+residual_meters = cells.family(
+    "specshield_residual_meters", "From a pose to the nearest one foreseen.", bounds=RESIDUAL
+)
+residual_radians = cells.family(
+    "specshield_residual_radians", "From a heading to that of the nearest pose foreseen.", bounds=RESIDUAL
+)
+_MODE = {mode: decisions.cell(mode) for mode in MODES}
+_REASON = {reason: reasons.cell(reason) for reason in REASONS}
+_ROLLOUT, _STORE = part_seconds.cell("rollout"), part_seconds.cell("store")
 
 
-def exposition() -> bytes:
-    """Prometheus text format."""
+@lru_cache(maxsize=1024)
+def _request(method: str, route: str, status: int) -> tuple[Counter, Histogram]:
+    return requests.labels(method, route, status), request_seconds.labels(method, route)
+
+
+def answered(method: str, route: str, status: int, seconds: float) -> None:
+    """A request was answered. The route is its template: what a caller makes up is no label."""
+    count, time = _request(method, route, status)
+    count.inc()
+    time.observe(seconds)
+
+
+def refused(type: str) -> None:
+    """A problem document was sent."""
+    _refusal[type].inc()
+
+
+def replayed() -> None:
+    """A step was answered from the store."""
+    _held[replays.first] += 1.0
+
+
+def decided(decision: Decision, told_later: int, timing: Mapping[str, float]) -> None:
+    """A step was decided, and is no replay; a line at debug tells of it.
+
+    told_later: the poses before x_t that came with it. timing: seconds of `rollout` and `store`.
+    """
+    mass, residual = decision.feasible_mass, decision.residual
+    _held[_MODE[decision.mode]] += 1.0
+    if decision.reason is not None:
+        _held[_REASON[decision.reason]] += 1.0
+    if decision.witness is None and decision.mode != "prior":
+        _held[uncertified.first] += 1.0
+    if told_later > 0:
+        _held[passed_over.first] += told_later
+    if mass is not None:
+        _observe(mass_ratio.first, MASS, mass)
+    if residual is not None:
+        _observe(residual_meters.first, RESIDUAL, residual[0])
+        _observe(residual_radians.first, RESIDUAL, residual[1])
+    _observe(_ROLLOUT, SECONDS, timing["rollout"])
+    _observe(_STORE, SECONDS, timing["store"])
+    if decision.finished:
+        logs.tell("session finished", spec_status=decision.spec_status, t=decision.t)
+    if logs.log.isEnabledFor(logging.DEBUG):
+        ms = {f"{part}_ms": round(1000 * seconds, 3) for part, seconds in timing.items()}
+        about = {name: getattr(decision, name) for name in ("t", "mode", "action_name", "feasible_mass")}
+        logs.tell("decided", logging.DEBUG, **about, **ms)
+
+
+def exposition(gauges: Iterable[Metric] = ()) -> bytes:
+    """Prometheus text format: what all processes counted, and `gauges`."""
+    every = registry
     if "PROMETHEUS_MULTIPROC_DIR" in os.environ:
         every = CollectorRegistry()
         multiprocess.MultiProcessCollector(every)  # type: ignore[no-untyped-call]
-        return generate_latest(every)
-    return generate_latest(registry)
+    return generate_latest(every) + generate_latest(_Given([*cells.collect(), *gauges]))
+
+
+class _Given(CollectorRegistry):
+    """A registry of families that are there already."""
+
+    def __init__(self, families: list[Metric]) -> None:
+        self._families = families
+
+    def collect(self) -> Iterable[Metric]:
+        return self._families

@@ -13,6 +13,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.routing import Match
+from starlette.types import Receive, Scope, Send
 
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
@@ -90,7 +91,19 @@ def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -
         extra["WWW-Authenticate"] = "Bearer"
     if status == 503:
         extra["Retry-After"] = "1"
-    return Response(json.dumps(document(error)), status, extra, media_type=MEDIA_TYPE)
+    return ProblemResponse(error, status, extra)
+
+
+class ProblemResponse(Response):
+    """A problem document. Once it is sent, `scope["state"]["problem"]` is its type."""
+
+    def __init__(self, error: SpecshieldError, status: int, headers: Mapping[str, str]) -> None:
+        super().__init__(json.dumps(document(error)), status, headers, media_type=MEDIA_TYPE)
+        self._type = error.type
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope["state"]["problem"] = self._type
+        await super().__call__(scope, receive, send)
 
 
 def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = "") -> InputError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
+from typing import Literal
 
 from pydantic import AliasChoices, Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -61,6 +62,13 @@ class Settings(BaseSettings):
         default=7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
     )
     shield_cache: int = Field(default=32, ge=1, description="Prepared shields kept in memory.")
+
+    log_format: Literal["text", "json"] = Field(
+        default="text", description="Lines of the log, for people or for programs."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="The least that is logged; `debug` tells of each decision."
+    )
 
     worker: bool | None = Field(
         default=None, description="Start a training worker too. Unset: where the store is embedded."

@@ -15,6 +15,7 @@ from specshield.service.startup import Startup
 from specshield.service.storage.store import Store
 from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import Jobs
+from specshield.service.watch.gauges import Gauges
 
 
 @dataclass
@@ -27,6 +28,7 @@ class Server:
     policies: Policies
     sessions: Sessions
     jobs: Jobs
+    gauges: Gauges
     worker: TrainingWorker | None
     startup: Startup
 

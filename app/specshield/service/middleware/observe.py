@@ -1,4 +1,4 @@
-"""Request ids, Server-Timing and metrics."""
+"""Request ids, Server-Timing, metrics, and a line of the log for what is refused."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from specshield.service import metrics
+from specshield.service.watch import logs
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
@@ -29,6 +30,8 @@ class Observe:
         scope.setdefault("state", {})["timing"] = timing
         asked = Headers(scope=scope).get("x-request-id", "")
         request_id = asked if REQUEST_ID.fullmatch(asked) else secrets.token_hex(8)
+        scope["state"]["request_id"] = request_id
+        logs.request.set(scope)
         status = 500
 
         async def answer(message: Message) -> None:
@@ -48,5 +51,14 @@ class Observe:
         finally:
             route = getattr(scope.get("route"), "path", "other")
             method = scope["method"] if route != "other" else "other"  # what a caller makes up is no label
-            metrics.requests.labels(method, route, status).inc()
-            metrics.request_seconds.labels(method, route).observe(time.perf_counter() - start)
+            metrics.answered(method, route, status, time.perf_counter() - start)
+            if status >= 400:
+                _tell_refusal(scope, method, route, status)
+
+
+def _tell_refusal(scope: Scope, method: str, route: str, status: int) -> None:
+    """What failed (500 and above) has a line already that says more; it is only counted here."""
+    type = scope["state"].get("problem", "error")
+    metrics.refused(type)
+    if status < 500:
+        logs.tell("refused", type=type, status=status, method=method, route=route)

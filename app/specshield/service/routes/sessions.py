@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
-from specshield.service import examples, metrics
+from specshield.service import examples
 from specshield.service.schemas.answers import to_json
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse
@@ -20,6 +20,7 @@ from specshield.service.schemas.steps import (
     Trajectory,
 )
 from specshield.service.state import Cursor, Limit, ServerState, problems
+from specshield.service.watch import logs
 
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
 SessionId = Annotated[
@@ -48,7 +49,9 @@ async def create(request: SessionRequest, server: ServerState) -> Any:
     action from x_0 has a future that satisfies the specification (unless `allow_infeasible`). It is erased
     when it has not changed for the server's time to live.
     """
-    return await server.sessions.create(request)
+    begun = await server.sessions.create(request)
+    logs.tell("session begun", session_id=begun["id"], policy_ids=begun["policy_ids"])
+    return begun
 
 
 @router.get(
@@ -72,6 +75,7 @@ async def read(session_id: SessionId, server: ServerState) -> Any:
 async def delete(session_id: SessionId, server: ServerState) -> Response:
     """Erases the session with its trajectory and its answers."""
     await server.sessions.delete(session_id)
+    logs.tell("session erased")
     return Response(status_code=204)
 
 
@@ -98,11 +102,7 @@ async def step(session_id: SessionId, body: StepRequest, request: Request, serve
     for byte, so a lost answer can be asked for again. Nothing is stored on an error.
     """
     timing = request.scope["state"]["timing"]
-    answer, mode = await server.sessions.steps.decide(session_id, body, timing)
-    if mode is not None:
-        metrics.decisions.labels(mode).inc()
-        for part, seconds in timing.items():
-            metrics.part_seconds.labels(part).observe(seconds)
+    answer = await server.sessions.steps.decide(session_id, body, timing)
     return Response(to_json(answer), media_type="application/json")
 
 
@@ -116,7 +116,9 @@ async def step(session_id: SessionId, body: StepRequest, request: Request, serve
 )
 async def close(session_id: SessionId, body: CloseRequest, server: ServerState) -> Any:
     """Hand in the last states, which no decision follows, and get the verdict. The trajectory stays."""
-    return await server.sessions.close(session_id, body)
+    closed = await server.sessions.close(session_id, body)
+    logs.tell("session closed", spec_status=closed["spec_status"], next_t=closed["next_t"])
+    return closed
 
 
 @router.get(

@@ -41,6 +41,6 @@ async def readyz(server: ServerState) -> Health:
     summary="Metrics",
     responses={200: {"content": {"text/plain": {}}, "description": "Prometheus text format."}},
 )
-async def show() -> Response:
+async def show(server: ServerState) -> Response:
     """Counters and times, for Prometheus."""
-    return Response(metrics.exposition(), media_type=metrics.MEDIA_TYPE)
+    return Response(metrics.exposition(await server.gauges.read()), media_type=metrics.MEDIA_TYPE)

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import msgspec
 import numpy as np
 
+from specshield.service import metrics
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.schemas.steps import StepRequest
 from specshield.service.sessions import record
@@ -40,10 +41,8 @@ class Steps:
     def __init__(self, store: Store, shields: Shields, threads: ThreadPoolExecutor, ttl: int) -> None:
         self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
 
-    async def decide(
-        self, id: str, request: StepRequest, timing: dict[str, float]
-    ) -> tuple[StepAnswer, str | None]:
-        """The answer, and its mode; None for a replay. `timing` collects the seconds of rollout and store."""
+    async def decide(self, id: str, request: StepRequest, timing: dict[str, float]) -> StepAnswer:
+        """The answer. `timing` collects the seconds of rollout and store."""
         for _ in range(RACES):
             with _clock(timing, "store"):
                 found = await self._store.load(id, request.t)
@@ -51,7 +50,8 @@ class Steps:
                 raise missing(id)
             session = Session.of(found)
             if found.step is not None:
-                return replay(session, found.step, request), None
+                metrics.replayed()
+                return replay(session, found.step, request)
             check_step(session, request)
             loop = asyncio.get_running_loop()
             session, decision, made = await loop.run_in_executor(
@@ -71,9 +71,10 @@ class Steps:
             )
             change = Change(state.packed(), *session.added(), request.t, content)
             with _clock(timing, "store"):
-                if isinstance(await self._store.append(id, session.version, change), bytes):
-                    answer = record.answer(made, session.rows[-1], session.config["actions"])
-                    return answer, decision.mode
+                kept = isinstance(await self._store.append(id, session.version, change), bytes)
+            if kept:
+                metrics.decided(decision, len(session.rows) - 1 - session.state.length, timing)
+                return record.answer(made, session.rows[-1], session.config["actions"])
         raise contended(id)
 
     def _decide(

@@ -190,6 +190,11 @@ class Store:
         async with self._reaching():
             return int(await self.redis.zcard(INDEX))
 
+    async def held_bytes(self) -> int:
+        """The memory that the store takes."""
+        async with self._reaching():
+            return int((await self.redis.info("memory"))["used_memory"])
+
     async def _configs(self, ids: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
         async with self.redis.pipeline(transaction=False) as pipe:
             for id in ids:

@@ -18,8 +18,11 @@ from rq import Queue
 from rq.serializers import JSONSerializer
 
 from specshield.errors import StoreError
+from specshield.policy.methods import METHODS
 from specshield.service.settings import Settings
+from specshield.service.watch import logs
 
+ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
 SIGN_OF_LIFE = 5  # seconds without one after which a run, or the last worker, is taken for dead
 WRITE = """
 if redis.call('HGET', KEYS[1], 'attempt') ~= ARGV[1] then return 0 end
@@ -74,6 +77,7 @@ class Jobs:
             )
 
         self._try(enqueue)
+        logs.tell("policy queued", policy_id=id, method=method)
 
     def get(self, id: str) -> Training:
         """How the training of a policy stands. One that the store knows nothing of counts as failed."""
@@ -94,9 +98,33 @@ class Jobs:
         """Cancels the run. One that has begun stops within about a second, a queued one at its turn."""
         fields = {"attempt": "", "status": "failed", "error": "cancelled", "eta_s": ""}
         self._try(lambda: self.redis.hset(_key(id), mapping=fields))
+        logs.tell("policy cancelled", policy_id=id)
 
     def forget(self, id: str) -> None:
         self._try(lambda: self.redis.unlink(_key(id)))
+
+    def counts(self) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], int]]:
+        """By method and state: the runs that are queued or training now, and all that have ended."""
+        methods = METHODS.names()
+
+        def ask() -> tuple[list[int], dict[bytes, bytes]]:
+            with self.redis.pipeline(transaction=False) as pipe:
+                for name in methods:
+                    queue = Queue(queue_of(name), connection=self.redis, serializer=JSONSerializer)
+                    pipe.llen(queue.key)
+                    pipe.zcard(queue.started_job_registry.key)
+                pipe.hgetall(ENDED)
+                *now, ended = pipe.execute()
+            return now, ended
+
+        now, ended = self._try(ask)
+        live = [(name, state) for name in methods for state in ("queued", "training")]
+        told = {tuple(key.decode().split(" ", 1)): int(count) for key, count in ended.items()}
+        return dict(zip(live, now, strict=True)), told
+
+    def ended(self, method: str, state: str) -> None:
+        """Counts a run that came to its end, `ready` or `failed`."""
+        self._try(lambda: self.redis.hincrby(ENDED, f"{method} {state}", 1))
 
     # --- for the run itself
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
+import logging.config
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import redis
-from rq import Worker
+from rq import Worker, get_current_job
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
@@ -23,6 +24,7 @@ from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, queue_of
+from specshield.service.watch import logs
 
 log = logging.getLogger("specshield")
 
@@ -33,6 +35,7 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = ()) -> No
     others: queues of jobs that are no training runs and look after themselves. Raises StoreError where the
     store has failed the worker for good.
     """
+    logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
     if settings.redis_url is None:
         embedded = EmbeddedStore(settings.data_dir)
         embedded.join()
@@ -101,7 +104,8 @@ class _Worker(Worker):
         if job.origin not in self._training:
             return
         id, attempt = job.args
-        self._jobs.report(id, attempt, status="failed", error=reason, eta_s="")
+        if self._jobs.report(id, attempt, status="failed", error=reason, eta_s=""):
+            _ended(self._jobs, job, "failed", reason)
 
 
 def train(id: str, attempt: str) -> None:
@@ -119,6 +123,7 @@ def train(id: str, attempt: str) -> None:
     live()  # first: a run that is said to train without a sign of life is taken for dead
     if not jobs.report(id, attempt, status="training"):
         return  # cancelled, or asked for again
+    logs.tell("making a policy", policy_id=id)
     with _regularly(live):
         try:
             _train(settings, jobs, id, attempt, cancelled)
@@ -132,7 +137,18 @@ def train(id: str, attempt: str) -> None:
             name = type(error).__name__  # its text may tell of the inside: paths, lines of code
             said = f"an unexpected {name}; the worker's log says more"
             done = {"status": "failed", "error": said, "eta_s": ""}
-        jobs.report(id, attempt, **done)  # of no effect once cancelled
+        if jobs.report(id, attempt, **done):  # of no effect once cancelled
+            _ended(jobs, get_current_job(), done["status"], done.get("error"))
+
+
+def _ended(jobs: Jobs, job: Any, state: str, error: str | None) -> None:
+    method = job.origin.removeprefix(queue_of(""))
+    with suppress(StoreError):  # a count that is lost is no reason to fail
+        jobs.ended(method, state)
+    told = {} if error is None else {"error": error}
+    logs.tell(
+        "policy made" if error is None else "policy not made", policy_id=job.args[0], method=method, **told
+    )
 
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:

@@ -1,0 +1,64 @@
+"""What /metrics asks of the store when it is scraped: each server tells the same of all."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import anyio
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
+
+from specshield.errors import StoreError
+from specshield.service.storage.store import Store
+from specshield.service.training.jobs import Jobs
+
+KEPT_FOR = 2.0  # [s] a scrape is answered from the one before; chosen by hand
+
+
+class Gauges:
+    """Sessions, jobs and memory. While the store is away there is `specshield_store_up 0` alone."""
+
+    def __init__(self, store: Store, jobs: Jobs) -> None:
+        self._store, self._jobs = store, jobs
+        self._asking = anyio.Lock()
+        self._asked, self._found = -KEPT_FOR, list[Metric]()
+
+    async def read(self) -> list[Metric]:
+        """The families, at most KEPT_FOR old."""
+        async with self._asking:  # of many scrapes at once one asks
+            if time.monotonic() - self._asked > KEPT_FOR:
+                try:
+                    self._found = list(await self._families())
+                except StoreError:
+                    self._found = [_up(0)]
+                self._asked = time.monotonic()
+        return self._found
+
+    async def _families(self) -> Iterator[Metric]:
+        sessions, held = await self._store.count(), await self._store.held_bytes()
+        waiting, ended = await anyio.to_thread.run_sync(self._jobs.counts)
+        return iter(
+            (
+                _up(1),
+                GaugeMetricFamily("specshield_sessions", "Sessions that the store holds.", sessions),
+                GaugeMetricFamily("specshield_store_bytes", "Memory that the store takes.", held),
+                _by(GaugeMetricFamily, "specshield_jobs", "Jobs that wait or run.", waiting),
+                _by(CounterMetricFamily, "specshield_jobs_ended", "Jobs that have ended.", ended),
+            )
+        )
+
+
+def _up(value: int) -> Metric:
+    return GaugeMetricFamily("specshield_store_up", "Whether the store answers.", value)
+
+
+def _by(
+    kind: type[GaugeMetricFamily] | type[CounterMetricFamily],
+    name: str,
+    help: str,
+    counts: dict[tuple[str, str], int],
+) -> Metric:
+    family = kind(name, help, labels=["method", "state"])
+    for labels, count in counts.items():
+        family.add_metric(labels, count)
+    return family

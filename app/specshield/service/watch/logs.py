@@ -1,0 +1,94 @@
+"""Lines of the log, as text or as JSON (one object a line). They hold neither keys nor bodies.
+
+    logs.tell("session begun", session_id=id)               # at info
+    logs.tell("decided", logging.DEBUG, t=3, mode="shaped")
+
+Inside a request its id, its session and its trace (of the header `traceparent`) are added where the line is
+written, so a request that logs nothing pays for none of it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from typing import Any
+
+from starlette.types import Scope
+from uvicorn.config import LOGGING_CONFIG
+from uvicorn.logging import DefaultFormatter
+
+LEVELS = ("debug", "info", "warning", "error")
+log = logging.getLogger("specshield")
+request: ContextVar[Scope | None] = ContextVar("request", default=None)  # the one that is being answered
+TRACEPARENT = re.compile(rb"[0-9a-f]{2}-([0-9a-f]{32})-([0-9a-f]{16})-[0-9a-f]{2}")  # W3C Trace Context
+PLAIN = re.compile(r"[\w.:/{}@+-]+")  # what a text line shows without quotes
+
+
+def tell(message: str, level: int = logging.INFO, /, **about: Any) -> None:
+    """One line: what happened, and what it was about."""
+    if log.isEnabledFor(level):
+        log.log(level, message, extra={"about": about})
+
+
+def config(form: str, level: str) -> dict[str, Any]:
+    """For uvicorn and for logging.config.dictConfig: all lines go to standard error in one form."""
+    kind = "specshield.service.watch.logs." + ("Json" if form == "json" else "Text")
+    own = {"handlers": ["default"], "level": level.upper(), "propagate": False}
+    loggers = {**LOGGING_CONFIG["loggers"], "specshield": own}
+    formatters = {"default": {"()": kind, "fmt": "%(levelprefix)s %(message)s"}}
+    handlers = {"default": LOGGING_CONFIG["handlers"]["default"]}
+    # Access lines are the metrics' and the refusals' part: uvicorn's own cost a request some 60 us.
+    del loggers["uvicorn.access"]
+    return {**LOGGING_CONFIG, "formatters": formatters, "handlers": handlers, "loggers": loggers}
+
+
+class Text(DefaultFormatter):
+    """uvicorn's form, with what a line is about after it: `INFO:     session begun  session_id=a`."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802
+        if record.name == log.name:  # a path that a caller made up must not begin a line of its own
+            record.message = record.message.replace("\r", "\\r").replace("\n", "\\n")
+        shown = " ".join(f"{name}={_plain(value)}" for name, value in _about(record).items())
+        return super().formatMessage(record) + (f"  {shown}" if shown else "")
+
+
+class Json(logging.Formatter):
+    """time, level, logger, message, what the line is about, and the traceback where there is one."""
+
+    def __init__(self, **_: Any) -> None:
+        super().__init__()
+
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **_about(record),
+        }
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def _about(record: logging.LogRecord) -> dict[str, Any]:
+    about: dict[str, Any] = dict(getattr(record, "about", ()))
+    scope = request.get()
+    if scope is None:
+        return about
+    session = scope.get("path_params", {}).get("session_id")
+    if session is not None:
+        about.setdefault("session_id", session)
+    about["request_id"] = scope["state"].get("request_id")
+    traced = TRACEPARENT.fullmatch(dict(scope["headers"]).get(b"traceparent", b""))
+    if traced:
+        about |= {"trace_id": traced[1].decode(), "span_id": traced[2].decode()}
+    return about
+
+
+def _plain(value: Any) -> str:
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return text if PLAIN.fullmatch(text) else json.dumps(text)
