@@ -22,21 +22,17 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from specshield.client import Decision, Session, ShieldClient, Verdict
+from specshield.client import Decision, LocalDecision, Session, ShieldClient, Verdict
 from specshield.errors import NotFound, ServerError, Starting, StoreError, TransportError
 from specshield.sim.cases import load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import Pose, SimulatedRobot
 
 T = TypeVar("T")
+Robust = Session[Decision | LocalDecision]  # whose steps answer also while the service is away
 POLICY = "case1"  # the rule: visit a charger within 60 steps, and again between steps 80 and 140
 START = (4.5, 5.0, 0.0)  # x [m], y [m], theta [rad]
-AWAY = (
-    TransportError,
-    Starting,
-    StoreError,
-    ServerError,
-)  # what a call raises while the service cannot answer
+AWAY = (TransportError, Starting, StoreError, ServerError)  # what a call raises while the service is away
 PAUSE = 0.5  # [s] between two tries where there is nothing to do but wait
 NOTES = Path("robot_loop.json")
 
@@ -45,13 +41,11 @@ NOTES = Path("robot_loop.json")
 class Notes:
     """What the robot must still know after a restart of its process. They are written before every motion.
 
-    plan: the actions that keep the rule to its end, from the next step on, as the service last certified.
     unsent: the poses, by step, that the service has not confirmed yet. pose: where the robot is.
     """
 
     session: str
     pose: Pose
-    plan: list[int] = field(default_factory=list)
     unsent: dict[int, Pose] = field(default_factory=dict)
     main_task_done: bool = False
 
@@ -70,60 +64,38 @@ class Notes:
 
 def drive(client: ShieldClient, robot: Any, model: Any, file: Path) -> Verdict:
     """Drives one session to its end, or goes on with the one that `file` tells of."""
-    session, notes = begin_or_resume(client, robot, file)
+    session = begin_or_resume(client, robot, file)
     while not session.finished:
-        pose = robot.pose
-        logits = None if session.main_task_done else model.logits(robot)
-        decision = ask(session, pose, logits, notes.plan)
-        if decision is None:  # the service is away: the plan keeps the rule, the model's own task waits
-            notes.unsent[session.t] = pose
-            session.record(pose)  # the service gets this pose with the next step that reaches it
-            action, notes.plan = notes.plan[0], notes.plan[1:]
-        else:
-            # A bump needs nothing here: the service certifies anew from the pose it is told, and
-            # `decision.residual` says how far that is from the pose it foresaw.
-            action, notes.plan, notes.unsent = decision.execute, list(decision.witness or ()), {}
-        notes.pose, notes.main_task_done = pose, session.main_task_done
-        notes.write(file)
-        if not session.finished:
-            robot.execute(action)
+        # While the service is away, the step follows the continuation that it certified last, and the service
+        # hears of it later. Where there is nothing certified to do, `execute` is None: the robot stands.
+        # A bump needs nothing here: the service certifies anew from the pose it is told.
+        decision = session.step(robot.pose, None if session.main_task_done else model.logits(robot))
+        Notes(session.id, robot.pose, session.unsent, session.main_task_done).write(file)
+        if decision.execute is not None and not session.finished:
+            robot.execute(decision.execute)
     verdict = patiently(lambda: session.close(robot.pose))
     file.unlink()
     return verdict
 
 
-def ask(session: Session, pose: Pose, logits: Any, plan: list[int]) -> Decision | None:
-    """The decision of the next step; None if the service is away and there is a plan to follow meanwhile.
-
-    Without a plan the robot stands and asks again, with the same pose and logits: the service may have
-    decided this step, and only its answer was lost. It gives the same answer to the same question.
-    """
-    while True:
-        try:
-            return session.step(pose, logits)
-        except AWAY:  # noqa: PERF203
-            if plan:
-                return None
-            time.sleep(PAUSE)
-
-
-def begin_or_resume(client: ShieldClient, robot: Any, file: Path) -> tuple[Session, Notes]:
+def begin_or_resume(client: ShieldClient, robot: Any, file: Path) -> Robust:
     if file.exists():
         notes = Notes.read(file)
         try:
-            session = patiently(lambda: client.sessions.get(notes.session))
+            session = patiently(lambda: client.sessions.get(notes.session, on_failure="witness"))
         except NotFound:
             print("the service no longer knows the session of these notes: a new one begins")
         else:
             session.main_task_done = session.main_task_done or notes.main_task_done
             while session.t in notes.unsent:  # the steps of an outage that the service has not heard of yet
                 session.record(notes.unsent[session.t])
-            return session, notes
+            return session
     # Some room for surprises: visits are planned 8 steps early, and 5 cm inside the region.
-    session = patiently(
-        lambda: client.sessions.create(policy_id=POLICY, initial_pose=robot.pose, slack=8, margin=0.05)
+    return patiently(
+        lambda: client.sessions.create(
+            policy_id=POLICY, initial_pose=robot.pose, slack=8, margin=0.05, on_failure="witness"
+        )
     )
-    return session, Notes(session.id, robot.pose)
 
 
 def patiently(call: Callable[[], T]) -> T:

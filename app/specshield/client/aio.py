@@ -160,12 +160,12 @@ def awaiting(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource, P], C
 
 
 def awaiting_step(
-    flow: Callable[Concatenate[AsyncSession, P], Flow[T]],
-) -> Callable[Concatenate[AsyncSession, P], Coroutine[Any, Any, T]]:
+    flow: Callable[Concatenate[AsyncSession[Any], P], Flow[T]],
+) -> Callable[Concatenate[AsyncSession[Any], P], Coroutine[Any, Any, T]]:
     """The method of a session that makes this call, which is a method of its state."""
 
     @looks_like(flow)
-    async def method(self: AsyncSession, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    async def method(self: AsyncSession[Any], /, *args: P.args, **kwargs: P.kwargs) -> T:
         return await self._run(flow(self, *args, **kwargs))
 
     return method

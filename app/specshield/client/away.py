@@ -108,12 +108,12 @@ class Continuation:
             branch if branch.plan else "the certified continuation has ended: the rule's last step is reached"
         )
 
-    def follow(self, branch: Branch) -> Pose | None:
-        """Take its first action; where that should lead, None if it was never told."""
-        motion = self.motions.get(branch.plan[0])
-        after = None if motion is None else _moved(branch.pose, motion)
-        self.branches = () if after is None else (Branch(after, branch.plan[1:]),)
-        return after
+    def follow(self, pose: Pose) -> None:
+        """From `pose` the next action is run: what leads on is where that ends, or nothing from elsewhere."""
+        way = self.at(pose)
+        self.branches = ()
+        if isinstance(way, Branch) and way.plan[0] in self.motions:
+            self.branches = (Branch(_moved(way.pose, self.motions[way.plan[0]]), way.plan[1:]),)
 
 
 def _difference(a: Pose, b: Pose) -> Pose:

@@ -71,8 +71,12 @@ class SessionState:
         return {t: pose for t, pose in self._poses.items() if self._stored <= t < self.t}
 
     def record(self, pose: Numbers) -> None:
-        """Note x_t of a step that goes without a decision (the service was away), and move on to t + 1."""
+        """Note x_t of a step that goes without a decision (the service was away), and move on to t + 1.
+
+        Where x_t is on the certified continuation, its next action is taken to be the one that is run.
+        """
         self._poses[self.t] = pose_values(pose)
+        self._continuation.follow(self._poses[self.t])
         self.t += 1
 
     def _step(
@@ -133,9 +137,9 @@ class SessionState:
     def _alone(self, x_t: Pose, way: Branch, over: bool, error: SpecshieldError | None) -> LocalDecision:
         """Follow the certified continuation through this step."""
         t, self.main_task_done = self.t, over
-        leads = self._continuation.follow(way)
         self.record(x_t)
         reason = "the service cannot answer; the certified continuation is followed"
+        leads = next((branch.pose for branch in self._continuation.branches), None)
         return LocalDecision(
             t, "witness", way.plan[0], reason, self.spec_status, way.plan[1:], leads, error=error
         )

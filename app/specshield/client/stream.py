@@ -75,14 +75,16 @@ class Streams:
         }
 
     def _read(self, exchange: Exchange, message: bytes | str) -> Reply | None:
-        """None for an answer about another step."""
+        """None for what is no answer, or one about another step."""
         import msgpack
 
         try:
             document = msgpack.unpackb(message) if isinstance(message, bytes) else None
         except (ValueError, msgpack.exceptions.UnpackException):
             document = None
-        status = document.get("status", 200) if isinstance(document, dict) and "type" in document else 200
+        if not isinstance(document, dict):
+            return None
+        status = document.get("status", 200) if "type" in document else 200
         return exchange.streamed(status, PROBLEM if status != 200 else {}, document)
 
 
@@ -91,7 +93,9 @@ def _refusal(error: Exception) -> httpx.Response | None:
     answer = getattr(error, "response", None)
     if answer is None:
         return None
-    return httpx.Response(answer.status_code, headers=dict(answer.headers.raw_items()), content=answer.body)
+    return httpx.Response(
+        answer.status_code, headers=dict(answer.headers.raw_items()), content=bytes(answer.body or b"")
+    )
 
 
 class SyncStreams(Streams):
@@ -132,7 +136,8 @@ class SyncStreams(Streams):
 
         def make() -> None:
             try:
-                made.append(connect(self._address(exchange.request), **self._options(exchange.seconds)))
+                options = self._options(exchange.seconds)
+                made.append(connect(self._address(exchange.request), **options).__enter__())
             except BaseException as error:
                 made.append(error)
             if over.is_set():
@@ -193,7 +198,9 @@ class AsyncStreams(Streams):
         connection = self._open.get(path)
         if connection is None:
             options = self._options(exchange.seconds)
-            connection = self._open[path] = await connect(self._address(exchange.request), **options)
+            connection = self._open[path] = await connect(
+                self._address(exchange.request), **options
+            ).__aenter__()
         await connection.send(message)
         return self._read(exchange, await connection.recv())
 

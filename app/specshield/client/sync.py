@@ -163,11 +163,13 @@ def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource, P], T
     return method
 
 
-def blocking_step(flow: Callable[Concatenate[Session, P], Flow[T]]) -> Callable[Concatenate[Session, P], T]:
+def blocking_step(
+    flow: Callable[Concatenate[Session[Any], P], Flow[T]],
+) -> Callable[Concatenate[Session[Any], P], T]:
     """The method of a session that makes this call, which is a method of its state."""
 
     @looks_like(flow)
-    def method(self: Session, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def method(self: Session[Any], /, *args: P.args, **kwargs: P.kwargs) -> T:
         return self._run(flow(self, *args, **kwargs))
 
     return method

@@ -1,0 +1,150 @@
+"""Steps over a WebSocket in MessagePack, against a server that misbehaves when it is told to."""
+
+import asyncio
+import contextlib
+import json
+import sys
+import threading
+import time
+from http import HTTPStatus
+
+import msgpack
+import pytest
+from client_script import SESSION
+from test_deadline import decided
+from websockets.sync.server import serve
+
+from specshield import errors
+from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient
+from specshield.client.models import build
+
+POSE, LOGITS = (0.0, 0.0, 0.0), [0.0, None]
+INFO = build(SessionInfo, SESSION)
+
+
+class Server:
+    """`faults[n]` is what the n-th message meets: "drop", "stale", "late", "mute", "text" or a problem."""
+
+    def __init__(self, *faults, refuse=None):
+        self.faults, self.refuse = list(faults), refuse
+        self.messages, self.paths, self.keys = [], [], []
+
+    def __call__(self, connection):
+        with contextlib.suppress(Exception):
+            for message in connection:
+                body = msgpack.unpackb(message)
+                self.messages.append(body)
+                fault = self.faults.pop(0) if self.faults else None
+                answer = decided(body["t"])
+                if fault == "drop":
+                    return
+                if fault == "mute":
+                    continue
+                if fault == "late":
+                    time.sleep(0.5)
+                if fault == "stale":
+                    answer = decided(body["t"] - 1)
+                if isinstance(fault, dict):
+                    answer = fault
+                connection.send("not MessagePack" if fault == "text" else msgpack.packb(answer))
+
+    def look(self, connection, request):
+        self.paths.append(request.path)
+        self.keys.append(request.headers.get("Authorization"))
+        if self.refuse is None:
+            return None
+        response = connection.respond(HTTPStatus(self.refuse["status"]), json.dumps(self.refuse))
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = "application/problem+json"
+        return response
+
+
+@pytest.fixture(params=["sync", "async"])
+def stepping(request):
+    """stepping(server, n, **options): the answers to n steps of one session over one client."""
+
+    def run(handler, n=1, timeout=10.0, **options):
+        async def awaited(url):
+            async with AsyncShieldClient(url, api_key="key", timeout=timeout, stream=True) as client:
+                session = AsyncSession(client._run, INFO, POSE)
+                return [await session.step(POSE, LOGITS, **options) for _ in range(n)]
+
+        def blocking(url):
+            with ShieldClient(url, api_key="key", timeout=timeout, stream=True) as client:
+                session = Session(client._run, INFO, POSE)
+                return [session.step(POSE, LOGITS, **options) for _ in range(n)]
+
+        with serve(handler, "127.0.0.1", 0, process_request=handler.look, compression=None) as server:
+            thread = threading.Thread(target=server.serve_forever, daemon=True)
+            thread.start()
+            url = f"http://127.0.0.1:{server.socket.getsockname()[1]}/prefix"
+            try:
+                return blocking(url) if request.param == "sync" else asyncio.run(awaited(url))
+            finally:
+                server.shutdown()
+                thread.join()
+
+    return run
+
+
+def test_steps_go_over_one_connection_in_messagepack(stepping):
+    server = Server()
+    decisions = stepping(server, 5)
+    assert [decision.t for decision in decisions] == [0, 1, 2, 3, 4]
+    assert decisions[0].distribution == (1.0, 0.0)
+    assert server.paths == ["/prefix/v1/sessions/s/stream"]
+    assert server.keys == ["Bearer key"]
+    assert server.messages[1] == {
+        "t": 1,
+        "poses": [[0, 0, 0]],
+        "logits": [0.0, None],
+        "main_task_done": False,
+        "witnesses": False,
+    }
+
+
+@pytest.mark.parametrize("fault", ["drop", "stale", "text"])
+def test_a_lost_connection_and_a_wrong_answer_are_asked_again_on_a_new_one(stepping, fault):
+    server = Server(None, fault, fault)
+    assert [decision.t for decision in stepping(server, 3)] == [0, 1, 2]
+    assert len(server.paths) == 3
+    assert [message["t"] for message in server.messages] == [0, 1, 1, 1, 2]
+
+
+def test_an_answer_that_comes_late_is_never_read(stepping):
+    server = Server(None, "late")
+    assert [decision.t for decision in stepping(server, 3, timeout=0.3)] == [0, 1, 2]
+
+
+def test_a_server_that_says_nothing_is_left_at_the_deadline(stepping):
+    began = time.monotonic()
+    with pytest.raises(errors.TransportTimeout):
+        stepping(Server("mute"), timeout=600.0, deadline=0.2)
+    assert time.monotonic() - began < 20.0
+
+
+def test_problems_arrive_as_their_errors(stepping):
+    gap = {"type": "history-conflict", "status": 409, "detail": "no", "path": "poses[0]"}
+    server = Server(gap)
+    with pytest.raises(errors.HistoryConflict, match="no") as caught:
+        stepping(server)
+    assert (caught.value.path, len(server.messages)) == ("poses[0]", 1)
+    starting = {"type": "starting", "status": 503, "detail": "soon"}
+    assert stepping(Server(starting, starting))[0].t == 0
+
+
+def test_a_handshake_that_is_refused_is_the_error_that_the_server_names(stepping):
+    refusal = {"type": "not-found", "status": 404, "detail": "there is no session 's'"}
+    server = Server(refuse=refusal)
+    with pytest.raises(errors.NotFound, match="there is no session"):
+        stepping(server)
+    assert len(server.paths) == 1
+
+
+@pytest.mark.parametrize("client", [ShieldClient, AsyncShieldClient])
+@pytest.mark.parametrize("missing", ["msgpack", "websockets"])
+def test_without_the_packages_it_says_what_to_install(client, missing, monkeypatch):
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(errors.InputError, match=missing) as caught:
+        client("http://127.0.0.1:9", stream=True)
+    assert "specshield[stream]" in caught.value.expected
