@@ -83,6 +83,7 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
+    from specshield.service.bounds.protocol import raise_file_limit
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.watch import logs
 
@@ -93,9 +94,12 @@ def serve(
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
     if embedded is not None:
         embedded.join()  # and so is why it does not start
+    raise_file_limit()
     options: dict[str, Any] = {
         "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
         "timeout_graceful_shutdown": 5, "log_config": logs.config(settings.log_format, settings.log_level),
+        "http": "specshield.service.bounds.protocol:BoundedProtocol",
+        "timeout_keep_alive": settings.keep_alive_timeout, "ws_max_size": settings.max_body_bytes,
     }  # fmt: skip
     if workers == 1:  # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up
         from specshield.service.app import create_app
@@ -111,6 +115,7 @@ def serve(
 
 def worker(
     until_eof: Annotated[bool, typer.Option(help="Stop when standard input ends.", hidden=True)] = False,
+    learner: Annotated[bool, typer.Option(help="Only what takes hours.", hidden=True)] = False,
 ) -> None:
     """Make the policies that are asked for, until stopped; policies that learn need torch.
 
@@ -119,7 +124,7 @@ def worker(
     """
     from specshield.service.training.worker import serve as work
 
-    work(_settings(), until_eof, [queue.name for queue in entry_points(group="specshield.queues")])
+    work(_settings(), until_eof, [queue.name for queue in entry_points(group="specshield.queues")], learner)
 
 
 def openapi() -> None:

@@ -13,6 +13,8 @@ SpecshieldError
 │   ├── PolicyError             weights or a card that do not fit their task
 │   ├── InfeasibleStart         no action from the initial pose has a satisfying future
 │   ├── Unsupported             an accepted word whose power this build lacks
+│   ├── TooExpensive            it took more time or memory than the server gives to one request
+│   ├── HeadersTooLarge         request headers over the limit
 │   ├── BodyTooLarge            a request body over the limit
 │   └── UnsupportedMediaType    a body that is not declared as a type that is taken
 ├── NotFound                    no such map, policy, session or page
@@ -28,6 +30,8 @@ SpecshieldError
 ├── CrossSite                   a request that a page of another origin made
 ├── MisdirectedRequest          a Host that is not this server's
 ├── LimitReached                too many maps, policies or sessions kept; delete some
+├── Busy                        the server has too much to do just now; ask again after Retry-After
+├── RequestTimeout              the request took too long to arrive
 ├── TrainingUnavailable         no worker is there to train
 ├── Starting                    the server is not ready yet; ask again after Retry-After
 ├── StoreError                  the trajectory store cannot be reached
@@ -135,6 +139,14 @@ class Unsupported(InputError):
     type = "unsupported"
 
 
+class TooExpensive(InputError):
+    type = "too-expensive"
+
+
+class HeadersTooLarge(InputError):
+    type = "headers-too-large"
+
+
 class BodyTooLarge(InputError):
     type = "body-too-large"
 
@@ -193,6 +205,14 @@ class MisdirectedRequest(SpecshieldError):
 
 class LimitReached(SpecshieldError):
     type = "limit-reached"
+
+
+class Busy(SpecshieldError):
+    type = "busy"
+
+
+class RequestTimeout(SpecshieldError):
+    type = "request-timeout"
 
 
 class TrainingUnavailable(SpecshieldError):

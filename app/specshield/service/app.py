@@ -15,9 +15,12 @@ from fastapi_offline import FastAPIOffline
 
 from specshield import __version__
 from specshield.service import problems
+from specshield.service.bounds import body
+from specshield.service.bounds.bodies import Bodies
+from specshield.service.heavy.heavy import Heavy
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
-from specshield.service.middleware import Bodies, Guard, Observe, guarded
+from specshield.service.middleware import Guard, Observe, guarded
 from specshield.service.routes import maps, policies, sessions, specs, system
 from specshield.service.schemas.base import Problem
 from specshield.service.sessions.sessions import Sessions
@@ -69,7 +72,7 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
         app.include_router(module.router)
     problems.install(app)
     api_key = None if settings.api_key is None else settings.api_key.get_secret_value()
-    app.add_middleware(Bodies, max_body=settings.max_body_bytes, max_upload=settings.max_upload_bytes)
+    app.add_middleware(Bodies, settings=settings)  # the innermost: nothing is read for who may not ask
     app.add_middleware(Guard, api_key=api_key, allowed_hosts=settings.hosts)
     app.add_middleware(Observe)  # the outermost
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
@@ -89,9 +92,11 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     known = Policies(settings, library)
     worker = TrainingWorker(settings) if wants_worker(settings) else None
     sessions, startup = Sessions(settings, store, known), Startup()
+    heavy = Heavy(settings)
     jobs = Jobs(url, settings)
     gauges = Gauges(store, jobs)
-    server = Server(settings, store, library, known, sessions, jobs, gauges, worker, startup)
+    server = Server(settings, store, library, known, sessions, jobs, gauges, worker, startup, heavy)
+    body.clear(settings.data_dir / "incoming")
     app.state.server = server
     tasks = [asyncio.create_task(tend(embedded, worker)), asyncio.create_task(prepare(startup))]
     try:
@@ -103,6 +108,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
             await asyncio.gather(*tasks)
         if worker is not None:
             await asyncio.to_thread(worker.stop)
+        heavy.close()
         await store.aclose()
         if embedded is not None:
             embedded.leave()
@@ -123,7 +129,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             "ValidationError",
         ):  # FastAPI's own, which never leave this server
             schemas.pop(name, None)
-        for model in (Problem, *policies.MODELS):  # referred to by hand
+        for model in (Problem, *specs.MODELS, *policies.MODELS):  # referred to by hand
             described = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(described.pop("$defs", {}))
             schemas[model.__name__] = described
@@ -141,6 +147,7 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
                     said["_503"] = operation["responses"].get("503", {}).get("description", "")
                     said["_503"] = f"{said['_503']} `starting`: the server is not ready yet.".strip()
                 if "requestBody" in operation:
+                    said["_408"] = "The body took too long to arrive."
                     said["_413"] = "The body is over the limit."
                     said["_415"] = "The body is not declared as a type that is taken here."
                 added = problem_documents(**said)

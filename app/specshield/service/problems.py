@@ -19,11 +19,18 @@ from specshield import errors
 from specshield.errors import InputError, SpecshieldError
 
 MEDIA_TYPE = "application/problem+json"
+CLIENT_GONE = 499  # what nginx logs for a request whose client went away; it is never sent
 log = logging.getLogger("specshield")
+
+
+class ClientGone(Exception):
+    """The caller has closed its connection: nobody is there to be answered."""
+
 
 STATUS: Mapping[type[SpecshieldError], int] = {
     errors.BodyTooLarge: 413,
     errors.UnsupportedMediaType: 415,
+    errors.HeadersTooLarge: 431,
     errors.InputError: 422,
     errors.NotFound: 404,
     errors.MethodNotAllowed: 405,
@@ -32,6 +39,8 @@ STATUS: Mapping[type[SpecshieldError], int] = {
     errors.CrossSite: 403,
     errors.MisdirectedRequest: 421,
     errors.LimitReached: 429,
+    errors.Busy: 503,
+    errors.RequestTimeout: 408,
     errors.TrainingUnavailable: 503,
     errors.Starting: 503,
     errors.StoreError: 503,
@@ -214,6 +223,10 @@ def install(app: FastAPI) -> None:
             )
         return response(InputError(str(error.detail), expected="a request in the form that /docs describes"))
 
+    async def gone(request: Request, error: Exception) -> Response:
+        request.scope["state"]["status"] = CLIENT_GONE
+        return Response(status_code=CLIENT_GONE)  # which nobody reads
+
     async def unknown(request: Request, error: Exception) -> Response:
         # The traceback goes to the log: starlette raises the error again after this answer.
         return response(errors.ServerError("the server failed on this request; its log says more"))
@@ -221,4 +234,5 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(SpecshieldError, known)
     app.add_exception_handler(RequestValidationError, invalid)
     app.add_exception_handler(HTTPException, http)
+    app.add_exception_handler(ClientGone, gone)
     app.add_exception_handler(Exception, unknown)

@@ -55,6 +55,37 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(
         default=64 << 20, ge=1024, description="Largest map or policy sent [bytes]."
     )
+    max_bodies_bytes: int = Field(
+        default=128 << 20, ge=1 << 20, description="Most that all bodies being received may hold [bytes]."
+    )
+    max_body_members: int = Field(
+        default=10_000, ge=100, description="Most members of objects in a JSON body, uploads excepted."
+    )
+    max_spec_bytes: int = Field(
+        default=256 << 10,
+        ge=1024,
+        description="Largest spec of a policy, and largest outlines of a map's rooms, as JSON [bytes].",
+    )
+    max_header_bytes: int = Field(default=32 << 10, ge=1024, description="Largest head of a request [bytes].")
+    max_connections: int = Field(
+        default=2000, ge=8, description="Most connections at once to one server process."
+    )
+    request_timeout: float = Field(
+        default=15.0, gt=0, description="Longest that a request's head, or its body, may take to arrive [s]."
+    )
+    min_body_rate: int = Field(
+        default=64 << 10, ge=1, description="A body may take 1 s more for each so many of its bytes [bytes]."
+    )
+    keep_alive_timeout: float = Field(
+        default=30.0, gt=0, description="A connection without a request is closed after this long [s]."
+    )
+    heavy_timeout: float = Field(
+        default=20.0, gt=0, description="Longest that reading an upload or drawing a map may take [s]."
+    )
+    heavy_memory: int = Field(
+        default=1 << 30, ge=256 << 20, description="Most memory of a process that does it [bytes]."
+    )
+
     max_maps: int = Field(default=1000, ge=1, description="Most uploaded maps kept.")
     max_policies: int = Field(default=1000, ge=1, description="Most policies kept.")
     max_sessions: int = Field(default=100_000, ge=1, description="Most sessions kept.")
@@ -73,7 +104,12 @@ class Settings(BaseSettings):
     worker: bool | None = Field(
         default=None, description="Start a training worker too. Unset: where the store is embedded."
     )
-    training_timeout: int = Field(default=6 * 3600, ge=1, description="Longest training run [s].")
+    training_timeout: int = Field(
+        default=6 * 3600, ge=1, description="Longest training run of a method that learns [s]."
+    )
+    synthesis_timeout: int = Field(
+        default=600, ge=1, description="Longest run of a method that computes its policies [s]."
+    )
 
     @field_validator("redis_url")
     @classmethod

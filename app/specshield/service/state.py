@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
+from specshield.service.heavy.heavy import Heavy
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions.sessions import Sessions
@@ -31,6 +32,7 @@ class Server:
     gauges: Gauges
     worker: TrainingWorker | None
     startup: Startup
+    heavy: Heavy
 
 
 def _server(request: Request) -> Server:

@@ -17,6 +17,7 @@ from typing import Any, Generic, TypeVar
 from specshield.errors import InputError, LimitReached
 
 HASH = re.compile(r"[0-9a-f]{64}")
+PAGE_BYTES = 256 << 10  # chosen by hand: read and shown in a few ms
 V = TypeVar("V")
 
 
@@ -87,10 +88,27 @@ def check_room(folder: Path, limit: int, what: str) -> None:
         )
 
 
-def page(keys: Sequence[str], after: str | None, limit: int) -> tuple[list[str], str | None]:
-    """The first `limit` keys after `after`, in order, and the `after` of the next page, None on the last."""
+def page(
+    keys: Sequence[str], after: str | None, limit: int, size: Callable[[str], int]
+) -> tuple[list[str], str | None]:
+    """The first `limit` keys after `after`, in order, and the `after` of the next page, None on the last.
+
+    size: about as many bytes as reading a key's item takes; no page takes many more than `PAGE_BYTES`.
+    """
     rest = sorted(key for key in keys if after is None or key > after)
-    return rest[:limit], rest[limit - 1] if len(rest) > limit else None
+    taken, room = 0, PAGE_BYTES
+    while taken < min(limit, len(rest)) and room > 0:
+        room -= size(rest[taken])
+        taken += 1
+    return rest[:taken], rest[taken - 1] if len(rest) > taken else None
+
+
+def size(path: Path) -> int:
+    """Bytes; 0 where there is no such file."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def now() -> str:

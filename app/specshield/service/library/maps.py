@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from specshield.errors import NotFound, SpecshieldError
+from specshield.errors import MapError, NotFound, SpecshieldError
 from specshield.service.library import files
 from specshield.service.settings import Settings
 from specshield.task import parse_regions
@@ -57,6 +57,7 @@ class Maps:
     def __init__(self, settings: Settings) -> None:
         self._folder, self._limit = settings.data_dir / "maps", settings.max_maps
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
         self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
 
@@ -76,6 +77,12 @@ class Maps:
             f"there is no map {key!r}", path="map_id", got=key, expected="an id or name from /v1/maps"
         )
 
+    def show(self, key: str) -> dict[str, Any]:
+        """The map as JSON, which can be had without reading the cells. Raises NotFound."""
+        if files.HASH.fullmatch(key) and (self._folder / key).is_dir():
+            return self._shown(key)
+        return self.get(key).to_json()
+
     def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region]) -> Map:
         """Keeps a map, unless there is one of this content already. Raises LimitReached."""
         id = _id(grid, rooms)
@@ -83,6 +90,11 @@ class Maps:
             return self.get(id)
         except NotFound:
             files.check_room(self._folder, self._limit, "maps")
+        if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
+            raise MapError(
+                "the outlines of the rooms are too large", path="rooms",
+                expected=f"at most {self._max_rooms} bytes as JSON: simpler outlines",
+            )  # fmt: skip
         text, image = dump_map(grid)
         made = Map(id, grid, rooms)
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
@@ -91,7 +103,10 @@ class Maps:
 
     def page(self, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
         """One page of maps, as JSON, which can be had without reading the cells."""
-        keys, following = files.page([*self._named, *files.ids(self._folder)], after, limit)
+        keys, following = files.page(
+            [*self._named, *files.ids(self._folder)], after, limit,
+            lambda key: files.size(self._folder / key / "map.json"),
+        )  # fmt: skip
         return [self._shown(key) for key in keys], following
 
     def _shown(self, key: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from specshield.errors import FormulaError, NotFound, PolicyError, SpecshieldError
+from specshield.errors import FormulaError, InputError, NotFound, PolicyError, SpecshieldError
 from specshield.policy.card import policy_id
 from specshield.policy.methods import load_policy
 from specshield.robot import robot_from_json
@@ -55,7 +55,7 @@ class Policies:
 
     def __init__(self, settings: Settings, maps: Maps) -> None:
         self._maps, self._models, self._limit = maps, settings.models_dir, settings.max_policies
-        self._max_horizon = settings.max_horizon
+        self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
         self._folder = settings.data_dir / "policies"
         self._folder.mkdir(parents=True, exist_ok=True)
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
@@ -116,16 +116,32 @@ class Policies:
         """The same with the map's id, whatever it was called. Raises NotFound."""
         return replace(about, map_id=self._maps.get(about.map_id).id)
 
-    def find(self, about: Description, task: Task) -> Record | None:
-        """The policy of this description, if there is one."""
+    def described(self, about: Description, task: Task) -> Record:
+        """The policy of this description, whether there is one or not. Its spec is left with the regions and
+        signals that the formula names: it goes into every session. Raises InputError where that is too large.
+        """
+        spec = dict(about.spec)
+        for kind, used in (("regions", task.regions), ("signals", task.signals)):
+            if spec.get(kind):
+                spec[kind] = {name: value for name, value in spec[kind].items() if name in used}
+        size = len(files.to_json(spec))
+        if size > self._max_spec:
+            raise InputError(
+                "the spec is too large", path="spec", got=f"{size} bytes as JSON",
+                expected=f"at most {self._max_spec}, regions that the formula does not name left out",
+            )  # fmt: skip
+        return Record(_id(about, task), replace(about, spec=spec), task.horizon)
+
+    def find(self, id: str) -> Record | None:
+        """The policy of this id, if there is one."""
         try:
-            return self.record(_id(about, task))
+            return self.record(id)
         except NotFound:
             return None
 
-    def add(self, about: Description, task: Task) -> Record:
+    def add(self, record: Record) -> Record:
         """Notes a policy that is still to be made, unless there is one already. Raises LimitReached."""
-        return self._add(Record(_id(about, task), about, task.horizon), {})
+        return self._add(record, {})
 
     def add_card(self, about: Description, card: Mapping[str, Any], weights: bytes) -> Record:
         """Keeps a policy that was made elsewhere, once all of it is checked. Raises PolicyError."""
@@ -136,12 +152,11 @@ class Policies:
             raise PolicyError(error.message, path=error.path, got=error.got, expected=error.expected).at(
                 "card"
             ) from None
-        id = _id(about, task)
-        card = {**card, "id": id}  # never the sender's
+        record = self.described(about, task)
+        card = {**card, "id": record.id, "spec": record.about.spec}  # never the sender's id
         load_policy(weights, card, task)
         return self._add(
-            Record(id, about, task.horizon, card=card),
-            {"policy.safetensors": weights, "card.json": files.to_json(card)},
+            replace(record, card=card), {"policy.safetensors": weights, "card.json": files.to_json(card)}
         )
 
     def _add(self, record: Record, trained: Mapping[str, bytes]) -> Record:
@@ -175,7 +190,10 @@ class Policies:
         files.remove_folder(self._folder / record.id)
 
     def page(self, after: str | None, limit: int) -> tuple[list[Record], str | None]:
-        keys, following = files.page([*self._named, *files.ids(self._folder)], after, limit)
+        keys, following = files.page(
+            [*self._named, *files.ids(self._folder)], after, limit,
+            lambda key: sum(files.size(self._folder / key / name) for name in ("policy.json", "card.json")),
+        )  # fmt: skip
         return [self.record(key) for key in keys], following
 
     def _shipped(self) -> Iterator[Record]:

@@ -1,7 +1,6 @@
 """Around every request, as plain ASGI (Starlette's `@app.middleware` costs most of the throughput)."""
 
-from specshield.service.middleware.bodies import Bodies
 from specshield.service.middleware.guard import Guard, guarded
 from specshield.service.middleware.observe import Observe
 
-__all__ = ["Bodies", "Guard", "Observe", "guarded"]
+__all__ = ["Guard", "Observe", "guarded"]

@@ -49,6 +49,7 @@ class Observe:
         try:
             await self.app(scope, receive, answer)
         finally:
+            status = scope["state"].get("status", status)  # of a request that nobody waits for any more
             route = getattr(scope.get("route"), "path", "other")
             method = scope["method"] if route != "other" else "other"  # what a caller makes up is no label
             metrics.answered(method, route, status, time.perf_counter() - start)

@@ -6,18 +6,15 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
-from pydantic import TypeAdapter
 
-from specshield.service.library.maps import Map
-from specshield.service.routes import uploads
+from specshield.service.heavy.uploads import FILES
+from specshield.service.routes.uploads import TOO_MUCH, received
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.maps import MapList, MapResponse
-from specshield.service.state import Cursor, Limit, Server, ServerState, problems
-from specshield.world.formats import FORMATS, read_map
+from specshield.service.state import Cursor, Limit, ServerState, problems
+from specshield.world.formats import FORMATS
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
-FILES = "map_server"  # the format of a map sent as files that do not say which it is
-BODY: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 MapId = Annotated[
     Id, Path(description="Id or name of a map.", openapi_examples={"case1": {"value": "case1"}})
 ]
@@ -50,7 +47,7 @@ def _described() -> dict[str, Any]:
     status_code=201,
     response_model=MapResponse,
     summary="Send a map",
-    responses=problems(_429="The server keeps no more maps."),
+    responses=problems(_429="The server keeps no more maps.", **TOO_MUCH),
     openapi_extra=_described(),
 )
 async def create(request: Request, server: ServerState) -> Any:
@@ -58,26 +55,13 @@ async def create(request: Request, server: ServerState) -> Any:
 
     Outside the map everything is occupied, and so is what is unknown. Rooms become names for formulas.
     """
-    if uploads.is_multipart(request):
-        files = await uploads.files(request)
-        name = files.pop("format", FILES.encode()).decode(errors="replace")
-        return (await asyncio.to_thread(_add, server, name, files, True)).to_json()
-    body = await request.body()
-
-    def read() -> Map:
-        members = uploads.parse(BODY, body)
-        return _add(server, members.pop("format", None), members, False)
-
-    return (await asyncio.to_thread(read)).to_json()
-
-
-def _add(server: Server, name: Any, members: dict[str, Any], files: bool) -> Map:
-    return server.maps.add(*read_map(name, members, files))
+    body = received(request)
+    return await server.heavy.run(request, "add_map", body.content_type, body.content)
 
 
 @router.get("", response_model=MapList, summary="List the maps", responses=problems())
 async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """The maps, in order of name and id."""
+    """The maps, in order of name and id. A page may be shorter than `limit`."""
     found, following = await asyncio.to_thread(server.maps.page, cursor, limit)
     return {"items": found, "next": following}
 
@@ -87,7 +71,7 @@ async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 10
 )
 async def read(map_id: MapId, server: ServerState) -> Any:
     """Its size, place and named areas."""
-    return (await asyncio.to_thread(server.maps.get, map_id)).to_json()
+    return await asyncio.to_thread(server.maps.show, map_id)
 
 
 @router.get(
@@ -96,10 +80,9 @@ async def read(map_id: MapId, server: ServerState) -> Any:
     summary="See a map",
     responses={
         200: {"content": {"image/png": {}}, "description": "One pixel a cell."},
-        **problems(_404="No such map."),
+        **problems(_404="No such map.", **TOO_MUCH),
     },
 )
-async def image(map_id: MapId, server: ServerState) -> Response:
+async def image(map_id: MapId, request: Request, server: ServerState) -> Response:
     """White is free, black occupied; up is the map's y."""
-    found = await asyncio.to_thread(server.maps.get, map_id)
-    return Response(await asyncio.to_thread(found.png), media_type="image/png")
+    return Response(await server.heavy.run(request, "draw_map", map_id), media_type="image/png")

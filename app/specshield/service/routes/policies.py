@@ -6,24 +6,20 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
-from pydantic import TypeAdapter
 
-from specshield.errors import FragmentError, InputError, InUse, TrainingUnavailable
+from specshield.errors import InUse, TrainingUnavailable
 from specshield.policy.methods import METHODS
-from specshield.policy.options import options_to_json, read_options
 from specshield.service import examples
-from specshield.service.library.policies import Description, Record, describe
-from specshield.service.routes import uploads
+from specshield.service.heavy.uploads import PARTS, is_multipart
+from specshield.service.library.policies import Record
+from specshield.service.routes.uploads import TOO_MUCH, received
 from specshield.service.schemas.base import Id
-from specshield.service.schemas.policies import Card, PolicyList, PolicyRequest, PolicyResponse
+from specshield.service.schemas.policies import PolicyList, PolicyRequest, PolicyResponse
 from specshield.service.state import Cursor, Limit, Server, ServerState, problems
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
 MODELS = (PolicyRequest,)  # documented by hand
-REQUEST = TypeAdapter(PolicyRequest)
-CARD = TypeAdapter(Card)
-PARTS = {"weights": "policy.safetensors", "card": "card.json"}
 PolicyId = Annotated[
     Id, Path(description="Id or name of a policy.", openapi_examples={"case1": {"value": "case1"}})
 ]
@@ -37,7 +33,7 @@ PolicyId = Annotated[
     responses=problems(
         _404="No such map.",
         _429="The server keeps no more policies.",
-        _503="`training-unavailable`: no worker is there to train; or the store is away.",
+        _503=f"`training-unavailable`: no worker is there to train; the store is away; or {TOO_MUCH['_503']}",
     ),
     openapi_extra={
         "requestBody": {
@@ -68,54 +64,41 @@ async def create(request: Request, server: ServerState) -> Any:
     Policies are immutable and known by the hash of task, method, options and seed: the same request again
     answers the policy there is, and queues it once more if it failed.
     """
-    if uploads.is_multipart(request):
-        files = await uploads.files(request)
-        if files.keys() != PARTS.keys():
-            expected = " and ".join(PARTS)
-            raise InputError(
-                "these are not a policy's parts", path="body", got=sorted(files), expected=expected
-            )
-        return _show(server, await asyncio.to_thread(_add, server, files["weights"], files["card"]))
-    return await asyncio.to_thread(_ask, server, await request.body())
+    body = received(request)
+    if is_multipart(body.content_type):
+        kept = await server.heavy.run(request, "add_policy", body.content_type, body.content)
+        return await asyncio.to_thread(_show, server, kept)
+    asked = await server.heavy.run(request, "check_policy", body.content)
+    return await asyncio.to_thread(_ask, server, asked)
 
 
-def _add(server: Server, weights: bytes, content: bytes) -> Record:
-    card = uploads.parse(CARD, content, "card").model_dump(exclude_unset=True)
-    return server.policies.add_card(describe(card), card, weights)
-
-
-def _ask(server: Server, content: bytes) -> dict[str, Any]:
-    body = uploads.parse(REQUEST, content).model_dump(exclude_unset=True)
-    asked = PolicyRequest(**body)
-    method = METHODS.get(asked.method)
-    options = read_options(method.options, asked.options)
-    robot, settings = body.get("robot", "stretch"), options_to_json(options)
-    about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, settings)
-    about = server.policies.resolve(about)
-    task = server.policies.task(about)
-    try:
-        method.check(task, options)
-    except FragmentError as error:
-        raise (error if error.path == "robot" else error.at("spec.formula")) from None
-    record = server.policies.find(about, task)
+def _ask(server: Server, asked: Record) -> dict[str, Any]:
+    record = server.policies.find(asked.id)
     if record is not None and _training(server, record).status != "failed":
         return _show(server, record)
+    name = asked.about.method
     own = [] if server.worker is None else server.worker.methods
-    if asked.method not in own and not server.jobs.worker_there(asked.method):
-        needs = f" where {' and '.join(method.needs)} is installed" if method.needs else ""
+    if name not in own and not server.jobs.worker_there(name):
+        needs = METHODS.get(name).needs
+        installed = f" where {' and '.join(needs)} is installed" if needs else ""
         raise TrainingUnavailable(
-            f"no worker is running that makes policies by {asked.method}",
+            f"no worker is running that makes policies by {name}",
             path="method",
-            got=asked.method,
-            expected=f"a worker: start one with `specshield worker`{needs}, then ask again",
+            got=name,
+            expected=f"a worker: start one with `specshield worker`{installed}, then ask again",
         )
-    record = record or server.policies.add(about, task)
-    server.jobs.start(record.id, asked.method)
+    record = record or server.policies.add(asked)
+    server.jobs.start(record.id, name)
     return _show(server, record)
 
 
 def _training(server: Server, record: Record) -> Training:
     return Training("ready", 1.0) if record.card is not None else server.jobs.get(record.id)
+
+
+def _listed(server: Server, record: Record) -> dict[str, Any]:
+    shown = _show(server, record)
+    return {**shown, "spec": {name: held for name, held in shown["spec"].items() if name != "regions"}}
 
 
 def _show(server: Server, record: Record) -> dict[str, Any]:
@@ -143,11 +126,11 @@ def _show(server: Server, record: Record) -> dict[str, Any]:
     "", response_model=PolicyList, summary="List the policies", responses=problems(_503="The store is away.")
 )
 async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """The policies, in order of name and id."""
+    """The policies, in order of name and id. Their `spec` is without `regions` here."""
 
     def show() -> dict[str, Any]:
         found, following = server.policies.page(cursor, limit)
-        return {"items": [_show(server, record) for record in found], "next": following}
+        return {"items": [_listed(server, record) for record in found], "next": following}
 
     return await asyncio.to_thread(show)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic_core import PydanticCustomError
 
 from specshield.service import examples
 
@@ -12,18 +13,34 @@ SpecStatus = Literal["pending", "satisfied", "violated"]
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 Pose = Annotated[
-    list[Coordinate], Field(min_length=3, max_length=3, description="[x, y, theta]: [m, m, rad], map frame.")
+    list[Coordinate],
+    Field(min_length=3, max_length=3, fail_fast=True, description="[x, y, theta]: [m, m, rad], map frame."),
 ]
 Point = Annotated[
-    list[Coordinate], Field(min_length=2, max_length=2, description="[x, y] in metres, map frame.")
+    list[Coordinate],
+    Field(min_length=2, max_length=2, fail_fast=True, description="[x, y] in metres, map frame."),
 ]
+MOST_UNKNOWN = 20  # fields of which each gets an error of its own
 Name = Annotated[str, Field(min_length=1, max_length=64)]
 
 
 class Strict(BaseModel):
-    """Requests: no unknown fields, no conversions, no NaN or infinity."""
+    """Requests: no unknown fields, no conversions, no NaN or infinity.
+
+    Lists and dictionaries of theirs are `fail_fast`: a schema says of each member what is wrong with it, and
+    thousands of them would take long to say so.
+    """
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, protected_namespaces=())
+
+    @model_validator(mode="before")
+    @classmethod
+    def _few_unknown_fields(cls, value: Any) -> Any:
+        most = len(cls.model_fields) + MOST_UNKNOWN
+        if isinstance(value, dict) and len(value) > most:
+            known = ", ".join(cls.model_fields)
+            raise PydanticCustomError("too_many_fields", "no other fields than {known}", {"known": known})
+        return value
 
 
 class Answer(BaseModel):

@@ -37,7 +37,7 @@ class RobotSpec(Strict):
     on_contact: Literal["stay", "stop"] = Field(
         "stay", description="What a move that would touch something does."
     )
-    actions: list[ActionSpec] = Field(min_length=1, max_length=256)
+    actions: list[ActionSpec] = Field(min_length=1, max_length=256, fail_fast=True)
 
 
 RobotChoice = Annotated[
@@ -46,7 +46,7 @@ RobotChoice = Annotated[
 ]
 
 
-Options = Annotated[dict[str, bool | int | float | str | list[float]], Field(max_length=64)]
+Options = Annotated[dict[str, bool | int | float | str | list[float]], Field(max_length=64, fail_fast=True)]
 
 
 def _describe_methods(schema: dict[str, Any]) -> None:
@@ -85,7 +85,7 @@ class Card(BaseModel):
     seed: int = Field(ge=0, lt=2**63)
     options: Options
     task_hash: Name
-    metrics: dict[str, JsonValue] = Field(max_length=256)
+    metrics: dict[str, JsonValue] = Field(max_length=256, fail_fast=True)
 
 
 class PolicyResponse(Answer):

@@ -27,6 +27,7 @@ class SessionRequest(Strict):
         None,
         min_length=1,
         max_length=8,
+        fail_fast=True,
         description="Several policies for one task: an action is feasible if any says so.",
     )
     initial_pose: Pose = Field(description="x_0: [m, m, rad], map frame; inside the map and free.")

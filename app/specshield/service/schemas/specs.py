@@ -28,7 +28,9 @@ class Polygon(Strict):
     """Simple: the edges touch only at their ends. The last vertex joins the first."""
 
     type: Literal["polygon"]
-    vertices: list[Point] = Field(min_length=3, max_length=10_000, description="In order, [x, y] in metres.")
+    vertices: list[Point] = Field(
+        min_length=3, max_length=10_000, fail_fast=True, description="In order, [x, y] in metres."
+    )
 
 
 Shape = Annotated[Circle | Rectangle | Polygon, Field(discriminator="type")]
@@ -38,7 +40,9 @@ class Union(Strict):
     """Everything inside any member."""
 
     type: Literal["union"]
-    members: list[Shape] = Field(min_length=1, max_length=256, description="Regions that are no unions.")
+    members: list[Shape] = Field(
+        min_length=1, max_length=256, fail_fast=True, description="Regions that are no unions."
+    )
 
 
 Region = Annotated[Circle | Rectangle | Polygon | Union, Field(discriminator="type")]
@@ -46,6 +50,7 @@ Regions = Annotated[
     dict[str, Region],
     Field(
         max_length=256,
+        fail_fast=True,
         description="Regions by name; in a formula a name is the signed distance [m], positive inside.",
     ),
 ]
@@ -53,6 +58,7 @@ Signals = Annotated[
     dict[str, float],
     Field(
         max_length=64,
+        fail_fast=True,
         description="Other signals by name, each with the value it holds before its first sample.",
     ),
 ]

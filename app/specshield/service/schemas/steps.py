@@ -22,6 +22,7 @@ class StepRequest(Strict):
     poses: list[Pose] = Field(
         min_length=1,
         max_length=10_001,
+        fail_fast=True,
         description="Ends with x_t; the whole history or any newest part that joins what the server has.",
     )
     logits: list[float | None] | None = Field(
@@ -33,6 +34,7 @@ class StepRequest(Strict):
     signals: dict[str, float] | None = Field(
         None,
         max_length=64,
+        fail_fast=True,
         description="Samples at t of the signals that the spec declares; one left out holds its last value.",
     )
     witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
@@ -90,7 +92,11 @@ class CloseRequest(Strict):
         None, ge=0, le=1_000_000, description="The last step reached. Default: the last one stored."
     )
     poses: list[Pose] | None = Field(
-        None, min_length=1, max_length=10_001, description="Ends with x_t, joined as in a step."
+        None,
+        min_length=1,
+        max_length=10_001,
+        fail_fast=True,
+        description="Ends with x_t, joined as in a step.",
     )
 
     @model_validator(mode="after")

@@ -23,13 +23,19 @@ log = logging.getLogger("specshield")
 class TrainingWorker:
     """There is at most one for a data folder, however many servers share it: it holds a lock while it lives.
 
-    methods: those that the worker makes policies by; none where it is another server's.
+    The worker of a server that dies ends by itself.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self.methods: list[str] = []
+        self._methods: list[str] = []
         self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def methods(self) -> list[str]:
+        """Those that the worker makes policies by; none where it is another server's, or has died."""
+        alive = self._process is not None and self._process.poll() is None
+        return self._methods if alive else []
 
     def ensure(self) -> None:
         """Start the worker, unless it runs already: as this process's child or as another server's."""
@@ -48,7 +54,7 @@ class TrainingWorker:
                 pass_fds=[lock],
                 start_new_session=True,
             )
-            self.methods = available()
+            self._methods = available()
         except BlockingIOError:
             pass
         finally:

@@ -53,7 +53,7 @@ class Jobs:
             retry=Retry(ExponentialBackoff(cap=0.2, base=0.02), 3, (redis.ConnectionError,)),
             retry_on_error=[redis.ConnectionError],
         )
-        self._timeout = settings.training_timeout
+        self._settings = settings
         self._write = self.redis.register_script(WRITE)
 
     def worker_there(self, method: str) -> bool:
@@ -71,7 +71,9 @@ class Jobs:
                 "specshield.service.training.worker.train",
                 id,
                 attempt,
-                job_timeout=self._timeout,
+                job_timeout=(
+                    self._settings.training_timeout if learns(method) else self._settings.synthesis_timeout
+                ),
                 result_ttl=0,
                 failure_ttl=24 * 3600,
             )
@@ -152,6 +154,11 @@ class Jobs:
             return action()
         except (redis.RedisError, OSError) as error:
             raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+
+
+def learns(method: str) -> bool:
+    """Whether making a policy may take hours: those methods that need modules of their own learn."""
+    return bool(METHODS.get(method).needs)
 
 
 def queue_of(method: str) -> str:

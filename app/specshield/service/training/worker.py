@@ -6,6 +6,7 @@ import logging
 import logging.config
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -23,17 +24,20 @@ from specshield.policy.options import read_options
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
-from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, queue_of
+from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, learns, queue_of
 from specshield.service.watch import logs
 
+NICE = 10  # below servers on the same machine, and below what decides their steps (heavy/heavy.py)
 log = logging.getLogger("specshield")
 
 
-def serve(settings: Settings, until_eof: bool, others: Sequence[str] = ()) -> None:
+def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learner: bool = False) -> None:
     """Work until told to stop, or until standard input ends: the server that started this one is gone.
 
-    others: queues of jobs that are no training runs and look after themselves. Raises StoreError where the
-    store has failed the worker for good.
+    Runs of methods that learn take hours, those of others seconds. So the former have a process of their own,
+    which this one starts. learner: whether this is that process. others: queues of jobs that are no training
+    runs and look after themselves; the second process has them too. Raises StoreError where the store has
+    failed the worker for good.
     """
     logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
     if settings.redis_url is None:
@@ -41,19 +45,53 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = ()) -> No
         embedded.join()
         os.environ["REDIS_URL"] = embedded.url  # for the runs
     url = os.environ.get("REDIS_URL") or str(settings.redis_url)
+    os.environ["REDIS_URL"] = url  # for the second process, too
+    os.nice(NICE)
     jobs = Jobs(url, settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
     methods = available()  # what is installed later is made by the next worker, whose queues include it
-    lacking = {name: missing(method) for name, method in METHODS.usable() if name not in methods}
-    for name, modules in lacking.items():
-        log.warning("this worker makes no policies by %s: %s is not installed", name, " and ".join(modules))
-    with _regularly(lambda: jobs.worker_lives(methods)):
-        _Worker(url, jobs, methods, others).work(logging_level="WARNING")
+    learning = [name for name in methods if learns(name)]
+    if learner:
+        methods = learning
+    else:
+        _tell(methods)
+        methods = [name for name in methods if name not in learning]
+    second = _Second() if (learning or others) and not learner else None
+
+    def live() -> None:
+        jobs.worker_lives(methods)
+        if second is not None:
+            second.ensure()
+
+    with _regularly(live):
+        _Worker(url, jobs, methods, others if learner else ()).work(logging_level="WARNING")
     raise StoreError(
         "the worker lost the store and cannot go on; rq's last lines in the log say why",
         expected="a store that answers",
     )
+
+
+def _tell(methods: Sequence[str]) -> None:
+    """Says which policies this worker makes, and which it does not."""
+    log.info("this worker makes policies by %s", ", ".join(methods))
+    for name, method in METHODS.usable():
+        if name not in methods:
+            modules = " and ".join(missing(method))
+            log.warning("this worker makes no policies by %s: %s is not installed", name, modules)
+
+
+class _Second:
+    """The process for what takes hours. It ends when this process does: its standard input is a pipe."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def ensure(self) -> None:
+        """Starts it, or starts it again."""
+        if self._process is None or self._process.poll() is not None:
+            command = [sys.executable, "-m", "specshield.cli", "worker", "--until-eof", "--learner"]
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE)
 
 
 class _Worker(Worker):

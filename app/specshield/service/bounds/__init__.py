@@ -1,0 +1,1 @@
+"""What one caller may take of the server: connections, headers, bytes of bodies, time to send them."""

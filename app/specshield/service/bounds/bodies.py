@@ -1,0 +1,128 @@
+"""Takes in the body of each request before the application sees it, within bounds.
+
+So no route waits for bytes, a client that goes away in the middle of a body has asked for nothing, and large
+bodies are on the disk, for the process that parses them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from specshield.errors import BodyTooLarge, InputError, RequestTimeout, SpecshieldError
+from specshield.service import problems
+from specshield.service.access.site import UPLOADS
+from specshield.service.bounds.body import FREE, Body
+from specshield.service.bounds.budget import Budget
+from specshield.service.problems import CLIENT_GONE
+from specshield.service.settings import Settings
+
+LONG = ("/steps", "/close", "/switch", "/validate")  # a history, or a formula with its regions
+LONG_JSON = 16 << 10  # [bytes]; what is shorter has no room for many members
+
+
+class Bodies:
+    """Puts a `Body` into `scope["state"]["body"]` for uploads; other routes receive theirs in one piece."""
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self.app = app
+        self._folder = settings.data_dir / "incoming"
+        self._budget = Budget(settings.max_bodies_bytes)
+        self._max_body, self._max_upload = settings.max_body_bytes, settings.max_upload_bytes
+        self._members, self._patience = settings.max_body_members, settings.request_timeout
+        self._slowest = settings.min_body_rate
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or not _has_body(scope):
+            await self.app(scope, receive, send)
+            return
+        path = scope["path"].rstrip("/")
+        upload = path in UPLOADS
+        body = Body(self._budget, self._folder, _header(scope, b"content-type"))
+        try:
+            try:
+                if not await self._take_in(scope, receive, body, self._limit(path)):
+                    scope["state"]["status"] = CLIENT_GONE
+                    return
+                if not upload:
+                    self._check_members(body.content)
+            except SpecshieldError as error:
+                # What is still to come of the body is not waited for.
+                await problems.response(error, {"Connection": "close"})(scope, receive, send)
+                return
+            if upload:
+                scope["state"]["body"] = body
+                await self.app(scope, receive, send)
+            else:
+                await self.app(scope, _replay(body.content, receive), send)
+        finally:
+            body.close()
+
+    def _limit(self, path: str) -> int:
+        if path in UPLOADS:
+            return self._max_upload
+        return self._max_body if path.endswith(LONG) else min(self._max_body, FREE)
+
+    async def _take_in(self, scope: Scope, receive: Receive, body: Body, limit: int) -> bool:
+        """Whether all of it came; else the client has gone."""
+        too_large = BodyTooLarge("the body is too large", expected=f"at most {limit} bytes", limit=limit)
+        announced = _header(scope, b"content-length") or "0"
+        if announced.isdigit() and int(announced) > limit:
+            raise too_large
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        try:
+            async with asyncio.timeout_at(begun + self._patience) as deadline:
+                while True:
+                    message = await receive()
+                    if message["type"] == "http.disconnect":
+                        return False
+                    chunk = message.get("body", b"")
+                    if body.size + len(chunk) > limit:
+                        raise too_large
+                    await body.add(chunk)
+                    if not message.get("more_body", False):
+                        break
+                    deadline.reschedule(begun + self._patience + body.size / self._slowest)
+        except TimeoutError:
+            raise RequestTimeout(
+                f"the body took too long: {body.size} bytes came in {loop.time() - begun:.0f} s",
+                expected=f"all of it within {self._patience:g} s and 1 s more for each {self._slowest} bytes",
+            ) from None
+        await body.end()
+        return True
+
+    def _check_members(self, content: bytes | Path) -> None:
+        """A schema says of each member that it does not know it: thousands would take long to say so."""
+        if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > self._members:
+            raise InputError(
+                "the body has too many members", path="body", got=content.count(b":"),
+                expected=f"at most {self._members}, and no more colons than that in texts",
+            )  # fmt: skip
+
+
+def _replay(content: bytes | Path, receive: Receive) -> Receive:
+    """The body in one message, then what the client does, which is to go away."""
+    given = False
+
+    async def replay() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        whole = content if isinstance(content, bytes) else await asyncio.to_thread(content.read_bytes)
+        return {"type": "http.request", "body": whole, "more_body": False}
+
+    return replay
+
+
+def _has_body(scope: Scope) -> bool:
+    return scope["method"] in ("POST", "PUT", "PATCH") or any(
+        name in (b"content-length", b"transfer-encoding") for name, _ in scope["headers"]
+    )
+
+
+def _header(scope: Scope, wanted: bytes) -> str:
+    return next((value.decode("latin-1") for name, value in scope["headers"] if name == wanted), "")

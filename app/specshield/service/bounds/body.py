@@ -1,0 +1,77 @@
+"""One request's body as it comes in: in memory while it is small, in a file beyond that."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from specshield.service.bounds.budget import Budget
+
+FREE = 64 << 10  # [bytes] of each body that no budget counts: a step fits, whatever others send
+IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they go to its file
+
+
+@dataclass
+class Body:
+    """folder: where the file of a large body goes. `close` gives everything back."""
+
+    budget: Budget
+    folder: Path
+    content_type: str
+    size: int = 0
+    path: Path | None = None
+    _held: bytearray = field(default_factory=bytearray)
+
+    async def add(self, chunk: bytes) -> None:
+        """Raises Busy where the requests together hold too much."""
+        counted = max(self.size - FREE, 0)
+        self.budget.take(max(self.size + len(chunk) - FREE, 0) - counted)
+        self.size += len(chunk)
+        self._held += chunk
+        if len(self._held) > IN_MEMORY:
+            await self._write()
+
+    async def end(self) -> None:
+        """No more will come."""
+        if self.path is not None:
+            await self._write()
+
+    @property
+    def content(self) -> bytes | Path:
+        """The whole body, or the file that holds it."""
+        return bytes(self._held) if self.path is None else self.path
+
+    async def _write(self) -> None:
+        if self.path is None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            descriptor, name = tempfile.mkstemp(dir=self.folder)
+            os.close(descriptor)
+            self.path = Path(name)
+        held, self._held = self._held, bytearray()
+        await asyncio.to_thread(_append, self.path, held)
+
+    def close(self) -> None:
+        self.budget.give(max(self.size - FREE, 0))
+        self.size = 0
+        if self.path is not None:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+
+
+def clear(folder: Path) -> None:
+    """Removes what servers that were killed have left: no body takes an hour."""
+    for path in folder.glob("*"):
+        with contextlib.suppress(OSError):
+            if path.stat().st_mtime < time.time() - 3600:
+                path.unlink()
+
+
+def _append(path: Path, content: bytearray) -> None:
+    with open(path, "r+b") as file:  # not "ab", which would make a file again that `close` has removed
+        file.seek(0, os.SEEK_END)
+        file.write(content)

@@ -1,0 +1,132 @@
+"""uvicorn's HTTP protocol with bounds that it lacks: connections, bytes of a head, time for a head to come.
+
+What uvicorn does without these was measured: a head of 100 MB is taken in whole, and a connection that
+sends nothing, or a byte now and then, stays for good.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import resource
+from functools import cache
+
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+
+from specshield.errors import Busy, HeadersTooLarge, RequestTimeout, SpecshieldError
+from specshield.service import metrics, problems
+from specshield.service.settings import Settings
+
+KEPT_FILES = 256  # descriptors for the store, files and child processes
+
+
+@cache
+def _settings() -> Settings:
+    return Settings()
+
+
+@cache
+def most_connections() -> int:
+    """As many as the settings say, unless the process may not open so many files."""
+    return min(
+        _settings().max_connections, max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] - KEPT_FILES, 16)
+    )
+
+
+def raise_file_limit() -> None:
+    """A process begins with a limit that is lower than the one that it may set itself."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
+class BoundedProtocol(HttpToolsProtocol):
+    """A connection waits until the head of its first request is there. When there are too many, the one that
+    has waited longest makes room for a new one; where none waits, the new one is refused. So those who open
+    connections and say nothing are the first to lose them, and robots that are at work keep theirs.
+    """
+
+    waiting: dict[BoundedProtocol, None] = {}  # noqa: RUF012  (of the whole process, the oldest first)
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        self._head = 0
+        self._in_head = self._upgraded = False
+        self._late: asyncio.TimerHandle | None = None
+        super().connection_made(transport)
+        if len(self.connections) > most_connections():
+            oldest = next(iter(self.waiting), None)
+            if oldest is None:
+                self._refuse(Busy("there are too many connections", expected="the request again, in a while"))
+                return
+            self.waiting.pop(oldest)
+            oldest.transport.abort()
+        self.waiting[self] = None
+        self._expect_head()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stop_waiting()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._in_head:  # of a head that came in one piece, `on_header` counts what is in it
+            self._head += len(data)
+            if self._head > _settings().max_header_bytes:
+                self._refuse_head()
+                return
+        super().data_received(data)
+        idle = self.cycle is None or self.cycle.response_complete
+        if self._late is None and (self._in_head or idle) and not self._upgraded:
+            self._expect_head()
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        self._in_head, self._head = True, 0
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        self._head += len(name) + len(value)
+        if self._head > 2 * _settings().max_header_bytes:  # a byte may have been counted as it came, too
+            raise ValueError("the head is too large")  # ends the parsing: `send_400_response` comes next
+        super().on_header(name, value)
+
+    def on_headers_complete(self) -> None:
+        self._in_head = False
+        self._stop_waiting()
+        super().on_headers_complete()
+
+    def handle_websocket_upgrade(self) -> None:
+        self._upgraded = True
+        super().handle_websocket_upgrade()
+
+    def send_400_response(self, msg: str) -> None:
+        if self._in_head and self._head > _settings().max_header_bytes:
+            self._refuse_head()
+        else:
+            super().send_400_response(msg)
+
+    def _expect_head(self) -> None:
+        self._late = self.loop.call_later(_settings().request_timeout, self._too_late)
+
+    def _too_late(self) -> None:
+        self._late = None
+        if self._in_head:
+            self._refuse(RequestTimeout("the request's head took too long", expected="a head sent at once"))
+        else:
+            self.transport.close()
+
+    def _refuse_head(self) -> None:
+        expected = f"at most {_settings().max_header_bytes} bytes"
+        self._refuse(HeadersTooLarge("the request's head is too large", expected=expected))
+
+    def _stop_waiting(self) -> None:
+        self.waiting.pop(self, None)
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
+
+    def _refuse(self, error: SpecshieldError) -> None:
+        """Answers and closes, without the application."""
+        self._stop_waiting()
+        metrics.refused(error.type)
+        answer = problems.response(error, {"Connection": "close"})
+        head = b"".join(name + b": " + value + b"\r\n" for name, value in answer.raw_headers)
+        status = STATUS_LINE[problems.status_of(error)]
+        self.transport.write(status + head + b"\r\n" + bytes(answer.body))
+        self.transport.close()

@@ -1,0 +1,108 @@
+"""The processes that heavy work runs in: a template that has everything imported, and forks of it.
+
+    python -m specshield.service.heavy.child     # the template; standard input is a socket from the server
+
+For each message that the server sends there, with a socket attached, the template forks. A fork takes 10 ms,
+where importing the core takes a second. The fork serves calls on its socket, one after the other. All of them
+end when the server closes their socket, or is gone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import importlib
+import os
+import pickle
+import resource
+import signal
+import socket
+import struct
+import sys
+import traceback
+from typing import Any
+
+from specshield.errors import SpecshieldError
+
+LIMITS = struct.Struct("<QB")  # most memory [bytes], niceness
+LENGTH = struct.Struct("<Q")
+PRELOADED = ("specshield.service.heavy.uploads",)
+
+
+def template(control: socket.socket) -> None:
+    for module in PRELOADED:
+        importlib.import_module(module)
+    gc.collect()
+    gc.freeze()  # the forks leave these pages as they are, and share them
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the forks
+    while True:
+        message, descriptors, _, _ = socket.recv_fds(control, LIMITS.size, 1)
+        if len(message) < LIMITS.size:
+            return
+        if os.fork() == 0:
+            control.close()
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            memory, nice = LIMITS.unpack(message)
+            _limit(memory, nice)
+            with socket.socket(fileno=descriptors[0]) as calls:
+                serve(calls)
+            os._exit(0)
+        os.close(descriptors[0])
+
+
+def _limit(memory: int, nice: int) -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG: whatever it is doing
+    os.nice(nice)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    # Not RLIMIT_AS, which counts the address space that libraries set aside and never use.
+    resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+
+
+def serve(calls: socket.socket) -> None:
+    """Says its process id and resident memory, then answers calls (function, arguments) to the end.
+
+    An answer is (value, None, resident memory [bytes]) or (None, error, resident memory).
+    """
+    stream = calls.makefile("rwb")
+    write(stream, (os.getpid(), resident()))
+    while True:
+        head = stream.read(LENGTH.size)
+        if len(head) < LENGTH.size:
+            return
+        call = stream.read(LENGTH.unpack(head)[0])
+        write(stream, (*_call(call), resident()))
+
+
+def _call(call: bytes) -> tuple[Any, BaseException | None]:
+    try:
+        name, arguments = pickle.loads(call)  # from the server; what strangers sent are bytes in it
+        module, _, function = name.partition(":")
+        return getattr(importlib.import_module(module), function)(*arguments), None
+    except SpecshieldError as error:
+        return None, error.with_traceback(None)
+    except MemoryError:
+        return None, MemoryError()
+    except BaseException as error:
+        traceback.print_exc()
+        return None, RuntimeError(f"{type(error).__name__}; the server's log says more")
+
+
+def write(stream: Any, value: Any) -> None:
+    content = pickle.dumps(value, protocol=5)
+    stream.write(LENGTH.pack(len(content)))
+    stream.write(content)
+    stream.flush()
+
+
+def resident() -> int:
+    """The memory that this process holds [bytes], what it shares with the template left out."""
+    with open("/proc/self/statm") as file:
+        _, total, shared, *_ = map(int, file.read().split())
+    return (total - shared) * os.sysconf("SC_PAGE_SIZE")
+
+
+if __name__ == "__main__":
+    with socket.socket(fileno=os.dup(0)) as control:
+        template(control)

@@ -1,0 +1,86 @@
+"""The heavy work of one server process: uploads are read, and slow decisions are made, in other processes."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Hashable
+from typing import Any
+
+from fastapi import Request
+
+from specshield.service.heavy.pool import Pool, Template
+from specshield.service.problems import ClientGone
+from specshield.service.settings import Settings
+
+# Chosen by hand: below what the server itself does (0), above what trains policies (see training/worker.py).
+DECISIONS_NICE, TASKS_NICE = 5, 10
+WAITING = 16  # calls of one owner that may wait
+DECISION_TIMEOUT = 60.0  # [s]; the slowest step known takes 1 s, its first one loads its kernels
+DECISION_MEMORY = 4 << 30  # [bytes]: tables of a few policies, and a look-ahead's
+IDLE = 60.0  # [s] that a process waits for more
+
+
+class Heavy:
+    """tasks: uploads and pictures. decisions: steps that take long."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings, self._template = settings, Template()
+        self.tasks = Pool(
+            self._template, size=2, memory=settings.heavy_memory, nice=TASKS_NICE, waiting=WAITING, idle=IDLE,
+            unused=self._unused,
+        )  # fmt: skip
+        self.decisions = Pool(
+            self._template, size=max(os.cpu_count() or 1, 2), memory=DECISION_MEMORY, nice=DECISIONS_NICE,
+            waiting=1000, idle=10 * IDLE, unused=self._unused,
+        )  # fmt: skip
+
+    async def run(self, request: Request, function: str, *arguments: Any) -> Any:
+        """What a function of heavy/uploads.py returns, its first argument the settings; see `Pool.run`.
+
+        Raises ClientGone, and ends the work, when the caller closes its connection.
+        """
+        owner = str(request.scope["state"].get("owner", ""))
+        work = asyncio.ensure_future(
+            self.tasks.run(
+                f"specshield.service.heavy.uploads:{function}", self._settings, *arguments,
+                seconds=self._settings.heavy_timeout, owner=owner,
+            )
+        )  # fmt: skip
+        gone = asyncio.ensure_future(_gone(request))
+        try:
+            await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
+            if not work.done():
+                raise ClientGone
+            return work.result()
+        finally:
+            work.cancel()
+            gone.cancel()
+            await asyncio.gather(work, gone, return_exceptions=True)
+
+    async def decide(self, function: str, *arguments: Any, session: str, key: Hashable) -> Any:
+        """What "module:function" returns, in a process for decisions. The sessions take turns.
+
+        key: of what the process has to prepare for it, such as the ids of the policies.
+        """
+        return await self.decisions.run(
+            function, *arguments, seconds=DECISION_TIMEOUT, owner=session, key=key
+        )
+
+    def _unused(self) -> None:
+        asyncio.get_running_loop().call_later(IDLE, self._stop_if_unused)
+
+    def _stop_if_unused(self) -> None:
+        if self.tasks.children + self.decisions.children == 0:
+            self._template.stop()
+
+    def close(self) -> None:
+        self.tasks.close()
+        self.decisions.close()
+        self._template.stop()
+
+
+async def _gone(request: Request) -> None:
+    """Returns when the caller has closed its connection."""
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

@@ -1,0 +1,180 @@
+"""What a child process does with an upload, or draws. Nothing of it is read in the server.
+
+Every function takes the settings first, and gives what the server needs for its answer.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from pydantic import TypeAdapter, ValidationError
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import create_form_parser
+
+from specshield import stl
+from specshield.errors import BodyTooLarge, FormulaError, FragmentError, InputError
+from specshield.policy.methods import METHODS
+from specshield.policy.options import options_to_json, read_options
+from specshield.service.library.maps import Maps
+from specshield.service.library.policies import Description, Policies, Record, describe
+from specshield.service.problems import from_validation
+from specshield.service.schemas.policies import Card, PolicyRequest
+from specshield.service.schemas.specs import SpecRequest
+from specshield.service.settings import Settings
+from specshield.task import names_for, parse_regions, parse_signals
+from specshield.world.formats import read_map
+from specshield.world.regions import Polygon
+
+T = TypeVar("T")
+Content = bytes | Path  # a body, or the file that it is in
+FILES = "map_server"  # the format of a map sent as files that do not say which it is
+PARTS = {"weights": "policy.safetensors", "card": "card.json"}
+MOST_PARTS = 16  # of a multipart body
+REQUEST = TypeAdapter(PolicyRequest)
+CARD = TypeAdapter(Card)
+SPEC = TypeAdapter(SpecRequest)
+
+Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))  # loads numba's compiler, once for all forks
+
+
+@cache
+def _policies(settings: Settings) -> Policies:
+    return Policies(settings, _maps(settings))
+
+
+@cache
+def _maps(settings: Settings) -> Maps:
+    return Maps(settings)
+
+
+def add_map(settings: Settings, content_type: str, content: Content) -> dict[str, Any]:
+    if is_multipart(content_type):
+        members: dict[str, Any] = dict(_parts(content_type, content))
+        name = members.pop("format", FILES.encode()).decode(errors="replace")
+        made = read_map(name, members, files=True)
+    else:
+        members = _object(_bytes(content))
+        made = read_map(members.pop("format", None), members)
+    return _maps(settings).add(*made).to_json()
+
+
+def draw_map(settings: Settings, key: str) -> bytes:
+    return _maps(settings).get(key).png()
+
+
+def add_policy(settings: Settings, content_type: str, content: Content) -> Record:
+    """Keeps a policy that was made elsewhere."""
+    files = _parts(content_type, content)
+    if files.keys() != PARTS.keys():
+        expected = " and ".join(PARTS)
+        raise InputError("these are not a policy's parts", path="body", got=sorted(files), expected=expected)
+    if len(files["card"]) > settings.max_body_bytes:
+        expected = f"at most {settings.max_body_bytes} bytes"
+        raise BodyTooLarge("the card is too large", path="card", got=len(files["card"]), expected=expected)
+    card = parse(CARD, files["card"], "card").model_dump(exclude_unset=True)
+    return _policies(settings).add_card(describe(card), card, files["weights"])
+
+
+def check_policy(settings: Settings, content: Content) -> Record:
+    """What is asked for, once it is checked; nothing is kept."""
+    body = parse(REQUEST, _bytes(content)).model_dump(exclude_unset=True)
+    asked = PolicyRequest(**body)
+    method = METHODS.get(asked.method)
+    options = read_options(method.options, asked.options)
+    robot, settled = body.get("robot", "stretch"), options_to_json(options)
+    about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, settled)
+    policies = _policies(settings)
+    about = policies.resolve(about)
+    task = policies.task(about)
+    try:
+        method.check(task, options)
+    except FragmentError as error:
+        raise (error if error.path == "robot" else error.at("spec.formula")) from None
+    return policies.described(about, task)
+
+
+def check_spec(settings: Settings, content: bytes) -> dict[str, Any]:
+    return explain(_maps(settings), settings, content)
+
+
+def explain(maps: Maps, settings: Settings, content: bytes) -> dict[str, Any]:
+    """What a formula means, as the contract shows it."""
+    request = parse(SPEC, content)
+    body = request.model_dump()
+    regions = parse_regions(body["regions"] or {})
+    signals = parse_signals(body["signals"] or {}, regions)
+    rooms = maps.get(request.map_id).rooms if request.map_id else {}
+    declared = any(given is not None for given in (request.regions, request.signals, request.map_id))
+    names = names_for({**rooms, **regions}, signals) if declared else None
+    try:
+        formula = stl.parse(request.formula, names=names, max_horizon=settings.max_horizon)
+    except FormulaError as error:
+        raise error.at("formula") from None
+    return {"formula": str(formula), "horizon": formula.horizon, "names": list(formula.names)}
+
+
+def is_multipart(content_type: str) -> bool:
+    return content_type.lower().startswith("multipart/form-data")
+
+
+def _parts(content_type: str, content: Content) -> dict[str, bytes]:
+    """The parts of a multipart body by name. Raises InputError where two have one name."""
+    found: list[tuple[str, bytes]] = []
+
+    def note(part: Any) -> None:
+        if len(found) == MOST_PARTS:
+            raise FormParserError(f"more than {MOST_PARTS} parts")
+        name = (part.field_name or b"").decode(errors="replace")
+        if hasattr(part, "file_object"):
+            part.file_object.seek(0)
+            found.append((name, part.file_object.read()))
+        else:
+            found.append((name, part.value or b""))
+
+    try:
+        parser = create_form_parser(
+            {"Content-Type": content_type.encode()}, note, note, config={"MAX_MEMORY_FILE_SIZE": 1 << 40}
+        )
+        parser.write(_bytes(content))
+        parser.finalize()
+    except (FormParserError, ValueError) as error:
+        raise InputError(
+            f"the body is not a multipart form: {error}", path="body", expected="multipart/form-data"
+        ) from None
+    names = [name for name, _ in found]
+    if len(set(names)) < len(names):
+        raise InputError("two parts have one name", path="body", got=sorted(names), expected="each part once")
+    return dict(found)
+
+
+def _bytes(content: Content) -> bytes:
+    return content if isinstance(content, bytes) else content.read_bytes()
+
+
+def _object(content: bytes) -> dict[str, Any]:
+    try:
+        members = msgspec.json.decode(content)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise InputError(f"the body is not JSON: {error}", expected="a JSON object") from None
+    if not isinstance(members, dict):
+        raise InputError("the body is not a JSON object", path="body", expected="a JSON object")
+    return members
+
+
+def parse(adapter: TypeAdapter[T], content: bytes, below: str = "") -> T:
+    """`content` as JSON of this shape. Raises InputError, its path below `below`."""
+    try:
+        return adapter.validate_json(content)
+    except ValidationError as invalid:
+        found = [{**item, "loc": ("body", *item["loc"])} for item in invalid.errors(include_url=False)]
+        raise from_validation(found, _body(content), below) from None
+
+
+def _body(content: bytes) -> Any:
+    try:
+        return TypeAdapter(Any).validate_json(content)
+    except ValidationError:
+        return None

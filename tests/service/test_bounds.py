@@ -1,0 +1,170 @@
+"""What one caller can take of the server, and what the others keep."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from tests.service.world import grid_json
+from tests.serving import RunningServer, serving, wait_for
+
+MOST = 12  # connections of the server below
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    """A server with little room. It does not have to be ready: connections are the same before."""
+    folder = tmp_path_factory.mktemp("small")
+    settings = {
+        "SPECSHIELD_MAX_CONNECTIONS": str(MOST),
+        "SPECSHIELD_REQUEST_TIMEOUT": "2",
+        "SPECSHIELD_MAX_HEADER_BYTES": "4096",
+    }
+    with serving(folder, ready=False, **settings) as server:
+        wait_for(lambda: _alive(server), 120.0)
+        yield server
+
+
+def _alive(server: RunningServer) -> bool:
+    with contextlib.suppress(httpx.TransportError):
+        return httpx.get(f"{server.url}/livez", timeout=20.0).status_code == 200
+    return False
+
+
+def _connect(server: RunningServer) -> socket.socket:
+    parts = urlsplit(server.url)
+    return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60.0)
+
+
+def _answer(connection: socket.socket) -> tuple[int, dict[str, Any]]:
+    """The status and the problem document of an answer after which the server closes."""
+    received = b""
+    with contextlib.suppress(ConnectionResetError):  # it may have bytes that it did not read
+        while part := connection.recv(65536):
+            received += part
+    head, _, body = received.partition(b"\r\n\r\n")
+    return int(head.split()[1]), json.loads(body)
+
+
+def test_a_head_that_is_too_large_is_refused(small: RunningServer) -> None:
+    with _connect(small) as connection:
+        connection.sendall(b"GET /livez HTTP/1.1\r\nX-Large: " + b"a" * 20_000 + b"\r\n\r\n")
+        status, problem = _answer(connection)
+    assert (status, problem["type"]) == (431, "headers-too-large")
+
+
+def test_a_head_that_never_ends_is_refused_while_it_comes(small: RunningServer) -> None:
+    with _connect(small) as connection, contextlib.suppress(OSError):
+        connection.sendall(b"GET /livez HTTP/1.1\r\nX-Large: ")
+        for _ in range(64):
+            connection.sendall(b"a" * (1 << 20))
+        pytest.fail("64 MB of one header were taken")
+
+
+def test_a_head_that_comes_too_slowly_is_refused(small: RunningServer) -> None:
+    with _connect(small) as connection:
+        connection.sendall(b"GET /livez HTTP/1.1\r\nX-Slow: ")
+        status, problem = _answer(connection)
+    assert (status, problem["type"]) == (408, "request-timeout")
+
+
+def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:
+    with _connect(small) as connection:
+        assert connection.recv(1) == b""
+
+
+def test_silent_connections_make_room_for_those_who_ask(small: RunningServer) -> None:
+    with contextlib.ExitStack() as held:
+        for _ in range(2 * MOST):
+            held.enter_context(_connect(small))
+        assert httpx.get(f"{small.url}/livez", timeout=60.0).status_code == 200
+
+
+def test_those_at_work_keep_their_connections_when_new_ones_are_refused(small: RunningServer) -> None:
+    with contextlib.ExitStack() as held:
+        working = [held.enter_context(httpx.Client(base_url=small.url, timeout=60.0)) for _ in range(MOST)]
+        for robot in working:
+            assert robot.get("/livez").status_code == 200
+        status, problem = _answer(held.enter_context(_connect(small)))
+        assert (status, problem["type"]) == (503, "busy")
+        for robot in working:
+            assert robot.get("/livez").status_code == 200
+
+
+def test_a_large_upload_is_read_while_others_ask(server: RunningServer, client: httpx.Client) -> None:
+    """F1: a valid map of 4 million cells, sent while another caller goes on."""
+    grid = grid_json()
+    grid["info"] |= {"width": 2000, "height": 2000}
+    grid["data"] = [0] * 4_000_000
+    answers: list[httpx.Response] = []
+    sending = threading.Thread(
+        target=lambda: answers.append(httpx.post(f"{server.url}/v1/maps", json=grid, timeout=None))
+    )
+    sending.start()
+    asked = 0
+    while sending.is_alive():
+        assert client.get("/livez").status_code == 200
+        asked += 1
+    assert answers[0].status_code == 201, answers[0].text
+    assert asked > 0
+    assert answers[0].json()["width"] == 2000
+
+
+def test_a_client_that_goes_away_in_an_upload_is_no_failure(server: Any, client: httpx.Client) -> None:
+    """F13: it is counted as gone, and nothing is logged as an error."""
+    before = server.log.read_text().count("Traceback")
+    for sent in (b"", b"[" * 100):
+        with _connect(server) as connection:
+            host = urlsplit(server.url).netloc
+            connection.sendall(
+                f"POST /v1/maps HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/json\r\n"
+                "Content-Length: 1000\r\n\r\n".encode()
+                + sent
+            )
+
+    def gone() -> bool:
+        return 'status="499"' in client.get("/metrics").text
+
+    wait_for(gone, 60.0)
+    assert server.log.read_text().count("Traceback") == before
+    assert list((server.data_dir / "incoming").glob("*")) == []
+
+
+def test_thousands_of_unknown_fields_are_refused_with_one_error(client: httpx.Client) -> None:
+    for path in ("/v1/specs/validate", "/v1/sessions/none/steps", "/v1/sessions", "/v1/policies"):
+        body = {f"f{i}": 0 for i in range(3000)}
+        answer = client.post(path, json=body)
+        assert answer.status_code == 422, path
+        assert len(answer.json()["errors"]) == 1, path
+        assert "/v1" not in answer.json()["expected"]
+    many = client.post("/v1/specs/validate", json={f"f{i}": 0 for i in range(60_000)})
+    assert (many.status_code, many.json()["path"]) == (422, "body")
+
+
+def test_lists_do_not_hold_regions(client: httpx.Client, begin: Any) -> None:
+    session = begin()
+    assert session["spec"]["regions"]
+    listed = client.get("/v1/policies", params={"limit": 1000}).json()["items"]
+    assert any(item["id"] in session["policy_ids"] for item in listed)
+    assert all("regions" not in item["spec"] and item["spec"]["formula"] for item in listed)
+
+
+def test_a_policy_keeps_only_the_regions_that_its_formula_names(client: httpx.Client, tmp_path: Path) -> None:
+    """F2: the others would go into every session."""
+    from tests.service.world import SPEC, policy_files
+
+    other = {"type": "polygon", "vertices": [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]}
+    spec = {**SPEC, "regions": {**SPEC["regions"], **{f"Other{i}": other for i in range(20)}}}
+    plain = client.post("/v1/policies", files=policy_files(seed=77)).json()
+    sent = client.post("/v1/policies", files=policy_files(spec, seed=77)).json()
+    assert sent["id"] == plain["id"]
+    assert list(client.get(f"/v1/policies/{sent['id']}").json()["spec"]["regions"]) == ["Goal"]

@@ -1,0 +1,124 @@
+"""Calls in child processes: bounded, cancelled, shared among owners, and gone when nobody needs them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from specshield.errors import Busy, MapError, ServerError, TooExpensive
+from specshield.service.heavy.pool import Pool, Template
+from specshield.service.heavy.queue import Turns
+
+
+def run(scenario: Callable[[Pool], Awaitable[Any]], size: int = 1, idle: float = 60.0) -> Any:
+    async def whole() -> Any:
+        template = Template()
+        pool = Pool(template, size=size, memory=1 << 30, nice=1, waiting=4, idle=idle, unused=lambda: None)
+        try:
+            return await scenario(pool)
+        finally:
+            pool.close()
+            template.stop()
+
+    return asyncio.run(whole())
+
+
+def test_children_answer_fail_run_out_and_are_replaced() -> None:
+    async def scenario(pool: Pool) -> None:
+        assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0
+        first = await pool.run("os:getpid", seconds=60.0)
+        assert await pool.run("os:getpid", seconds=60.0) == first != os.getpid()
+
+        with pytest.raises(MapError) as wrong:  # our errors come back as they are
+            await pool.run("specshield.world.checks:integer", 1.5, "data[0]", 0, 9, seconds=60.0)
+        assert (wrong.value.path, wrong.value.got) == ("data[0]", 1.5)
+        with pytest.raises(ServerError, match="ZeroDivisionError"):  # and others without what they say
+            await pool.run("operator:truediv", 1, 0, seconds=60.0)
+        assert await pool.run("os:getpid", seconds=60.0) == first
+
+        with pytest.raises(TooExpensive, match=r"0\.2 s"):
+            await pool.run("time:sleep", 600.0, seconds=0.2)
+        second = await pool.run("os:getpid", seconds=60.0)
+        assert second != first
+        with pytest.raises(TooExpensive, match="MiB"):
+            await pool.run("builtins:bytearray", 4 << 30, seconds=60.0)
+        with pytest.raises(TooExpensive, match="ended"):
+            await pool.run("os:abort", seconds=60.0)
+        assert await pool.run("math:sqrt", 4.0, seconds=60.0) == 2.0
+
+    run(scenario)
+
+
+def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end() -> None:
+    async def scenario(pool: Pool) -> int:
+        pid: int = await pool.run("os:getpid", seconds=60.0)
+        sleeping = asyncio.create_task(pool.run("time:sleep", 600.0, seconds=600.0))
+        await asyncio.sleep(0)  # it has the child now
+        sleeping.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await sleeping
+        other: int = await pool.run("os:getpid", seconds=60.0)
+        assert other != pid
+        await _ends(pid)
+        return other
+
+    left = run(scenario)
+    asyncio.run(_ends(left))
+
+
+def test_a_child_that_keeps_much_memory_or_has_nothing_to_do_ends() -> None:
+    async def scenario(pool: Pool) -> None:
+        pid = await pool.run("os:getpid", seconds=60.0)
+        await pool.run("numpy:ones", 100, seconds=60.0)
+        await _ends(pid)  # idle
+        assert pool.children == 0
+        pid = await pool.run("os:getpid", seconds=60.0)
+        assert len(await pool.run("operator:mul", b"a", 100 << 20, seconds=60.0)) == 100 << 20
+        await _ends(pid)
+
+    run(scenario, idle=0.05)
+
+
+def test_owners_take_turns() -> None:
+    async def scenario() -> list[str]:
+        turns, order = Turns(1, 4), list[str]()
+        await turns.take("first")
+
+        async def call(owner: str) -> None:
+            await turns.take(owner)
+            order.append(owner)
+            turns.give()
+
+        calls = [asyncio.create_task(call(owner)) for owner in ("many", "many", "many", "few", "other")]
+        await asyncio.sleep(0)
+        calls[1].cancel()
+        turns.give()
+        await asyncio.gather(*calls, return_exceptions=True)
+        return order
+
+    assert asyncio.run(scenario()) == ["many", "few", "other", "many"]
+
+
+def test_an_owner_has_so_many_waiting_and_no_more() -> None:
+    async def scenario() -> None:
+        turns = Turns(1, 2)
+        await turns.take("a")
+        waiting = [asyncio.create_task(turns.take("a")) for _ in range(2)]
+        await asyncio.sleep(0)
+        with pytest.raises(Busy):
+            await turns.take("a")
+        another = asyncio.create_task(turns.take("b"))
+        for _ in range(3):
+            turns.give()
+        await asyncio.gather(*waiting, another)
+
+    asyncio.run(scenario())
+
+
+async def _ends(pid: int) -> None:
+    while os.path.exists(f"/proc/{pid}"):
+        await asyncio.sleep(0.01)
