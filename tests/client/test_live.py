@@ -10,11 +10,13 @@ import httpx
 import numpy as np
 import pytest
 
+from benchmarks.away import campaign
 from specshield import errors
 from specshield.client import AsyncShieldClient, Decision, ShieldClient
 
 pytest.importorskip("specshield.service.app", reason="needs the service")
 from specshield.service.schemas.steps import StepResponse
+from specshield.sim.cases import load_case
 
 
 @pytest.fixture
@@ -253,3 +255,23 @@ def test_async_sessions_run_side_by_side(client, server):
     episodes, ids = asyncio.run(main())
     assert [t for _, t in episodes] == [10, 10, 10]
     assert {id for id, _ in episodes} <= ids
+
+
+@pytest.mark.parametrize("case", ["case1", "case2"])
+def test_the_rule_is_kept_although_the_service_is_away_for_30_steps(server, case):
+    """One episode with a network that is cut, one on which answers are lost; the campaign has 100 of a case."""
+    counts = campaign(server.url, load_case(case), episodes=2, steps=30, seed=1)
+    assert counts["satisfied"] == counts["episodes"] == 2
+    assert counts["steps by witness"] + counts["steps by stop"] >= 60
+
+
+def test_a_session_read_back_follows_what_the_service_certified_last(client):
+    session, pose = begin(client, seed=7)
+    decision = session.step(pose, model(session, 7))
+    pose = decision.next_poses[decision.execute]
+    with ShieldClient("http://127.0.0.1:9") as nowhere:
+        again = client.sessions.get(session.id, on_failure="witness")
+        again._run = nowhere._run
+        alone = again.step(pose, model(again, 7))
+    assert (alone.source, alone.t, alone.execute) == ("witness", 1, decision.witness[0])
+    client.sessions.delete(session.id)

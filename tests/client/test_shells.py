@@ -6,6 +6,8 @@ import json
 import socket
 import subprocess
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import httpx
 import pytest
@@ -141,6 +143,32 @@ def test_a_closed_client_says_so():
 
     with pytest.raises(errors.TransportError, match="closed"):
         asyncio.run(after())
+
+
+def test_a_proxy_that_the_environment_names_is_used(use, monkeypatch):
+    seen, answer = [], json.dumps(SPEC).encode()
+
+    class Proxy(BaseHTTPRequestHandler):
+        def do_POST(self):
+            seen.append((self.path, self.headers["Proxy-Authorization"]))
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(answer)))
+            self.end_headers()
+            self.wfile.write(answer)
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Proxy) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        monkeypatch.setenv("http_proxy", f"http://me:secret@127.0.0.1:{server.server_port}")
+        assert use("http://robot.test", validate, timeout=10.0).horizon == 3
+        monkeypatch.setenv("no_proxy", "robot.test")
+        with pytest.raises(errors.TransportError):
+            use("http://robot.test", validate)
+        server.shutdown()
+    assert seen == [("http://robot.test/v1/specs/validate", "Basic bWU6c2VjcmV0")]
 
 
 def test_what_goes_over_the_wire(use):
