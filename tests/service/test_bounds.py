@@ -155,7 +155,11 @@ def test_lists_do_not_hold_regions(client: httpx.Client, begin: Any) -> None:
     assert session["spec"]["regions"]
     listed = client.get("/v1/policies", params={"limit": 1000}).json()["items"]
     assert any(item["id"] in session["policy_ids"] for item in listed)
-    assert all("regions" not in item["spec"] and item["spec"]["formula"] for item in listed)
+    sessions = client.get("/v1/sessions", params={"limit": 1000}).json()["items"]
+    assert any(item["id"] == session["id"] for item in sessions)
+    for item in [*listed, *sessions]:
+        assert "regions" not in item["spec"]
+        assert item["spec"]["formula"]
 
 
 def test_a_policy_keeps_only_the_regions_that_its_formula_names(client: httpx.Client, tmp_path: Path) -> None:

@@ -91,8 +91,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     store, library = Store(url, settings.store_timeout, settings.session_ttl), Maps(settings)
     known = Policies(settings, library)
     worker = TrainingWorker(settings) if wants_worker(settings) else None
-    sessions, startup = Sessions(settings, store, known), Startup()
-    heavy = Heavy(settings)
+    heavy, startup = Heavy(settings), Startup()
+    sessions = Sessions(settings, store, known, heavy)
     jobs = Jobs(url, settings)
     gauges = Gauges(store, jobs)
     server = Server(settings, store, library, known, sessions, jobs, gauges, worker, startup, heavy)

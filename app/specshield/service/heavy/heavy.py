@@ -16,7 +16,7 @@ from specshield.service.settings import Settings
 # Chosen by hand: below what the server itself does (0), above what trains policies (see training/worker.py).
 DECISIONS_NICE, TASKS_NICE = 5, 10
 WAITING = 16  # calls of one owner that may wait
-DECISION_TIMEOUT = 60.0  # [s]; the slowest step known takes 1 s, its first one loads its kernels
+DECISION_TIMEOUT = 30.0  # [s]; the slowest step known takes 1 s, its first one loads its kernels
 DECISION_MEMORY = 4 << 30  # [bytes]: tables of a few policies, and a look-ahead's
 IDLE = 60.0  # [s] that a process waits for more
 
@@ -59,12 +59,17 @@ class Heavy:
             await asyncio.gather(work, gone, return_exceptions=True)
 
     async def decide(self, function: str, *arguments: Any, session: str, key: Hashable) -> Any:
-        """What "module:function" returns, in a process for decisions. The sessions take turns.
+        """What a function of heavy/decisions.py returns. The sessions take turns.
 
         key: of what the process has to prepare for it, such as the ids of the policies.
         """
         return await self.decisions.run(
-            function, *arguments, seconds=DECISION_TIMEOUT, owner=session, key=key
+            f"specshield.service.heavy.decisions:{function}",
+            self._settings,
+            *arguments,
+            seconds=DECISION_TIMEOUT,
+            owner=session,
+            key=key,
         )
 
     def _unused(self) -> None:

@@ -41,7 +41,7 @@ Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))  # loads numba's compiler, once fo
 
 
 @cache
-def _policies(settings: Settings) -> Policies:
+def policies_of(settings: Settings) -> Policies:
     return Policies(settings, _maps(settings))
 
 
@@ -75,7 +75,7 @@ def add_policy(settings: Settings, content_type: str, content: Content) -> Recor
         expected = f"at most {settings.max_body_bytes} bytes"
         raise BodyTooLarge("the card is too large", path="card", got=len(files["card"]), expected=expected)
     card = parse(CARD, files["card"], "card").model_dump(exclude_unset=True)
-    return _policies(settings).add_card(describe(card), card, files["weights"])
+    return policies_of(settings).add_card(describe(card), card, files["weights"])
 
 
 def check_policy(settings: Settings, content: Content) -> Record:
@@ -86,7 +86,7 @@ def check_policy(settings: Settings, content: Content) -> Record:
     options = read_options(method.options, asked.options)
     robot, settled = body.get("robot", "stretch"), options_to_json(options)
     about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, settled)
-    policies = _policies(settings)
+    policies = policies_of(settings)
     about = policies.resolve(about)
     task = policies.task(about)
     try:

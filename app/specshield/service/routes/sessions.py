@@ -58,7 +58,10 @@ async def create(request: SessionRequest, server: ServerState) -> Any:
     "", response_model=SessionList, summary="List the sessions", responses=problems(_503="The store is away.")
 )
 async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """The sessions, in order of id; ids that the server makes up are in order of time."""
+    """The sessions, in order of id; ids that the server makes up are in order of time.
+
+    Their `spec` is without `regions` here, and a page may be shorter than `limit`.
+    """
     found, following = await server.sessions.page(cursor, limit)
     return {"items": found, "next": following}
 

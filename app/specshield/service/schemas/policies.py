@@ -98,7 +98,9 @@ class PolicyResponse(Answer):
     metrics: dict[str, JsonValue] = Field(description="What was measured, such as the rate of satisfaction.")
     map_id: str = Field(description="Id of the map.")
     robot: str | dict[str, JsonValue] = Field(description="A preset's name, or the robot as it was sent.")
-    spec: dict[str, JsonValue] = Field(description="`formula`, `regions`, `signals`.")
+    spec: dict[str, JsonValue] = Field(
+        description="`formula`, `signals` and, where one policy is read, `regions`."
+    )
     horizon: int = Field(description="The horizon T in steps.")
     method: str = Field(description="How it is made.")
     seed: int = Field(description="As asked for.")

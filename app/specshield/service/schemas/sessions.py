@@ -76,7 +76,9 @@ class SessionResponse(Answer):
     id: str = Field(description="For the paths below /v1/sessions.")
     policy_ids: list[str] = Field(description="Ids of its policies.")
     map_id: str = Field(description="Id of its map.")
-    spec: dict[str, JsonValue] = Field(description="`formula`, `regions`, `signals`.")
+    spec: dict[str, JsonValue] = Field(
+        description="`formula`, `signals` and, where one session is read, `regions`."
+    )
     horizon: int = Field(description="The horizon T in steps; the last shaped decision is at T - 1.")
     actions: list[str] = Field(description="Names, in the order of the logits.")
     terminal_actions: list[int] = Field(description="Indices of the actions that end the main task.")

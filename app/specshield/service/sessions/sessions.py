@@ -21,6 +21,7 @@ from specshield.errors import FragmentError, InfeasibleStart, InputError, LimitR
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
+from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
 from specshield.service.schemas.sessions import SessionRequest
@@ -53,11 +54,12 @@ R = TypeVar("R")
 class Sessions:
     """What takes longer than a moment runs in threads; the store is awaited."""
 
-    def __init__(self, settings: Settings, store: Store, policies: Policies) -> None:
+    def __init__(self, settings: Settings, store: Store, policies: Policies, heavy: Heavy) -> None:
         self._settings, self._store, self._policies = settings, store, policies
         self._shields = Shields(policies, settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
-        self.steps = Steps(store, self._shields, self._threads, settings.session_ttl)
+        self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl)
+        self._heavy = heavy
 
     async def create(self, request: SessionRequest) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
@@ -70,11 +72,24 @@ class Sessions:
                 preference = await asyncio.shield(asyncio.wrap_future(preparing))
             except FragmentError as error:
                 raise refused(request.shaping, error) from None
-        config, feasible, status, rows = await self._run(self._begin, request, settings, preference)
+        config, feasible, status, rows = await self._begun(request, settings, preference)
         content = files.to_json(config)
         state = State(1, 0, feasible, status, self._expiry(), record.digest(content))
         await self._store.create(config["id"], content, Change(state.packed(), pack(rows)))
         return describe(config, state)
+
+    async def _begun(
+        self, request: SessionRequest, settings: Config, preference: Preference | None
+    ) -> tuple[dict[str, Any], bool, str, Floats]:
+        """In a thread, or in another process where the policies' decisions take long."""
+        if preference is None:
+            ids = await self._run(lambda: [self._policies.record(key).id for key in request.policies])
+            if await self._run(self._shields.slow_policies, ids):
+                begun: tuple[dict[str, Any], bool, str, Floats] = await self._heavy.decide(
+                    "begin", request, settings, session=",".join(ids), key=tuple(ids)
+                )
+                return begun
+        return await self._run(begin, self._policies, self._shields, request, settings, preference)
 
     def _checked(self, request: SessionRequest) -> Config:
         """The session's settings. Raises InputError for those that cannot be had."""
@@ -87,52 +102,16 @@ class Sessions:
             check_preferring(config)
         return config
 
-    def _begin(
-        self, request: SessionRequest, settings: Config, preference: Preference | None
-    ) -> tuple[dict[str, Any], bool, str, Floats]:
-        """The config, whether the start is feasible, the formula's verdict on it, and the first row."""
-        records = [self._policies.record(key) for key in request.policies]
-        ids = [record.id for record in records]
-        shield = replace(self._shields.get(ids, settings), preference=preference)
-        feasible = True
-        try:
-            episode.start(shield, request.initial_pose)
-        except InfeasibleStart:
-            if not request.allow_infeasible:
-                raise
-            feasible = False
-        task, about = shield.task, records[0].about
-        signals = {name: task.signals[name] for name in sorted(task.signals)}
-        rows = np.array([[*request.initial_pose, *signals.values()]])
-        status, _ = episode.close(shield, rows[:, :3], columns(rows, signals))
-        config = {
-            "id": request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
-            "policy_ids": ids,
-            "map_id": about.map_id,
-            "spec": {
-                "formula": str(task.formula),
-                "regions": about.spec.get("regions") or {},
-                "signals": signals,
-            },
-            "robot": about.robot,
-            "horizon": task.horizon,
-            "actions": list(task.robot.action_names),
-            "terminal_actions": np.flatnonzero(task.robot.terminal).tolist(),
-            **{name: getattr(settings, name) for name in CONFIG},
-            "shaping": request.shaping,
-            "max_steps": shield.max_steps,
-            "created_at": files.now(),
-            "nonce": secrets.token_hex(8),
-        }
-        return config, feasible, status, rows
-
     async def read(self, id: str) -> dict[str, Any]:
         session = Session.of(await self._load(id))
         return describe(session.config, session.state)
 
     async def page(self, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
         found, following = await self._store.page(after, limit)
-        return [describe(json.loads(config), State.of(state)) for config, state in found], following
+        shown = [describe(json.loads(config), State.of(state)) for config, state in found]
+        for item in shown:  # they can be long, and whoever wants them reads the session
+            item["spec"] = {name: held for name, held in item["spec"].items() if name != "regions"}
+        return shown, following
 
     async def delete(self, id: str) -> None:
         if not await self._store.delete(id):
@@ -223,3 +202,47 @@ class Sessions:
 
     def _expiry(self) -> float:
         return time.time() + self._settings.session_ttl
+
+
+def begin(
+    policies: Policies,
+    shields: Shields,
+    request: SessionRequest,
+    settings: Config,
+    preference: Preference | None,
+) -> tuple[dict[str, Any], bool, str, Floats]:
+    """The config, whether the start is feasible, the formula's verdict on it, and the first row."""
+    records = [policies.record(key) for key in request.policies]
+    ids = [record.id for record in records]
+    shield = replace(shields.get(ids, settings), preference=preference)
+    feasible = True
+    try:
+        episode.start(shield, request.initial_pose)
+    except InfeasibleStart:
+        if not request.allow_infeasible:
+            raise
+        feasible = False
+    task, about = shield.task, records[0].about
+    signals = {name: task.signals[name] for name in sorted(task.signals)}
+    rows = np.array([[*request.initial_pose, *signals.values()]])
+    status, _ = episode.close(shield, rows[:, :3], columns(rows, signals))
+    config = {
+        "id": request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
+        "policy_ids": ids,
+        "map_id": about.map_id,
+        "spec": {
+            "formula": str(task.formula),
+            "regions": about.spec.get("regions") or {},
+            "signals": signals,
+        },
+        "robot": about.robot,
+        "horizon": task.horizon,
+        "actions": list(task.robot.action_names),
+        "terminal_actions": np.flatnonzero(task.robot.terminal).tolist(),
+        **{name: getattr(settings, name) for name in CONFIG},
+        "shaping": request.shaping,
+        "max_steps": shield.max_steps,
+        "created_at": files.now(),
+        "nonce": secrets.token_hex(8),
+    }
+    return config, feasible, status, rows

@@ -16,6 +16,8 @@ from specshield.service.sessions.session import CONFIG, Session
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 
+QUICK = ("reachability", "dqn")  # methods whose decisions take a millisecond; of others nothing is known
+
 
 class Shields:
     """Threads may share it. Preparing a preference takes seconds, in a thread of its own, so that no decision
@@ -24,9 +26,28 @@ class Shields:
 
     def __init__(self, policies: Policies, room: int) -> None:
         self._policies, self._shields = policies, files.Recent[Shield](room)
+        self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
         self._preparing = ThreadPoolExecutor(1, "prepare")
         self._latest: Future[Preference] | None = None  # the last one that was asked for
+
+    def slow(self, session: Session) -> bool:
+        """Whether its decisions take long. A session with a preference stays where that is prepared."""
+        if session.config["shaping"] != PROJECTION:
+            return False
+        return self.slow_policies(session.config["policy_ids"])
+
+    def slow_policies(self, policy_ids: Sequence[str]) -> bool:
+        key = tuple(policy_ids)
+        return self._slow.get(
+            key, lambda: any(self._policies.record(id).about.method not in QUICK for id in key)
+        )
+
+    def note_slow(self, session: Session) -> None:
+        """One of its decisions has taken long."""
+        key = tuple(session.config["policy_ids"])
+        self._slow.drop(key)
+        self._slow.get(key, lambda: True)
 
     def get(self, policy_ids: Sequence[str], config: Config) -> Shield:
         def make() -> Shield:

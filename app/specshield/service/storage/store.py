@@ -20,6 +20,8 @@ from redis.backoff import ExponentialBackoff
 
 from specshield.errors import SessionExists, StoreError
 
+PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
+AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
 INDEX = "specshield:sessions"
 APPEND = Path(__file__).with_name("append.lua").read_text()
 DROP = """\
@@ -173,14 +175,18 @@ class Store:
         return bool(found)
 
     async def page(self, after: str | None, limit: int) -> tuple[list[tuple[bytes, bytes]], str | None]:
-        """Up to `limit` of (config, state) in order of id, and the id to go on after, None at the end."""
+        """Up to `limit` of (config, state) in order of id, and the id to go on after, None at the end. There
+        are fewer where the configs are long: reading them must not hold up steps.
+        """
         listed: list[tuple[bytes, bytes]] = []
-        while len(listed) < limit:  # once, but for ids of sessions that have expired
+        room = PAGE_BYTES
+        while len(listed) < limit and room > 0:
             async with self._reaching():
                 low = "-" if after is None else f"({after}"
-                ids = await self.redis.zrangebylex(INDEX, low, "+", 0, limit - len(listed))
+                ids = await self.redis.zrangebylex(INDEX, low, "+", 0, min(limit - len(listed), AT_ONCE))
                 if not ids:
                     return listed, None
+                ids, room = await self._that_fit(ids, room)
                 listed += await self._configs(ids)
                 after = ids[-1].decode()
         return listed, after
@@ -194,6 +200,17 @@ class Store:
         """The memory that the store takes."""
         async with self._reaching():
             return int((await self.redis.info("memory"))["used_memory"])
+
+    async def _that_fit(self, ids: list[bytes], room: int) -> tuple[list[bytes], int]:
+        """The first ids whose configs come to about `room` bytes, at least one, and what is left of it."""
+        async with self.redis.pipeline(transaction=False) as pipe:
+            for id in ids:
+                pipe.hstrlen(_keys(id.decode())[0], "config")
+            for taken, size in enumerate(await pipe.execute(), start=1):
+                room -= size
+                if room <= 0:
+                    return ids[:taken], room
+        return ids, room
 
     async def _configs(self, ids: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
         async with self.redis.pipeline(transaction=False) as pipe:

@@ -1,0 +1,36 @@
+"""What a process for decisions does: the server's own functions, on shields that it has prepared itself."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from specshield.arrays import Floats
+from specshield.service.heavy.uploads import policies_of
+from specshield.service.schemas.sessions import SessionRequest
+from specshield.service.schemas.steps import StepRequest
+from specshield.service.sessions import sessions, steps
+from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.session import Session
+from specshield.service.sessions.shields import Shields
+from specshield.service.settings import Settings
+from specshield.shield.decision import Config, Decision
+
+
+@cache
+def _shields(settings: Settings) -> Shields:
+    return Shields(policies_of(settings), settings.shield_cache)
+
+
+def step(
+    settings: Settings, session: Session, request: StepRequest
+) -> tuple[Session, Decision, StepRecord, float]:
+    """The session with its new row, the decision, its record, and the seconds that it took."""
+    made = steps.timed(_shields(settings), session, request)
+    return made[0], made[1], made[2], made[3]
+
+
+def begin(
+    settings: Settings, request: SessionRequest, config: Config
+) -> tuple[dict[str, Any], bool, str, Floats]:
+    return sessions.begin(policies_of(settings), _shields(settings), request, config, None)
