@@ -75,6 +75,12 @@ def worker_of(server):
     return pid
 
 
+def learner_of(server):
+    """The worker's process for what takes hours."""
+    (pid,) = (pid for pid, command in children(worker_of(server)) if b"--learner" in command)
+    return pid
+
+
 def test_a_policy_is_trained_and_serves(client):
     policy = ask(client)
     assert policy["status"] in ("queued", "training")
@@ -99,6 +105,14 @@ def test_a_policy_is_computed_and_serves(client):
     assert session.json()["feasible"]
 
 
+def test_what_is_computed_does_not_wait_for_what_is_learned(client):
+    learned = ask(client, options=LONG, seed=5)
+    reach(client, learned, "training")
+    reach(client, ask(client, method="reachability", options={}, seed=6), "ready", 600.0)
+    assert read(client, learned)["status"] == "training"
+    client.delete(f"/v1/policies/{learned['id']}")
+
+
 def test_a_run_that_cannot_be_says_why(client):
     policy = ask(client, robot={**ROBOT, "footprint": {"radius": 5.0}})
     wait_for(lambda: read(client, policy)["status"] == "failed", 60.0)
@@ -113,7 +127,7 @@ def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
     assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
     found = read(client, policy)
     assert (found["status"], found["error"]) == ("failed", "cancelled")
-    ((run, _),) = children(worker_of(server))
+    ((run, _),) = children(learner_of(server))
     wait_for(lambda: not Path(f"/proc/{run}").exists(), 10.0)
     assert read(client, policy)["error"] == "cancelled"
     assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
@@ -123,7 +137,7 @@ def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
 def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, client):
     policy = ask(client, options=LONG, seed=2)
     reach(client, policy, "training")
-    ((run, _),) = children(worker_of(server))
+    ((run, _),) = children(learner_of(server))
     os.kill(run, signal.SIGKILL)
     wait_for(lambda: read(client, policy)["status"] == "failed", 3.0)
     assert "signal 9" in read(client, policy)["error"]
@@ -134,7 +148,7 @@ def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, c
 def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, client):
     policy = ask(client, options=LONG, seed=3)
     reach(client, policy, "training")
-    os.kill(worker_of(server), signal.SIGKILL)
+    os.kill(learner_of(server), signal.SIGKILL)
     wait_for(lambda: read(client, policy)["status"] == "failed", 10.0)
     assert "worker is gone" in read(client, policy)["error"]
     reach(client, ask(client, seed=4), "ready")
@@ -145,10 +159,10 @@ def test_nothing_trains_on_without_its_server(tmp_path):
         with httpx.Client(base_url=server.url, timeout=None) as client:
             policy = ask(client, options=LONG)
             reach(client, policy, "training")
-        worker = worker_of(server)
-        ((run, _),) = children(worker)
+        worker, learner = worker_of(server), learner_of(server)
+        ((run, _),) = children(learner)
         server.kill()
-        wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (worker, run)), 10.0)
+        wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (worker, learner, run)), 10.0)
     with serving(tmp_path) as server:  # no worker this time
         found = httpx.get(f"{server.url}/v1/policies/{policy['id']}").json()
         assert found["status"] == "failed"
