@@ -58,7 +58,7 @@ def read(client, policy):
     return client.get(f"/v1/policies/{policy['id']}").json()
 
 
-def reach(client, policy, status, seconds=60.0):
+def reach(client, policy, status, seconds=600.0):
     wait_for(lambda: read(client, policy)["status"] in (status, "failed"), seconds)
     found = read(client, policy)
     assert found["status"] == status, found
@@ -108,7 +108,7 @@ def test_a_policy_is_computed_and_serves(client):
 def test_what_is_computed_does_not_wait_for_what_is_learned(client):
     learned = ask(client, options=LONG, seed=5)
     reach(client, learned, "training")
-    reach(client, ask(client, method="reachability", options={}, seed=6), "ready", 600.0)
+    reach(client, ask(client, method="reachability", options={}, seed=6), "ready")
     assert read(client, learned)["status"] == "training"
     client.delete(f"/v1/policies/{learned['id']}")
 
