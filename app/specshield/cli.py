@@ -67,7 +67,7 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
 
 def _commands() -> Iterator[Callable[..., None]]:
     """The commands below, and those that other packages register as entry points."""
-    yield from (serve, demo, train, worker, openapi)
+    yield from (serve, demo, train, worker, verify, openapi)
     for registered in entry_points(group="specshield.commands"):
         yield registered.load()
 
@@ -125,6 +125,31 @@ def worker(
     from specshield.service.training.worker import serve as work
 
     work(_settings(), until_eof, [queue.name for queue in entry_points(group="specshield.queues")], learner)
+
+
+def verify(
+    file: Annotated[Path, typer.Argument(help="A record: GET /v1/sessions/{id}/record.", show_default=False)],
+    data_dir: Annotated[
+        Path | None, typer.Option(help="A server's data folder, for maps and policies that were sent to it.")
+    ] = None,
+    models_dir: Annotated[
+        Path | None, typer.Option(help="Policies, one folder each. [default: those shipped]")
+    ] = None,
+    maps_dir: Annotated[
+        Path | None, typer.Option(help="Maps, <name>.yaml beside its image. [default: those shipped]")
+    ] = None,
+) -> None:
+    """Check a session's record: its chain of hashes, then every decision, made again to the same bytes.
+
+    The exit status is 0 where all is as it was, 1 where something differs, 2 where map or policy are not at
+    hand, so that only the chain was checked.
+    """
+    from specshield.service import verify as verifying
+    from specshield.service.settings import read_settings
+
+    given = {"data_dir": data_dir, "models_dir": models_dir, "maps_dir": maps_dir}
+    settings = read_settings().model_copy(update={k: v for k, v in given.items() if v is not None})
+    raise typer.Exit(verifying.verify(file, settings))
 
 
 def openapi() -> None:

@@ -77,6 +77,8 @@ ORDER = [  # the way the description says: each example is sent as it stands
     ("post", "/v1/sessions/{session_id}/steps", 200),
     ("post", "/v1/sessions/{session_id}/close", 200),
     ("get", "/v1/sessions/{session_id}/trajectory", 200),
+    ("get", "/v1/sessions/{session_id}/record", 200),
+    ("get", "/v1/sessions/{session_id}/events", 204),  # it is over: nothing follows
     ("delete", "/v1/sessions/{session_id}", 204),
     ("get", "/livez", 200),
     ("get", "/readyz", 200),

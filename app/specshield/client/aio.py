@@ -244,6 +244,7 @@ class AsyncSession(SessionState, Generic[D]):
     else:
         step = awaiting_step(SessionState._step)
     trajectory = awaiting_step(SessionState._trajectory)
+    save_record = awaiting_step(SessionState._save_record)
     close = awaiting_step(SessionState._end)
 
 

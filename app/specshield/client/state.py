@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
@@ -203,6 +205,16 @@ class SessionState:
         body = yield from call(get("sessions", self.id, "trajectory", slow=True))
         raw: Page[Any] = build(Page, body)
         return tuple(build(TrajectoryItem, item) for item in raw.items)
+
+    def _save_record(self, path: str | os.PathLike[str]) -> Flow[str]:
+        """Write the session's record to a file, for `specshield verify`; the answer is its seal.
+
+        Who keeps the seal can tell later that a record shown to them is this one.
+        """
+        reply = (yield from deliver(get("sessions", self.id, "record", slow=True))).reply
+        check(reply)
+        Path(path).write_bytes(reply.content)
+        return reply.headers.get("x-record-seal", "")
 
     def _send(
         self, action: str, poses: Mapping[int, Pose], t: int, body: Mapping[str, Any], tries: int = TRIES

@@ -243,6 +243,7 @@ class Session(SessionState, Generic[D]):
     else:
         step = blocking_step(SessionState._step)
     trajectory = blocking_step(SessionState._trajectory)
+    save_record = blocking_step(SessionState._save_record)
     close = blocking_step(SessionState._end)
 
 

@@ -21,7 +21,7 @@ from specshield.service.heavy.heavy import Heavy
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe, guarded
-from specshield.service.routes import maps, policies, sessions, specs, system
+from specshield.service.routes import events, maps, policies, sessions, specs, system
 from specshield.service.schemas.base import Problem
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
@@ -32,6 +32,7 @@ from specshield.service.storage.keeper import follow_parent
 from specshield.service.storage.store import Store
 from specshield.service.training.children import TrainingWorker, tend, wants_worker
 from specshield.service.training.jobs import Jobs
+from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
 DESCRIPTION = """\
@@ -68,7 +69,7 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
         generate_unique_id_function=lambda route: "_".join([*map(str, route.tags), route.name]),
         swagger_ui_parameters={"defaultModelsExpandDepth": 0, "tryItOutEnabled": True},
     )
-    for module in (specs, maps, policies, sessions, system):
+    for module in (specs, maps, policies, sessions, events, system):
         app.include_router(module.router)
     problems.install(app)
     api_key = None if settings.api_key is None else settings.api_key.get_secret_value()
@@ -95,10 +96,12 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     sessions = Sessions(settings, store, known, heavy)
     jobs = Jobs(url, settings)
     gauges = Gauges(store, jobs)
-    server = Server(settings, store, library, known, sessions, jobs, gauges, worker, startup, heavy)
+    watchers = Watchers(store, settings.max_watchers, lambda: startup.stopping)
+    server = Server(settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy)
     body.clear(settings.data_dir / "incoming")
     app.state.server = server
-    tasks = [asyncio.create_task(tend(embedded, worker)), asyncio.create_task(prepare(startup))]
+    running = (tend(embedded, worker), prepare(startup), watchers.run())
+    tasks = [asyncio.create_task(each) for each in running]
     try:
         yield
     finally:

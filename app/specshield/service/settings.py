@@ -94,6 +94,9 @@ class Settings(BaseSettings):
     )
     shield_cache: int = Field(default=32, ge=1, description="Prepared shields kept in memory.")
 
+    max_watchers: int = Field(
+        default=1000, ge=0, description="Most open streams of events, for each server process."
+    )
     log_format: Literal["text", "json"] = Field(
         default="text", description="Lines of the log, for people or for programs."
     )

@@ -35,10 +35,11 @@ class Startup:
     """How far a server has come.
 
     failure: why it will not be ready. before: the kernels on the disk when compiling began; None where none
-    has to be compiled. parts: those compiled since.
+    has to be compiled. parts: those compiled since. stopping: whether it has been told to stop.
     """
 
     ready: bool = False
+    stopping: bool = False
     failure: str | None = None
     before: int | None = None
     parts: list[str] = field(default_factory=list)

@@ -16,6 +16,7 @@ from specshield.service.startup import Startup
 from specshield.service.storage.store import Store
 from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import Jobs
+from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
 
@@ -30,6 +31,7 @@ class Server:
     sessions: Sessions
     jobs: Jobs
     gauges: Gauges
+    watchers: Watchers
     worker: TrainingWorker | None
     startup: Startup
     heavy: Heavy

@@ -26,7 +26,7 @@ from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import CloseRequest
-from specshield.service.sessions import record
+from specshield.service.sessions import chain, record
 from specshield.service.sessions.session import (
     CONFIG,
     RACES,
@@ -43,7 +43,7 @@ from specshield.service.sessions.shields import Shields, refused
 from specshield.service.sessions.state import State
 from specshield.service.sessions.steps import Steps
 from specshield.service.settings import Settings
-from specshield.service.storage.store import Change, Record, Store
+from specshield.service.storage.store import Change, Dump, Record, Store
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring
 from specshield.shield.preference import Preference
@@ -159,10 +159,20 @@ class Sessions:
 
     async def trajectory(self, id: str) -> Iterator[bytes]:
         """One JSON object a step: t, pose, signals, and the answer that was given."""
+        found = await self._dump(id)
+        return lines(Session.of(found), found.steps)
+
+    async def record(self, id: str) -> tuple[bytes, str]:
+        """The session's record as a file, and its seal."""
+        found = await self._dump(id)
+        rows = Session.of(found).rows
+        return await self._run(chain.pack, found.config, pack(rows), found.steps)
+
+    async def _dump(self, id: str) -> Dump:
         found = await self._store.dump(id)
         if found is None:
             raise missing(id)
-        return lines(Session.of(found), found.steps)
+        return found
 
     async def using(self, policy_id: str) -> str | None:
         """A session that may still ask this policy, if there is one."""

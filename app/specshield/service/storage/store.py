@@ -52,6 +52,15 @@ class Dump:
 
 
 @dataclass(frozen=True)
+class News:
+    """What a session has from some step on: rows and steps as in `Dump`, both from that step."""
+
+    state: bytes
+    rows: bytes
+    steps: list[bytes]
+
+
+@dataclass(frozen=True)
 class Change:
     """What one write adds: `rows` from byte `offset` on, what step `t` left, the state after it."""
 
@@ -195,6 +204,26 @@ class Store:
         """How many sessions there are; some may have expired."""
         async with self._reaching():
             return int(await self.redis.zcard(INDEX))
+
+    async def versions(self, ids: Sequence[str]) -> list[bytes | None]:
+        """Of each session the version, None where the store has none. One round trip."""
+        async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
+            for id in ids:
+                pipe.hget(_keys(id)[0], "version")
+            found: list[bytes | None] = await pipe.execute()
+        return found
+
+    async def news(self, asked: Sequence[tuple[str, int, int, int]]) -> list[News | None]:
+        """For each (id, t, bytes of a row, count): what it has from step t on, at most so many steps."""
+        async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
+            for id, t, width, count in asked:
+                session, rows, steps = _keys(id)
+                pipe.hget(session, "state")
+                pipe.lrange(steps, t, t + count - 1)
+                pipe.getrange(rows, t * width, (t + count) * width - 1)  # last: it has all rows of the steps
+            found = await pipe.execute()
+        three = zip(found[::3], found[1::3], found[2::3], strict=True)
+        return [None if state is None else News(state, rows, steps) for state, steps, rows in three]
 
     async def held_bytes(self) -> int:
         """The memory that the store takes."""

@@ -1,0 +1,109 @@
+"""What is shown of a session to others: `/v1/sessions/{id}/events`, each decision as it is made, as
+server-sent events; and `/v1/sessions/{id}/record`, all of it, to be verified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+import anyio
+from fastapi import APIRouter, Header, Query, Response
+from starlette.types import Receive, Scope, Send
+
+from specshield.service.routes.sessions import GONE, SessionId
+from specshield.service.sessions import chain
+from specshield.service.state import ServerState, problems
+
+SLOWEST = 10.0  # [s] that a reader may take for what was sent; chosen by hand
+EVENTS = "text/event-stream"
+router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
+
+
+class EventStream(Response):
+    """Sends what the stream gives until it ends, the reader goes away, or is too slow."""
+
+    media_type = EVENTS
+
+    def __init__(self, stream: AsyncIterator[bytes]) -> None:
+        super().__init__(headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
+        del self.headers["content-length"]
+        self._stream = stream
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def until_gone() -> None:
+            while (await receive())["type"] != "http.disconnect":
+                pass
+            group.cancel_scope.cancel()
+
+        start = {"type": "http.response.start", "status": 200, "headers": self.raw_headers}
+        async with anyio.create_task_group() as group:
+            group.start_soon(until_gone)
+            await send(start)
+            async for content in self._stream:
+                with anyio.move_on_after(SLOWEST) as sending:
+                    await send({"type": "http.response.body", "body": content, "more_body": True})
+                if sending.cancelled_caught:
+                    break  # unfinished: the server closes the connection
+            else:
+                await send({"type": "http.response.body", "body": b""})
+            group.cancel_scope.cancel()
+        await self._stream.aclose()  # type: ignore[attr-defined]
+
+
+@router.get(
+    "/{session_id}/events",
+    response_class=Response,
+    summary="Watch a session",
+    responses={
+        200: {
+            "content": {EVENTS: {"schema": {"type": "string"}}},
+            "description": "Server-sent events: `id` is t, `data` the answer to that step, as JSON. The last "
+            "one is `event: end`. Comments keep the connection alive.",
+        },
+        204: {"description": "The session is over, and nothing follows: do not ask again."},
+        **problems(**GONE, _429="The server has no room for more streams."),
+    },
+)
+async def events(
+    session_id: SessionId,
+    server: ServerState,
+    last_event_id: Annotated[
+        int | None, Header(ge=-1, le=1_000_000, description="As `after`; a browser sends it by itself.")
+    ] = None,
+    after: Annotated[
+        int | None, Query(ge=-1, le=1_000_000, description="Begin after this step; -1: with the first.")
+    ] = None,
+) -> Response:
+    """Each decision as it is made, whichever server makes it, about a tenth of a second later.
+
+    Without `after` or `Last-Event-ID` it begins with the next decision; with one of them it resumes where the
+    reader was, without a gap and without doubles. Steps that were passed over have no event. The stream ends
+    when the session is finished, and when this server stops: then ask again. A reader who is too slow is cut
+    off.
+    """
+    stream = await server.watchers.open(session_id, after if last_event_id is None else last_event_id)
+    return Response(status_code=204) if stream is None else EventStream(stream)
+
+
+@router.get(
+    "/{session_id}/record",
+    response_class=Response,
+    summary="Read the record",
+    responses={
+        200: {
+            "content": {chain.MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+            "description": "A file for `specshield verify`. `X-Record-Seal` is its seal.",
+        },
+        **problems(**GONE),
+    },
+)
+async def read_record(session_id: SessionId, server: ServerState) -> Response:
+    """The session's config, poses, signals, what was asked and answered at each step: a chain of hashes.
+
+    `specshield verify` checks the chain, and decides every step again, to the same bytes.
+    """
+    content, seal = await server.sessions.record(session_id)
+    name = f'attachment; filename="{session_id}.record"'
+    headers = {"Content-Disposition": name, "X-Record-Seal": seal}
+    return Response(content, media_type=chain.MEDIA_TYPE, headers=headers)

@@ -1,0 +1,145 @@
+"""A session's record as a file: all that its chain of steps covers, and the hash that seals it (pure).
+
+What record.py says of one step holds of the file: each record holds the hash of all before it. The `seal` is
+the same for what follows the last record. A file comes from strangers: `read` bounds it, then checks it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.errors import InputError
+from specshield.service.sessions import record
+from specshield.service.sessions.record import StepRecord
+
+FORMAT: Literal["specshield-record-1"] = "specshield-record-1"
+LARGEST = 256 << 20  # [bytes]; a session of 10,000 steps takes about 7 MB
+MEDIA_TYPE = "application/vnd.specshield.record"
+
+
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """config, rows: as stored. steps: the record of each, b"" where passed over. seal: SHA-256."""
+
+    format: Literal["specshield-record-1"]
+    config: bytes
+    rows: bytes
+    steps: list[bytes]
+    seal: bytes
+
+
+class Spec(msgspec.Struct, frozen=True):
+    formula: str
+    regions: dict[str, Any]
+    signals: dict[str, float]
+
+
+class Config(msgspec.Struct, frozen=True, kw_only=True):
+    """What a session's config has to hold to be decided again; there is more in it."""
+
+    id: str
+    policy_ids: list[str]
+    map_id: str
+    spec: Spec
+    actions: list[str]
+    seed: int
+    threshold: float
+    margin: float
+    slack: int = 0
+    evaluation: str
+    max_steps: int
+    shaping: str
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A record whose chain is whole. rows [n, 3 + signals]; steps: b"" where passed over. seal: in hex."""
+
+    config: Config
+    rows: Floats
+    steps: Sequence[bytes]
+    seal: str
+
+    @property
+    def names(self) -> list[str]:
+        """Of the signals, as in the rows."""
+        return sorted(self.config.spec.signals)
+
+    def decided(self) -> Iterator[tuple[int, bytes, StepRecord]]:
+        for t, content in enumerate(self.steps):
+            if content:
+                yield t, content, record.decode(content)
+
+
+def pack(config: bytes, rows: bytes, steps: Sequence[bytes]) -> tuple[bytes, str]:
+    """The file, and its seal in hex. Rows: no more than the session has."""
+    names = msgspec.json.decode(config, type=Config).spec.signals
+    held = np.frombuffer(rows, "<f8").reshape(-1, 3 + len(names))
+    last, begin = record.digest(config), 0
+    for t, content in enumerate(steps):
+        if content:
+            last, begin = record.digest(content), t + 1
+    seal = record.link(last, held[begin:])
+    return msgspec.msgpack.encode(_File(FORMAT, config, rows, list(steps), seal)), seal.hex()
+
+
+def read(content: bytes) -> Chain:
+    """Raises InputError where the file is no record, or the chain is broken. `t` in its details: the step at
+    fault, None where it is the file.
+    """
+    if len(content) > LARGEST:
+        raise _broken(None, "the file is too large", f"at most {LARGEST} bytes")
+    try:
+        file = msgspec.msgpack.decode(content, type=_File)
+        config = msgspec.json.decode(file.config, type=Config)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise _broken(None, f"the file is not a session's record: {error}", FORMAT) from None
+    if msgspec.msgpack.encode(file) != content:
+        raise _broken(None, "the file is not written as a server writes it", "every byte as it was")
+    rows = _rows(file.rows, 3 + len(config.spec.signals))
+    if len(file.steps) > len(rows):
+        raise _broken(None, f"{len(file.steps)} steps and {len(rows)} poses", "a pose for each step")
+    last, begin = record.digest(file.config), 0
+    for t, step in enumerate(file.steps):
+        if not step:
+            continue
+        found = _decode(t, step)
+        if found.before != record.link(last, rows[begin : t + 1]):
+            raise _broken(t, "the chain is broken: something before this step is not as it was", None)
+        last, begin = record.digest(step), t + 1
+    if file.seal != record.link(last, rows[begin:]):
+        raise _broken(None, "the seal is not that of the last record and of what follows it", None)
+    return Chain(config, rows, file.steps, file.seal.hex())
+
+
+def _rows(content: bytes, width: int) -> Floats:
+    if len(content) % (8 * width) or not content:
+        raise _broken(None, "the poses are not whole", f"a multiple of {8 * width} bytes")
+    rows = np.frombuffer(content, "<f8").reshape(-1, width)
+    if not np.isfinite(rows).all():
+        raise _broken(None, "a pose or a signal is not finite", "finite numbers")
+    return rows
+
+
+def _decode(t: int, content: bytes) -> StepRecord:
+    try:
+        found = record.decode(content)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise _broken(t, f"the step's record is malformed: {error}", None) from None
+    if found.format != record.FORMAT or found.t != t or record.encode(found) != content:
+        raise _broken(t, "the step's record is malformed", f"format {record.FORMAT}, t = {t}")
+    numbers = (found.feasible_mass, found.kl, *(found.residual or ()))
+    if not all(value is None or math.isfinite(value) for value in numbers):
+        raise _broken(t, "the step's record is malformed: a number is not finite", None)
+    return found
+
+
+def _broken(t: int | None, message: str, expected: str | None) -> InputError:
+    where = "" if t is None else f"step {t}: "
+    return InputError(f"{where}{message}", expected=expected, t=t)

@@ -1,0 +1,134 @@
+"""`specshield verify`: is a session's record whole, and would every step be decided like that again?"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from specshield.errors import InputError, SpecshieldError
+from specshield.lookahead.preferences import PROJECTION, prepare
+from specshield.service.library.maps import Maps
+from specshield.service.library.policies import Policies
+from specshield.service.sessions import chain, history, record
+from specshield.service.sessions.chain import Chain
+from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.session import columns
+from specshield.service.sessions.state import pack_carry
+from specshield.service.settings import Settings
+from specshield.shield import episode
+from specshield.shield.decision import Carry, Config, Shield, make_shield
+
+
+def verify(file: Path, settings: Settings) -> int:
+    """Prints what is found of a record. 0: every step is as it should be; 1: it is not; 2: only the chain
+    could be checked. Raises InputError where the file cannot be read.
+    """
+    try:
+        with open(file, "rb") as opened:
+            content = opened.read(chain.LARGEST + 1)
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror}", path="FILE", got=str(file)) from None
+    try:
+        found = chain.read(content)
+    except InputError as error:
+        print(f"NOT as it was: {error}")
+        return 1
+    decided = sum(map(bool, found.steps))
+    print(f"session {found.config.id}: {decided} decided steps, {len(found.rows)} poses")
+    print(f"map {found.config.map_id}")
+    print(f"policies {', '.join(found.config.policy_ids)}")
+    print("the chain is whole: no byte was changed since it was sealed")
+    print(f"seal {found.seal}")
+    try:
+        shield = _shield(found, settings)
+    except SpecshieldError as error:
+        print(f"NOT decided again: {error}")
+        return 2
+    return _decide(found, shield)
+
+
+def _decide(found: Chain, shield: Shield) -> int:
+    try:
+        differing = list(differences(found, shield))
+    except (SpecshieldError, ValueError, IndexError) as error:  # a record that no server made
+        print(f"NOT as decided: it cannot be decided again: {error}")
+        return 1
+    for t, fields in differing[:20]:
+        print(f"NOT as decided: step {t}: {', '.join(fields)} differ")
+    if differing:
+        print(f"{len(differing)} steps differ")
+        return 1
+    print("every step is decided again to the same bytes")
+    return 0
+
+
+def differences(found: Chain, shield: Shield) -> Iterator[tuple[int, list[str]]]:
+    """The steps whose decision is another one now, each with the fields that differ."""
+    plain, carry = replace(shield, preference=None), None
+    for t, content, kept in found.decided():
+        again, following = _again(found, shield, t, kept, carry)
+        if record.encode(again) != content and shield.preference is not None:
+            # Where its preference was not at hand, the server projected.
+            projected, other = _again(found, plain, t, kept, carry)
+            if record.encode(projected) == content:
+                again, following = projected, other
+        carry = following
+        if record.encode(again) != content:
+            names = StepRecord.__struct_fields__
+            yield t, [name for name in names if _differ(getattr(again, name), getattr(kept, name))]
+
+
+def _again(
+    found: Chain, shield: Shield, t: int, kept: StepRecord, carry: Carry | None
+) -> tuple[StepRecord, Carry]:
+    rows, names = found.rows[: t + 1], found.names
+    if len(kept.rows) != len(found.config.actions):
+        raise InputError(f"step {t} is of {len(kept.rows)} actions", t=t)
+    if not history.agree(kept.pose_sent(rows[-1]), rows[-1, :3]).all():
+        raise InputError(f"the pose sent at step {t} is not the one stored", t=t)
+    logits = kept.logits_sent()
+    decision = episode.decide(
+        shield, rows[:, :3], logits, kept.main_task_done, columns(rows, names), carry, kept.all_witnesses
+    )
+    made = record.make(
+        decision,
+        rows[-1],
+        kept.before,
+        kept.pose_sent(rows[-1]).tolist(),
+        logits,
+        kept.main_task_done,
+        kept.signals_sent(rows[-1], names),
+        names,
+        kept.all_witnesses,
+    )
+    return made, pack_carry(decision.carry).unpacked()
+
+
+def _differ(a: object, b: object) -> bool:
+    return msgspec.msgpack.encode(a) != msgspec.msgpack.encode(b)
+
+
+def _shield(found: Chain, settings: Settings) -> Shield:
+    """As the server had it. Raises SpecshieldError where map or policy are not at hand."""
+    config = found.config
+    with tempfile.TemporaryDirectory() as folder:  # where there is no data folder, none is made
+        if not settings.data_dir.is_dir():
+            settings = settings.model_copy(update={"data_dir": Path(folder)})
+        policies = Policies(settings, Maps(settings))
+        proposers = [policies.policy(policies.record(id)) for id in config.policy_ids]
+    kept = Config(
+        config.threshold, config.margin, config.slack, config.evaluation, config.max_steps, config.seed
+    )
+    shield = replace(make_shield(proposers), config=kept)
+    task = shield.task
+    if [*task.robot.action_names] != config.actions or str(task.formula) != config.spec.formula:
+        raise InputError("the policy at hand is for another task", expected=config.spec.formula)
+    if config.shaping != PROJECTION:
+        preference = prepare(config.shaping, task, proposers, np.asarray(found.rows[0, :3]).tolist())
+        shield = replace(shield, preference=preference)
+    return shield

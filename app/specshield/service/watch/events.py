@@ -1,0 +1,214 @@
+"""Each decision of a session as it is made, for whoever watches: made here, or by any other server.
+
+A step pays nothing for its watchers. Each server process asks the store which of the sessions watched here
+have gone on, ten times a second and a part of them at a time, and reads what is new once for all who watch.
+A watcher who is behind reads the stored steps itself, a few at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+
+from specshield.errors import LimitReached, SpecshieldError
+from specshield.service import metrics
+from specshield.service.schemas.answers import to_json
+from specshield.service.sessions import record
+from specshield.service.sessions.session import Session, missing
+from specshield.service.sessions.state import State
+from specshield.service.storage.store import News, Store
+
+EVERY = 0.1  # [s] between two looks at a session; chosen by hand: a page need not be quicker
+PARTS = 4  # of the sessions, looked at one after the other, so that none of them holds up a decision
+KEPT = 64  # events kept for the watchers of a session, and read at once
+HEARTBEAT = 15.0  # [s] without an event; chosen by hand, below what proxies wait
+FIRST = b"retry: 1000\n\n"
+log = logging.getLogger("specshield")
+
+
+@dataclass(eq=False)
+class Feed:
+    """A session that is watched here. actions: their names. width: bytes of a row.
+
+    recent: the events of the steps from `start` to before `end`. version: the one that was read; None for a
+    session that is not in the store.
+    """
+
+    id: str
+    actions: list[str]
+    width: int
+    version: bytes | None
+    start: int
+    end: int
+    over: bool
+    status: str
+    watchers: int = 0
+    recent: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def add(self, state: State, found: list[tuple[int, bytes]], end: int) -> None:
+        for event in found:
+            if len(self.recent) == KEPT:
+                self.start = self.recent[0][0] + 1
+            self.recent.append(event)
+        self.end, self.over, self.status = end, state.finished and end >= state.next_t, state.spec_status
+        self.wake()
+
+    def wake(self) -> None:
+        self.changed.set()
+        self.changed = asyncio.Event()
+
+
+class Watchers:
+    """limit: of streams at once in this process. stopping: whether the server is on its way out."""
+
+    def __init__(self, store: Store, limit: int, stopping: Callable[[], bool]) -> None:
+        self._store, self._limit, self._stopping = store, limit, stopping
+        self._feeds: dict[str, Feed] = {}
+        self._open = 0
+
+    async def run(self) -> None:
+        """Looks at the sessions that are watched, until it is cancelled."""
+        while True:
+            feeds = list(self._feeds.values())
+            for part in range(PARTS):
+                await asyncio.sleep(EVERY / PARTS)
+                try:
+                    await self._look(feeds[part::PARTS])
+                except SpecshieldError:
+                    pass  # the store is away: what is missed is read when it is back
+                except Exception:
+                    log.exception("what is new in a session cannot be read")
+            if self._stopping():
+                for feed in feeds:
+                    feed.wake()
+
+    async def open(self, id: str, after: int | None) -> AsyncIterator[bytes] | None:
+        """The stream of what follows step `after`, by default the last one decided; None where nothing will.
+
+        Raises NotFound, LimitReached.
+        """
+        if self._open >= self._limit:
+            raise LimitReached(
+                f"this server has {self._limit} open streams of events",
+                expected="room for one more: close one, or ask another server",
+            )
+        feed = self._feeds.get(id) or await self._begin(id)
+        t = feed.end if after is None else after + 1
+        if feed.over and t >= feed.end:
+            return None
+        return self._stream(feed, t)
+
+    async def _begin(self, id: str) -> Feed:
+        found = await self._store.load(id)
+        if found is None:
+            raise missing(id)
+        session = Session.of(found)
+        state = session.state
+        return Feed(
+            id, session.config["actions"], 8 * session.rows.shape[1], found.version,
+            state.next_t, state.next_t, state.finished, state.spec_status,
+        )  # fmt: skip
+
+    async def _stream(self, feed: Feed, t: int) -> AsyncIterator[bytes]:
+        feed = self._feeds.setdefault(feed.id, feed)
+        feed.watchers += 1
+        self._open += 1
+        metrics.watchers.inc()
+        try:
+            yield FIRST
+            while not self._stopping():
+                changed = feed.changed
+                if t < feed.start:
+                    found, t = await self._older(feed, t)
+                else:
+                    found, t = [event for event in feed.recent if event[0] >= t], max(t, feed.end)
+                if found:
+                    yield b"".join(event for _, event in found)
+                if t < feed.end:
+                    continue
+                if feed.over:
+                    yield _end(feed)
+                    return
+                try:
+                    await asyncio.wait_for(changed.wait(), HEARTBEAT)
+                except TimeoutError:
+                    yield b": alive\n\n"
+        finally:
+            metrics.watchers.dec()
+            self._open -= 1
+            feed.watchers -= 1
+            if not feed.watchers and self._feeds.get(feed.id) is feed:
+                del self._feeds[feed.id]
+
+    async def _look(self, feeds: list[Feed]) -> None:
+        if not feeds:
+            return
+        versions = await self._store.versions([feed.id for feed in feeds])
+        seen = zip(feeds, versions, strict=True)
+        gone_on = [(feed, version) for feed, version in seen if feed.version != version]
+        here = [(feed, version) for feed, version in gone_on if version is not None]
+        if here:
+            news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed, _ in here])
+            for (feed, version), new in zip(here, news, strict=True):
+                self._gone_on(feed, version, new)
+        for feed, found in gone_on:
+            if found is None:
+                await self._left(feed)
+
+    def _gone_on(self, feed: Feed, version: bytes, new: News | None) -> None:
+        if new is None or _begun(version) != _begun(feed.version or version):
+            feed.over = True  # erased, and perhaps another session of this id was begun
+            feed.wake()
+            return
+        state, (found, end) = State.of(new.state), _events(feed, feed.end, new)
+        feed.add(state, found, end)
+        if end >= state.next_t:  # else there is more, for the next look
+            feed.version = version
+
+    async def _left(self, feed: Feed) -> None:
+        """The session is no longer in the store: it was erased, or lies in the archive."""
+        dump = await self._store.dump(feed.id)
+        if dump is None:
+            feed.over = True
+            feed.wake()
+        else:
+            new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
+            feed.add(State.of(dump.state), *_events(feed, feed.end, new))
+        feed.version = None
+
+    async def _older(self, feed: Feed, t: int) -> tuple[list[tuple[int, bytes]], int]:
+        """Events from step t on, and the step that follows them."""
+        (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
+        if new is None:
+            dump = await self._store.dump(feed.id)
+            if dump is None:
+                return [], feed.end
+            new = News(dump.state, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
+        found, end = _events(feed, t, new)
+        return found, end if end > t else feed.end
+
+
+def _events(feed: Feed, t: int, new: News) -> tuple[list[tuple[int, bytes]], int]:
+    """The events of the steps from t on that `new` has, and the step that follows them."""
+    found = []
+    for i, step in enumerate(new.steps):
+        if step:
+            row = record.row_of(new.rows[i * feed.width : (i + 1) * feed.width])
+            answer = to_json(record.answer(record.decode(step), row, feed.actions))
+            found.append((t + i, b"id: %d\ndata: %s\n\n" % (t + i, answer)))
+    return found, t + len(new.steps)
+
+
+def _end(feed: Feed) -> bytes:
+    told = {"next_t": feed.end, "spec_status": feed.status, "finished": True}
+    return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
+
+
+def _begun(version: bytes) -> bytes:
+    """What tells one session of an id from another."""
+    return version.partition(b":")[0]

@@ -1,0 +1,156 @@
+"""Watching a session: every decision once, in order, whoever makes it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+import time
+from typing import Any
+
+import httpx
+
+from tests.service.world import ahead
+from tests.serving import serving
+
+END = "end"
+
+
+def read(
+    url: str, session: str, after: int | None = None, most: int = 10_000, last: int | None = None
+) -> list[Any]:
+    """(id, data as text) of each event until the stream ends; `END` as the id of the last one."""
+    found: list[Any] = []
+    with contextlib.suppress(httpx.RemoteProtocolError):  # a server that was stopped
+        _read(found, f"{url}/v1/sessions/{session}/events", after, most, last)
+    return found
+
+
+def _read(found: list[Any], path: str, after: int | None, most: int, last: int | None) -> None:
+    headers = {} if last is None else {"Last-Event-ID": str(last)}
+    params = {} if after is None else {"after": after}
+    with httpx.stream("GET", path, params=params, headers=headers, timeout=None) as response:
+        if response.status_code == 204:
+            found.append(204)
+            return
+        assert response.status_code == 200, response.read()
+        assert response.headers["content-type"].startswith("text/event-stream")
+        event: dict[str, str] = {}
+        for line in response.iter_lines():
+            if line == "" and "data" in event:
+                found.append((int(event["id"]) if "id" in event else event["event"], event["data"]))
+                if len(found) == most:
+                    break
+            if line == "":
+                event = {}
+            elif not line.startswith(":"):
+                name, _, value = line.partition(": ")
+                event[name] = value
+
+
+class Reader(threading.Thread):
+    """Reads in a thread of its own, until the stream ends."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(daemon=True)
+        self._args, self._options, self.found = args, options, list[Any]()
+        self.start()
+
+    def run(self) -> None:
+        self.found = read(*self._args, **self._options)
+
+
+def test_every_decision_is_told_once_and_as_it_was_answered(server, client, begin, step):
+    session = begin()
+    early = Reader(server.url, session["id"], after=-1)
+    answers = {t: step(session, t, [pose]).text for t, pose in enumerate(ahead(3))}
+    answers[6] = step(session, 6, ahead(6)).text  # 4 and 5 were passed over
+    late = Reader(server.url, session["id"], after=-1)
+    resumed = Reader(server.url, session["id"], last=2)
+    answers[7] = step(session, 7, [ahead(7)[-1]]).text
+    assert client.post(f"/v1/sessions/{session['id']}/close", json={}).status_code == 200
+    expected = list(answers.items())
+    for reader, events in ((early, expected), (late, expected), (resumed, expected[3:])):
+        reader.join()
+        assert reader.found[:-1] == events
+        kind, told = reader.found[-1]
+        assert kind == END
+        assert json.loads(told)["next_t"] == 8
+    assert read(server.url, session["id"], last=6)[0] == expected[-1]
+    assert read(server.url, session["id"], last=7) == [204], "a browser that came back is told to stay away"
+    assert read(server.url, session["id"], after=-1)[:-1] == expected, "and it can be read again"
+
+
+def test_more_steps_than_are_kept_in_memory(server, client, begin, step):
+    session = begin(max_steps=200)
+    reader = Reader(server.url, session["id"], after=-1)
+    pose = ahead(1)[0]
+    for t in range(150):
+        assert step(session, t, [pose]).status_code == 200
+    client.post(f"/v1/sessions/{session['id']}/close", json={})
+    reader.join()
+    assert [t for t, _ in reader.found] == [*range(150), END]
+    assert [t for t, _ in read(server.url, session["id"], after=9)] == [*range(10, 150), END]
+
+
+def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_its_readers_go(tmp_path):
+    with serving(tmp_path) as one, httpx.Client(base_url=one.url, timeout=None) as client:
+        body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}
+        session = client.post("/v1/sessions", json=body).json()["id"]
+        with serving(tmp_path) as other:
+            reader = Reader(other.url, session, after=-1)
+            local = Reader(one.url, session, after=-1, most=3)
+            for t in range(3):
+                asked = {"t": t, "poses": [[4.5, 5.0, 0.0]], "logits": [0.0] * 20}
+                assert client.post(f"/v1/sessions/{session}/steps", json=asked).status_code == 200
+            local.join()
+            assert [t for t, _ in local.found] == [0, 1, 2]
+            assert [t for t, _ in read(other.url, session, after=0, most=2)] == [1, 2]
+        reader.join(30.0)
+        assert not reader.is_alive()
+        assert [t for t, _ in reader.found] == [0, 1, 2]
+
+
+def test_an_erased_session_ends_its_streams_and_an_unknown_one_has_none(server, client, begin, step):
+    session = begin()
+    reader = Reader(server.url, session["id"], after=-1)
+    step(session, 0, ahead(0))
+    while not watched(client):
+        time.sleep(0.05)
+    client.delete(f"/v1/sessions/{session['id']}")
+    reader.join()
+    assert client.get(f"/v1/sessions/{session['id']}/events").json()["type"] == "not-found"
+    for wrong in ("-2", "x", str(10**9)):
+        response = client.get(f"/v1/sessions/{session['id']}/events", headers={"Last-Event-ID": wrong})
+        assert response.json()["type"] == "invalid-input"
+
+
+def watched(client: httpx.Client) -> bool:
+    lines = client.get("/metrics", timeout=None).text.splitlines()
+    return "specshield_watchers 0.0" not in lines
+
+
+def test_the_number_of_readers_is_bounded_and_those_who_leave_make_room(tmp_path):
+    def connect() -> socket.socket:
+        connection = socket.create_connection(("127.0.0.1", port))
+        connection.sendall(f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
+        assert connection.recv(4096).startswith(b"HTTP/1.1 200")
+        return connection
+
+    with (
+        serving(tmp_path, SPECSHIELD_MAX_WATCHERS="2") as server,
+        httpx.Client(base_url=server.url, timeout=None) as client,
+    ):
+        port = httpx.URL(server.url).port
+        body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}
+        session = client.post("/v1/sessions", json=body).json()["id"]
+        path = f"/v1/sessions/{session}/events"
+        connections = [connect(), connect()]
+        response = client.get(path)
+        assert (response.status_code, response.json()["type"]) == (429, "limit-reached")
+        for connection in connections:
+            connection.close()
+        while watched(client):
+            time.sleep(0.05)
+        connect().close()

@@ -1,0 +1,152 @@
+"""A session's record: what is told of it, and that nothing in it can be changed unseen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from specshield.client import ShieldClient
+from specshield.errors import InputError
+from specshield.service.sessions import chain, record
+from specshield.service.settings import Settings
+from specshield.service.verify import verify
+from tests.service.world import ahead
+
+
+@pytest.fixture(scope="module")
+def case1(server: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, str]:
+    """A record of case 1, and its seal: steps decided, passed over, and with all witnesses."""
+    file = tmp_path_factory.mktemp("record") / "case1.record"
+    with ShieldClient(server.url, timeout=30.0) as client:
+        pose = (4.5, 5.0, 0.0)
+        with client.sessions.create(policy_id="case1", initial_pose=pose, seed=3, slack=2) as session:
+            random = np.random.default_rng(0)
+            for t in range(24):
+                if t in (5, 6):
+                    session.record(pose)
+                    continue
+                decision = session.step(pose, random.normal(size=20), witnesses=t == 3)
+                pose = decision.next_poses[decision.execute]
+            seal = session.save_record(file)
+            session.close(pose)
+            closed = session.save_record(file.with_suffix(".closed"))
+    assert seal != closed
+    return file.with_suffix(".closed").read_bytes(), closed
+
+
+def told(capsys: Any, tmp_path: Any, content: bytes, **settings: Any) -> tuple[int, str]:
+    file = tmp_path / "a.record"
+    file.write_bytes(content)
+    status = verify(file, Settings(**{"data_dir": tmp_path / "none", **settings}))
+    return status, capsys.readouterr().out
+
+
+def test_every_step_is_decided_again_to_the_same_bytes(case1, capsys, tmp_path):
+    content, seal = case1
+    status, said = told(capsys, tmp_path, content)
+    assert status == 0, said
+    assert f"seal {seal}" in said
+    assert "22 decided steps, 25 poses" in said
+    assert "every step is decided again" in said
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_was_sent_to_a_server_is_found_in_its_data_folder(server, client, begin, step, capsys, tmp_path):
+    session = begin()
+    for t, pose in enumerate(ahead(6)):
+        signals = {"battery": 80.0 - t} if t % 2 == 0 else None
+        fields = {} if signals is None else {"signals": signals}
+        assert step(session, t, [pose], **fields).status_code == 200
+    answer = client.get(f"/v1/sessions/{session['id']}/record")
+    assert answer.status_code == 200
+    assert told(capsys, tmp_path, answer.content, data_dir=server.data_dir)[0] == 0
+    status, said = told(capsys, tmp_path, answer.content)
+    assert (status, "the chain is whole" in said, "NOT decided again" in said) == (2, True, True)
+    assert client.get("/v1/sessions/none/record").json()["type"] == "not-found"
+
+
+@given(st.data())
+def test_any_byte_that_is_changed_is_found(case1, data):
+    content = bytearray(case1[0])
+    at = data.draw(st.integers(0, len(content) - 1))
+    content[at] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(InputError):
+        chain.read(bytes(content))
+
+
+@given(st.data())
+def test_bytes_left_out_doubled_or_added_are_found(case1, data):
+    content = case1[0]
+    a, b = sorted(data.draw(st.lists(st.integers(0, len(content)), min_size=2, max_size=2, unique=True)))
+    added = data.draw(st.binary(min_size=1, max_size=9))
+    for changed in (content[:a] + content[b:], content[:b] + content[a:], content[:a] + added + content[a:]):
+        with pytest.raises(InputError):
+            chain.read(changed)
+
+
+@given(st.binary(max_size=300))
+def test_what_is_no_record_is_refused(content):
+    with pytest.raises(InputError):
+        chain.read(content)
+
+
+def forged(content: bytes, t: int, **changed: Any) -> bytes:
+    """A whole chain of which one step says something else: who holds the server can make one."""
+    file = msgspec.msgpack.decode(content)
+    found = chain.read(content)
+    steps, last, start = list(found.steps), record.digest(file["config"]), 0
+    for i, step in enumerate(steps):
+        if step:
+            kept = record.decode(step)
+            before = record.link(last, found.rows[start : i + 1])
+            kept = msgspec.structs.replace(kept, before=before, **(changed if i == t else {}))
+            steps[i] = record.encode(kept)
+            last, start = record.digest(steps[i]), i + 1
+    return chain.pack(file["config"], file["rows"], steps)[0]
+
+
+def test_a_forged_chain_is_whole_and_its_answer_is_found_out(case1, capsys, tmp_path):
+    content, seal = case1
+    assert forged(content, -1) == content
+    kept = record.decode(chain.read(content).steps[7])
+    other = next(a for a in range(20) if a != kept.action)
+    for changed, named in (
+        ({"action": other}, "action"),
+        ({"mode": "fallback"}, "mode"),
+        ({"kl": 0.5}, "kl"),
+    ):
+        status, said = told(capsys, tmp_path, forged(content, 7, **changed))
+        assert status == 1
+        assert "the chain is whole" in said
+        assert f"step 7: {named} differ" in said
+        assert seal not in said, "whoever kept the seal knows at once"
+
+
+HOSTILE = [
+    {"logits": b""},
+    {"logits": b"\xff" * 400},
+    {"rows": b""},
+    {"rows": bytes(range(20))},
+    {"table": b"\xff" * 7},
+    {"pool": b"123"},
+    {"action": 10**9},
+    {"pose": b"12"},
+    {"pose": np.array([np.nan] * 3).tobytes()},
+    {"signals": 2**62},
+    {"distribution": b"\x00"},
+    {"kl": float("nan")},
+    {"main_task_done": True},
+    {"logits": None},
+]
+
+
+@pytest.mark.parametrize("changed", HOSTILE, ids=str)
+def test_a_hostile_step_is_told_of_and_breaks_nothing(case1, changed, capsys, tmp_path):
+    status, said = told(capsys, tmp_path, forged(case1[0], 7, **changed))
+    assert status == 1
+    assert "NOT as" in said
