@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from benchmarks.decisions import ROUNDING, ask
+from benchmarks.episodes import HERE, measure
 from benchmarks.plain import Plain
 from benchmarks.states import shipped_dqn, starts
 from benchmarks.sweep import made_robot
@@ -91,3 +92,11 @@ def test_what_reachability_certifies_holds_by_the_plain_dynamics(dqn):
 
 def test_made_robots_have_as_many_distinct_motions_as_they_say():
     assert [len(made_robot(n).motions) for n in (7, 16, 32, 64)] == [7, 16, 32, 64]
+
+
+def test_two_processes_decide_and_time_the_same_states_of_an_episode():
+    found = measure("case1", "reachability", [HERE, HERE], 1, 0)
+    assert found["differ"] == 0
+    assert found["first"].count(True) == 1
+    assert len(found["seconds"][0]) == len(found["seconds"][1]) == len(found["near"]) > 60
+    assert 0.0 < np.min(found["seconds"]) <= np.max(found["seconds"]) < np.inf
