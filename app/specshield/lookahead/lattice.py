@@ -10,7 +10,7 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.policy.lattice import heading_count, pose_of
+from specshield.policy.lattice import Corners, heading_count, pose_of
 from specshield.policy.reachability.tables import Tables, slack
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 from specshield.rule.progress import (
@@ -177,6 +177,7 @@ def _rule_out(body: Body, rules: Rules, tables: Tables, planes: Planes) -> None:
     """Leaves `possible` 0 where the tables leave no slack, for each set of settled goals at each step."""
     headings, cells = planes.valid.shape
     status, run = np.zeros(rules.kind.shape[0], np.int8), np.zeros(rules.kind.shape[0], np.int64)
+    corners = Corners(np.empty(4, np.int64), np.empty(4))
     for t in range(planes.slot.shape[0] - 1):
         for mask in range(planes.slot.shape[1]):
             slot = planes.slot[t, mask]
@@ -188,5 +189,5 @@ def _rule_out(body: Body, rules: Rules, tables: Tables, planes: Planes) -> None:
                 for c in range(cells):
                     if planes.valid[h, c]:
                         x, y, theta = pose_at(body, planes, h, c)
-                        spare = slack(body, rules, tables, x, y, theta, t, status, run)
+                        spare = slack(body, rules, tables, x, y, theta, t, status, run, corners)
                         planes.possible[slot, h, c] = spare >= 0.0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.arrays import Bools, Bytes, Codes, Int32s, Ints, Singles
+from specshield.arrays import Bools, Bytes, Codes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.robot.dynamics import (
     TOUCH,
@@ -153,9 +153,7 @@ def interpolate(
     or INVALID; what is above `largest` counts as that. nothing: the result where no corner is valid.
     """
     ny, nx = cell.shape
-    k = int(np.floor(h))
-    f = h - k
-    low, high = k % code.shape[1], (k + 1) % code.shape[1]
+    low, high, f = _beside(h, code.shape[1])
     total, weights = 0.0, 0.0
     for n in range(4):
         j, i, across = corner(v, u, n)
@@ -171,6 +169,53 @@ def interpolate(
             total += w * (min(int(found), largest) - zero)
             weights += w
     return total / (STEP_CODES * weights) if weights > 1e-6 else nothing
+
+
+class Corners(NamedTuple):
+    """The crossings about a place that some table knows: rows of the table (4,), bilinear weights (4,)."""
+
+    row: Ints
+    weight: Floats
+
+
+@inlined
+def find_corners(cell: Int32s, v: float, u: float, corners: Corners) -> int:
+    """Writes the crossings about a place; returns how many there are. cell [ny, nx]: as in `interpolate`."""
+    ny, nx = cell.shape
+    found = 0
+    for n in range(4):
+        j, i, across = corner(v, u, n)
+        if j < 0 or j >= ny or i < 0 or i >= nx or across == 0.0 or cell[j, i] < 0:
+            continue
+        corners.row[found], corners.weight[found] = cell[j, i], across
+        found += 1
+    return found
+
+
+@inlined
+def read_corners(corners: Corners, count: int, code: Codes, nothing: float, h: float) -> float:
+    """`interpolate` with codes from 1 on, at the first `count` of the corners about a place."""
+    low, high, f = _beside(h, code.shape[1])
+    total, weights = 0.0, 0.0
+    for n in range(count):
+        row, across = corners.row[n], corners.weight[n]
+        w, found = across * (1.0 - f), code[row, low]
+        if w >= 1e-9 and found != INVALID:
+            total += w * (int(found) - 1.0)
+            weights += w
+        w, found = across * f, code[row, high]
+        if w >= 1e-9 and found != INVALID:
+            total += w * (int(found) - 1.0)
+            weights += w
+    return total / (STEP_CODES * weights) if weights > 1e-6 else nothing
+
+
+@inlined
+def _beside(h: float, headings: int) -> tuple[int, int, float]:
+    """The headings of a lattice on both sides of h, and the share of the way from the one to the other."""
+    k = int(np.floor(h))
+    low = k if 0 <= k < headings else k % headings  # nearly always the former, and a division takes long
+    return low, low + 1 if low + 1 < headings else 0, h - k
 
 
 @leaf
@@ -254,8 +299,7 @@ def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
     ny, nx, headings = lattice.valid.shape
     out = np.zeros((rules.kind.shape[0], ny, nx, headings), np.uint8)
     values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
-    turns_matter = np.any((rules.programs.ops == VALUE) & (rules.programs.args == HEADING))
-    turns_matter = turns_matter or np.any(rules.regions.point != 0.0)
+    turns_matter = reads_heading(rules)
     for j in range(ny):
         for i in range(nx):
             fresh = True
@@ -269,3 +313,14 @@ def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
                 for k in range(predicates.shape[0]):
                     out[k, j, i, h] = predicates[k] > rules.margin
     return out
+
+
+@leaf
+def reads_heading(rules: Rules) -> bool:
+    """Whether some predicate may depend on where the robot looks, and not only on where it is."""
+    reads, programs, point = False, rules.programs, rules.regions.point
+    for i in range(programs.ops.shape[0]):
+        reads = reads or (programs.ops[i] == VALUE and programs.args[i] == HEADING)
+    for r in range(point.shape[0]):
+        reads = reads or point[r, 0] != 0.0 or point[r, 1] != 0.0
+    return reads

@@ -5,7 +5,7 @@ its dynamics knows what each of them does. A dynamics offers:
 
     Body, make_body                the robot on its map, prepared once: a NamedTuple of arrays and numbers
     step, successors, simulate     f: one motion, every motion, a list of motions, each with its contacts
-    unhindered                     f where nothing is near
+    around, step_from, unhindered  `step` in parts, to make several motions from a pose; f in the open
     overlap, in_collision          whether a pose is one that the robot may be in
     free_distance, swing_radius    how much room a place has, and how much the robot needs to turn there
     motion_count, displacement,    how many motions there are, where they lead from, and how far
@@ -31,4 +31,4 @@ from specshield.robot.body import (
     wrap,
 )
 from specshield.robot.contact import TOUCH, free_distance, in_collision, overlap
-from specshield.robot.unicycle import simulate, step, successors, unhindered
+from specshield.robot.unicycle import around, simulate, step, step_from, successors, unhindered

@@ -17,11 +17,25 @@ from specshield.robot.contact import TOUCH, can_turn, room_around, way_ahead
 @leaf
 def step(body: Body, x: float, y: float, theta: float, motion: int) -> tuple[float, float, float]:
     """f: the pose after one motion (an index into `Robot.motions`). theta in and out in (-pi, pi]."""
-    if _reach(body, motion) <= room_around(body, *centre(body, x, y, theta)):
-        return unhindered(body, x, y, theta, math.cos(theta), math.sin(theta), motion)
-    distance = body.translate[motion]
-    moved = way_ahead(body, x, y, theta, distance) if distance != 0.0 else 0.0
-    return _end(body, x, y, theta, motion, moved)
+    cos, sin, room = around(body, x, y, theta)
+    return step_from(body, x, y, theta, cos, sin, room, motion)
+
+
+@inlined
+def around(body: Body, x: float, y: float, theta: float) -> tuple[float, float, float]:
+    """What every motion from a pose needs: cosine and sine of its heading, and how much room [m] it has."""
+    return math.cos(theta), math.sin(theta), room_around(body, *centre(body, x, y, theta))
+
+
+@inlined
+def step_from(
+    body: Body, x: float, y: float, theta: float, cos: float, sin: float, room: float, motion: int
+) -> tuple[float, float, float]:
+    """`step`, given what is `around` the pose."""
+    if _reach(body, motion) <= room:
+        return unhindered(body, x, y, theta, cos, sin, motion)
+    far = body.translate[motion]
+    return _end(body, x, y, theta, motion, way_ahead(body, x, y, theta, far) if far != 0.0 else 0.0)
 
 
 @inlined
@@ -75,8 +89,7 @@ def simulate(body: Body, pose: Floats, motions: Ints, out: Floats) -> None:
 def successors(body: Body, pose: Floats, out: Floats) -> None:
     """The pose after each motion: `step`, with what the motions share done once. pose (3,), out (M, 3)."""
     x, y, theta = pose[0], pose[1], pose[2]
-    cos, sin = math.cos(theta), math.sin(theta)
-    room = room_around(body, *centre(body, x, y, theta))
+    cos, sin, room = around(body, x, y, theta)
     last, moved = 0.0, 0.0
     for motion in range(body.translate.shape[0]):
         if _reach(body, motion) <= room:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from specshield.policy.lattice import STEP_CODES
+from specshield.policy.lattice import STEP_CODES, Corners
 from specshield.policy.reachability.beam import beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.search import continue_all
@@ -33,10 +33,13 @@ def begun(guide, first, motion, t=0):
     return motions, poses, scratch
 
 
+def corners():
+    return Corners(np.empty(4, np.int64), np.empty(4))
+
+
 def slack_at(guide, where, t, status=PENDING, run=0):
-    return slack(
-        guide.body, guide.rules, guide.tables, *where, t, np.array([status], np.int8), np.array([run])
-    )
+    status, run = np.array([status], np.int8), np.array([run])
+    return slack(guide.body, guide.rules, guide.tables, *where, t, status, run, corners())
 
 
 def test_the_codes_of_the_tables(visit):
@@ -60,16 +63,17 @@ def test_a_dwell_under_way_leaves_what_comes_after_it():
     """Two of three steps in A are over at step 3; then there are four cells to B by step 12."""
     guide = guide_of(make_corridor("F[0,4] G[0,2] A and F[0,12] B", A=1, B=5))
     status, run = np.array([PENDING, PENDING], np.int8), np.array([2, 0])
-    here = slack(guide.body, guide.rules, guide.tables, *pose(1), 3, status, run)
+    here = slack(guide.body, guide.rules, guide.tables, *pose(1), 3, status, run, corners())
     assert here == 12 - 4 - 4  # it is over at step 4
 
 
 def test_the_score_of_each_motion(visit):
     scores = np.empty(4)
     status, run = np.array([PENDING], np.int8), np.array([0])
-    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, -1, scores)
+    scratch = corners(), corners()
+    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, -1, scores, *scratch)
     assert scores.tolist() == pytest.approx([8.0, 6.0, 6.0, 7.0])
-    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, LEFT, scores)
+    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, LEFT, scores, *scratch)
     assert scores[RIGHT] == HOPELESS
 
 

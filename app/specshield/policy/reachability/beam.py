@@ -13,9 +13,11 @@ import numpy as np
 
 from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
-from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, update_progress
-from specshield.policy.reachability.tables import SAFE, is_broken, score, slack
-from specshield.robot.dynamics import motion_count, step
+from specshield.policy.lattice import reads_heading
+from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, read_due
+from specshield.policy.reachability.tables import SAFE, UNKNOWN, is_broken, score, slack_at
+from specshield.robot.dynamics import around, motion_count, step_from
+from specshield.rule.progress import advance
 
 MAX_ROOTS = 62  # bits of a tag, which is an int64
 
@@ -50,6 +52,13 @@ class Edges(NamedTuple):
     tag: Ints
 
 
+class Heap(NamedTuple):
+    """Rows of `Poses` and their slack [steps], as a binary heap."""
+
+    row: Ints
+    slack: Floats
+
+
 @kernel
 def beam_search(
     guide: Guide, t: int, pose: Floats, status: Int8s, run: Ints, share: int, band: float, target: float,
@@ -75,6 +84,7 @@ def beam_search(
     while slots < 2 * room:
         slots *= 2
     table, place, kept = np.empty(slots, np.int32), np.empty(room, np.int64), np.empty(roots, np.int64)
+    heap = Heap(np.empty(room, np.int64), np.empty(room))
     here.pose[:roots], here.status[:roots], here.run[:roots] = pose, status, run
     here.tag[:roots] = 1 << np.arange(roots)
     taken[:] = 0
@@ -85,8 +95,7 @@ def beam_search(
         open_roots = _finish(t, n, found, open_roots, target, status, new, edges, motions, taken)
         if open_roots == 0:
             return
-        order = np.argsort(-new.slack[:found], kind="mergesort")
-        count = _select(order, n, open_roots, width, share, band, kept, place, here, new, edges)
+        count = _select(found, n, open_roots, width, share, band, kept, place, heap, here, new, edges)
         if count == 0:
             return
 
@@ -115,26 +124,37 @@ def _expand(
 ) -> int:  # fmt: skip
     """Makes every motion from the first `count` poses of `here`; each new pose is written once. How many."""
     body, rules, tables, wait = guide
-    found, joined = 0, 0
+    found, joined, turns_matter = 0, 0, reads_heading(rules)
     for w in range(count):
         edges.tag[n, w] = here.tag[w]
         if here.tag[w] & open_roots == 0:
             continue
-        x, y, theta = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
-        score(body, rules, tables, x, y, theta, t + n, here.status[w], here.run[w], wait, -1, scratch.scores)
+        before_x, before_y, before = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
+        known = score(
+            body, rules, tables, before_x, before_y, before, t + n, here.status[w], here.run[w], wait, -1,
+            scratch.scores, scratch.corners, scratch.ahead,
+        )  # fmt: skip
         lowest = max(band + t + n + 1, _lowest(scratch.scores))
+        cos, sin, room = around(body, before_x, before_y, before)
+        read = False  # whether the scratch holds the predicates at the place that the motions begin at
         for m in range(motion_count(body)):
             if scratch.scores[m] < lowest:
                 continue
-            x, y, theta = step(body, here.pose[w, 0], here.pose[w, 1], here.pose[w, 2], m)
+            x, y, theta = step_from(body, before_x, before_y, before, cos, sin, room, m)
             copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
-            update_progress(rules, t + n + 1, x, y, theta, scratch)
+            # After a turn the corners are those of before, and mostly the predicates too.
+            stays = x == before_x and y == before_y
+            if not (stays and read):
+                read_due(rules, t + n + 1, x, y, theta, scratch)
+                read = stays and not turns_matter
+            advance(rules, t + n + 1, scratch.predicates, scratch.status, scratch.run)
             _put(new, found, x, y, theta, scratch.status, scratch.run)
             at = _place(new, found, table)
             if at == found:
-                new.slack[at] = slack(
-                    body, rules, tables, x, y, theta, t + n + 1, new.status[at], new.run[at]
-                )
+                new.slack[at] = slack_at(
+                    body, rules, tables, x, y, theta, t + n + 1, new.status[at], new.run[at],
+                    scratch.corners if stays else scratch.ahead, known if stays else UNKNOWN,
+                )  # fmt: skip
                 new.tag[at] = 0
                 found += 1
             if new.slack[at] >= band and not is_broken(new.status[at]):
@@ -190,21 +210,30 @@ def _finish(
 
 @leaf
 def _select(
-    order: Ints, n: int, open_roots: int, width: int, share: int, band: float, kept: Ints, place: Ints,
-    here: Poses, new: Poses, edges: Edges,
+    found: int, n: int, open_roots: int, width: int, share: int, band: float, kept: Ints, place: Ints,
+    heap: Heap, here: Poses, new: Poses, edges: Edges,
 ) -> int:  # fmt: skip
     """Puts the poses to go on with into `here`, most slack first, until each root has its share. How many.
 
-    order: the rows of `new` by falling slack. The edges to poses that are not kept are taken out.
+    found: how many poses of `new` count. The edges to poses that are not kept are taken out.
     """
     for r in range(kept.shape[0]):
         kept[r] = 0
-    count, full = 0, 0  # full: the roots that have their share
-    for i in range(order.shape[0]):
-        o = order[i]
+    size = 0
+    for o in range(found):
         place[o] = -1
+        if new.slack[o] >= band and new.tag[o] & open_roots != 0:
+            heap.row[size], heap.slack[size] = o, new.slack[o]
+            size += 1
+    for i in range(size // 2 - 1, -1, -1):
+        _sink(heap, i, size, heap.row[i], heap.slack[i])
+    count, full = 0, 0  # full: the roots that have their share
+    while size > 0 and count < width:
+        o = heap.row[0]
+        size -= 1
+        _sink(heap, 0, size, heap.row[size], heap.slack[size])
         tag = new.tag[o] & open_roots
-        if count == width or new.slack[o] < band or tag & ~full == 0:
+        if tag & ~full == 0:
             continue
         for r in range(kept.shape[0]):
             kept[r] += tag >> r & 1
@@ -222,6 +251,31 @@ def _select(
             joined += 1
     edges.made[n] = joined
     return count
+
+
+@inlined
+def _sink(heap: Heap, hole: int, size: int, row: int, slack: float) -> None:
+    """Puts a row into heap[:size] at `hole` or below. The hole goes down to the end first and the row up from
+    there, since it mostly belongs there: fewer branches that cannot be foreseen.
+    """
+    at = hole
+    while 2 * at + 1 < size:
+        child = 2 * at + 1
+        if child + 1 < size:
+            child += _is_before(heap, child + 1, heap.row[child], heap.slack[child])
+        heap.row[at], heap.slack[at] = heap.row[child], heap.slack[child]
+        at = child
+    while at > hole and not _is_before(heap, (at - 1) // 2, row, slack):
+        heap.row[at], heap.slack[at] = heap.row[(at - 1) // 2], heap.slack[(at - 1) // 2]
+        at = (at - 1) // 2
+    heap.row[at], heap.slack[at] = row, slack
+
+
+@inlined
+def _is_before(heap: Heap, at: int, row: int, slack: float) -> bool:
+    """Whether what is at a place of the heap comes before a row: most slack first, then the lowest row."""
+    other = heap.slack[at]
+    return bool((other > slack) | ((other == slack) & (heap.row[at] < row)))
 
 
 @leaf

@@ -8,6 +8,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
+from specshield.policy.lattice import Corners
 from specshield.policy.reachability.tables import Tables, goals_settled
 from specshield.robot.dynamics import Body
 from specshield.rule.progress import EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
@@ -29,7 +30,8 @@ class Scratch(NamedTuple):
 
     status, run (K,): the progress at the newest pose; high_status, high_run (K,): where the latest feasible
     time was highest. predicates (K,): their robustness at the newest pose, where it was needed. scores (M,):
-    the latest feasible time after each motion. values, stack: of `evaluate_packed`.
+    the latest feasible time after each motion. values, stack: of `evaluate_packed`. corners, ahead: of
+    `score` and `slack`.
     """
 
     values: Floats
@@ -40,6 +42,8 @@ class Scratch(NamedTuple):
     run: Ints
     high_status: Int8s
     high_run: Ints
+    corners: Corners
+    ahead: Corners
 
 
 @kernel
@@ -48,6 +52,7 @@ def make_scratch(rules: Rules, motions: int) -> Scratch:
     return Scratch(
         np.empty(value_count(rules)), np.empty(STACK), np.empty(k), np.empty(motions), np.empty(k, np.int8),
         np.empty(k, np.int64), np.empty(k, np.int8), np.empty(k, np.int64),
+        Corners(np.empty(4, np.int64), np.empty(4)), Corners(np.empty(4, np.int64), np.empty(4)),
     )  # fmt: skip
 
 
@@ -75,12 +80,18 @@ def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, scratch
 
 @inlined
 def update_progress(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> None:
-    """Takes x_t into the scratch's progress. Predicates that `advance` does not need are not evaluated."""
+    """Takes x_t into the scratch's progress."""
+    read_due(rules, t, x, y, theta, scratch)
+    advance(rules, t, scratch.predicates, scratch.status, scratch.run)
+
+
+@inlined
+def read_due(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> None:
+    """Evaluates the predicates that `advance` needs at step t."""
     for k in range(rules.kind.shape[0]):
         opens = rules.a[k] + (rules.c2[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
         if scratch.status[k] == PENDING and t >= opens:
             scratch.predicates[k] = predicate_at(rules, k, x, y, theta, scratch)
-    advance(rules, t, scratch.predicates, scratch.status, scratch.run)
 
 
 @inlined

@@ -141,7 +141,9 @@ def _first_steps(
         copy_progress(status, run, scratch.status, scratch.run)
         update_progress(rules, t + 1, x, y, theta, scratch)
         copy_progress(scratch.status, scratch.run, starts.status[m], starts.run[m])
-        starts.slack[m] = slack(body, rules, tables, x, y, theta, t + 1, scratch.status, scratch.run)
+        starts.slack[m] = slack(
+            body, rules, tables, x, y, theta, t + 1, scratch.status, scratch.run, scratch.corners
+        )
 
 
 @leaf
@@ -186,7 +188,11 @@ def _follow(
             break
         status, run = scratch.high_status.copy(), scratch.high_run.copy()
         x, y, theta = poses[n - 1]
-        high = t + n + slack(guide.body, guide.rules, guide.tables, x, y, theta, t + n, status, run)
+        high = (
+            t
+            + n
+            + slack(guide.body, guide.rules, guide.tables, x, y, theta, t + n, status, run, scratch.corners)
+        )
         way = np.empty((1, min(motions.shape[0] - n, ESCAPE_LENGTH)), np.int64)
         taken = np.empty(1, np.int64)
         beam_search(

@@ -9,19 +9,21 @@ import numpy as np
 from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, leaf
 from specshield.policy.lattice import (
-    INVALID,
+    Corners,
     coordinates,
     coordinates_ahead,
     corner,
+    find_corners,
     heading_after,
-    interpolate,
     leads_back,
+    read_corners,
 )
 from specshield.robot.dynamics import Body, displacement
 from specshield.rule.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
 SAFE = 1e6  # in place of a slack [steps], where nothing is left to do
+UNKNOWN = -1  # in place of how many corners there are about a place
 DELAYS = (0, 1, 2, 4, 8)  # [steps] that a robot which cannot wait would like to have to spare
 
 
@@ -49,19 +51,28 @@ class Tables(NamedTuple):
 
 
 @inlined
-def latest_at(tables: Tables, table: int, v: float, u: float, h: float) -> float:
-    """L at lattice coordinates, HOPELESS where no corner is valid."""
-    return interpolate(tables.cell, tables.code[table], 1.0, INVALID, HOPELESS, v, u, h)
+def latest_at(tables: Tables, table: int, corners: Corners, count: int, h: float) -> float:
+    """L at the first `count` of the corners about a place, HOPELESS where none is valid."""
+    return read_corners(corners, count, tables.code[table], HOPELESS, h)
 
 
 @leaf
 def slack(
     body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
-    run: Ints,
+    run: Ints, corners: Corners,
 ) -> float:  # fmt: skip
     """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something
-    is broken.
+    is broken. corners: scratch.
     """
+    return slack_at(body, rules, tables, x, y, theta, t, status, run, corners, UNKNOWN)
+
+
+@inlined
+def slack_at(
+    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
+    run: Ints, corners: Corners, count: int,
+) -> float:  # fmt: skip
+    """`slack`, inlined. corners: those about (x, y) where `count` says how many, else scratch."""
     if tables.bits.shape[0] > 0:
         return _steps_ahead(body, rules, tables, x, y, theta, t, status, run)
     mask, every = 0, 0
@@ -74,15 +85,17 @@ def slack(
     if mask == every and tables.phase[t] == len(tables.end) - 1:
         return SAFE
     v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
+    if count == UNKNOWN:
+        count = find_corners(tables.cell, v, u, corners)
     best = HOPELESS
     table = tables.table[tables.phase[t], mask]
     if table >= 0:
-        best = latest_at(tables, table, v, u, h) - t
+        best = latest_at(tables, table, corners, count, h) - t
     for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
             over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
             if over < tables.phase.shape[0]:
-                best = max(best, _after_dwell(tables, mask | tables.bit[k], every, over, v, u, h))
+                best = max(best, _after_dwell(tables, mask | tables.bit[k], every, over, corners, count, h))
     return best
 
 
@@ -132,12 +145,14 @@ def _feasible_at(tables: Tables, t: int, progress: int, v: float, u: float, h: f
 
 
 @inlined
-def _after_dwell(tables: Tables, mask: int, every: int, t: int, v: float, u: float, h: float) -> float:
+def _after_dwell(
+    tables: Tables, mask: int, every: int, t: int, corners: Corners, count: int, h: float
+) -> float:
     """The slack once a dwell is over, at step t and where it was begun."""
     if mask == every and tables.phase[t] == len(tables.end) - 1:
         return float(tables.end[-1] - t)
     table = tables.table[tables.phase[t], mask]
-    return latest_at(tables, table, v, u, h) - t if table >= 0 else HOPELESS
+    return latest_at(tables, table, corners, count, h) - t if table >= 0 else HOPELESS
 
 
 @inlined
@@ -159,16 +174,18 @@ def is_broken(status: Int8s) -> bool:
 @inlined
 def score(
     body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
-    run: Ints, wait: int, last: int, scores: Floats,
-) -> None:  # fmt: skip
+    run: Ints, wait: int, last: int, scores: Floats, corners: Corners, ahead: Corners,
+) -> int:  # fmt: skip
     """L after each motion (M,) from x_t, contact and the step's own progress left out: a cheap order to try
     motions in.
 
     last: the motion before, -1 for none. HOPELESS for what leads straight back: the tables err by a little.
+    Writes the corners about (x, y) and returns how many there are, UNKNOWN where they were not needed; ahead:
+    scratch.
     """
     if tables.bits.shape[0] > 0:
         scores[:] = SAFE
-        return
+        return UNKNOWN
     mask, every = 0, 0
     for k in range(status.shape[0]):
         every |= tables.bit[k]
@@ -176,19 +193,26 @@ def score(
             mask |= tables.bit[k]
     if mask == every and tables.phase[t + 1] == len(tables.end) - 1:
         scores[:] = SAFE
-        return
+        return UNKNOWN
     table = tables.table[tables.phase[t + 1], mask]
     headings = tables.code.shape[2]
     v, u, h, dv, du = coordinates_ahead(body, tables.pitch, headings, x, y, theta)
+    count = find_corners(tables.cell, v, u, corners)
     for m in range(scores.shape[0]):
         if table < 0 or leads_back(body, last, m):
             scores[m] = HOPELESS
             continue
         d, angle = displacement(body, m)
-        scores[m] = latest_at(tables, table, v + d * dv, u + d * du, heading_after(headings, h, angle))
+        w = heading_after(headings, h, angle)
+        if d == 0.0:
+            scores[m] = latest_at(tables, table, corners, count, w)
+        else:
+            there = find_corners(tables.cell, v + d * dv, u + d * du, ahead)
+            scores[m] = latest_at(tables, table, ahead, there, w)
     for k in range(status.shape[0]):
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
             over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
             if over < tables.phase.shape[0]:
-                spare = _after_dwell(tables, mask | tables.bit[k], every, over, v, u, h)
+                spare = _after_dwell(tables, mask | tables.bit[k], every, over, corners, count, h)
                 scores[wait] = max(scores[wait], spare + t + 1.0)
+    return count

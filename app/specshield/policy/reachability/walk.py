@@ -54,7 +54,10 @@ def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: S
     high, high_n = -np.inf, n
     while n < steps and not is_over(rules, tables, t + n, status):
         last = motions[n - 1]
-        score(body, rules, tables, x, y, theta, t + n, status, run, wait, last, scores)
+        score(
+            body, rules, tables, x, y, theta, t + n, status, run, wait, last, scores, scratch.corners,
+            scratch.ahead,
+        )  # fmt: skip
         gained = n == high_n or scores[wait] > high + CLIMB_GAIN
         for k in range(k_count):
             gained = gained or status[k] != scratch.high_status[k]
@@ -92,7 +95,7 @@ def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: S
             poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
             n += 1
             if goal >= 0:  # it is settled; where there is time, the robot goes deeper into it
-                spare = slack(body, rules, tables, x, y, theta, t + n, status, run) - SPARE
+                spare = slack(body, rules, tables, x, y, theta, t + n, status, run, scratch.corners) - SPARE
                 n = _deepen(guide, t, n, goal, min(rules.b[goal], t + n + spare), motions, poses, scratch)
                 x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
             continue
