@@ -52,7 +52,10 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
     )
     try:
         for command in commands:
-            app.command()(command)
+            if isinstance(command, typer.Typer):
+                app.add_typer(command)
+            else:
+                app.command()(command)
         app()
     except SpecshieldError as error:
         sys.exit(str(error))
@@ -68,8 +71,15 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
 def _commands() -> Iterator[Callable[..., None]]:
     """The commands below, and those that other packages register as entry points."""
     yield from (serve, demo, train, worker, verify, openapi)
+    yield _keys()
     for registered in entry_points(group="specshield.commands"):
         yield registered.load()
+
+
+def _keys() -> Any:
+    from specshield.service.access.commands import app
+
+    return app
 
 
 def serve(
@@ -89,11 +99,11 @@ def serve(
 
     settings = _settings()  # what is wrong with them is said here, in one line
     _check_address(host, port)
-    if not insecure:
-        _check_exposure(host, settings)
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
     if embedded is not None:
         embedded.join()  # and so is why it does not start
+    if not insecure:
+        _check_exposure(host, settings)
     raise_file_limit()
     options: dict[str, Any] = {
         "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
@@ -201,15 +211,18 @@ def _check_address(host: str, port: int) -> None:
 
 def _check_exposure(host: str, settings: Settings) -> None:
     """Raises InputError where anybody on the network could use the server."""
+    from specshield.service.access.commands import on_keys
     from specshield.service.access.site import is_loopback
 
-    if settings.api_key is None and not is_loopback(host):
+    if is_loopback(host) or settings.api_key is not None:
+        return
+    if not on_keys(lambda keys: keys.listed(), settings):
         raise InputError(
             f"whoever reaches {host} could use this server, since it asks for no key",
             path="--host",
             got=host,
-            expected="SPECSHIELD_API_KEY set; or an address that only this machine reaches, as 127.0.0.1; or "
-            "--insecure, where something in front decides who may",
+            expected="a key, by `specshield keys create` or SPECSHIELD_API_KEY; or an address that only this "
+            "machine reaches, as 127.0.0.1; or --insecure, where something in front decides who may",
         )
 
 

@@ -30,6 +30,8 @@ SpecshieldError
 ├── CrossSite                   a request that a page of another origin made
 ├── MisdirectedRequest          a Host that is not this server's
 ├── LimitReached                too many maps, policies or sessions kept; delete some
+│   └── RateLimited             too many requests a second for this key; ask again after Retry-After
+├── InsufficientStorage         no room on the disk, or none left for this owner
 ├── Busy                        the server has too much to do just now; ask again after Retry-After
 ├── RequestTimeout              the request took too long to arrive
 ├── TrainingUnavailable         no worker is there to train
@@ -205,6 +207,14 @@ class MisdirectedRequest(SpecshieldError):
 
 class LimitReached(SpecshieldError):
     type = "limit-reached"
+
+
+class RateLimited(LimitReached):
+    type = "rate-limited"
+
+
+class InsufficientStorage(SpecshieldError):
+    type = "insufficient-storage"
 
 
 class Busy(SpecshieldError):

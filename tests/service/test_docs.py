@@ -67,6 +67,7 @@ ORDER = [  # the way the description says: each example is sent as it stands
     ("get", "/v1/maps", 200),
     ("get", "/v1/maps/{map_id}", 200),
     ("get", "/v1/maps/{map_id}/image.png", 200),
+    ("delete", "/v1/maps/{map_id}", 409),  # it came with the server
     ("post", "/v1/policies", 503),  # no worker here; with one it is 202
     ("get", "/v1/policies", 200),
     ("get", "/v1/policies/{policy_id}", 200),

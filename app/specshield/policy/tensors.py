@@ -29,9 +29,11 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
     try:
         return _mapped(weights) if isinstance(weights, Path) else load(weights)
     except Exception as error:  # the parser raises its own types for hostile bytes
-        got = str(weights) if isinstance(weights, Path) else f"{len(weights)} bytes"
+        # No path of this machine is told: not as what was got, nor by an error of the system's.
+        got = None if isinstance(weights, Path) else f"{len(weights)} bytes"
+        reason = "it cannot be read" if isinstance(error, OSError) else str(error)
         raise PolicyError(
-            f"not a safetensors file: {error}", path="weights", got=got, expected="safetensors"
+            f"not a safetensors file: {reason}", path="weights", got=got, expected="safetensors"
         ) from error
 
 
@@ -40,8 +42,13 @@ def named_arrays(
 ) -> list[NDArray[Any]]:
     """The arrays of these names, {name: (dtype, rank)}, contiguous and writable.
 
-    Raises PolicyError for one that is missing, or of another dtype or rank.
+    Raises PolicyError for one that is missing, of another dtype or rank, or not among these.
     """
+    if not tensors.keys() <= wanted.keys():
+        extra = sorted(tensors.keys() - wanted.keys())
+        raise PolicyError(
+            "arrays that no policy of this kind has", path="weights", got=extra, expected=str(sorted(wanted))
+        )
     for name, (dtype, rank) in wanted.items():
         array = tensors.get(name)
         if array is None or array.dtype != dtype or array.ndim != rank:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import multiprocessing
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -14,10 +15,13 @@ from fastapi.openapi.utils import get_openapi
 from fastapi_offline import FastAPIOffline
 
 from specshield import __version__
+from specshield.errors import SpecshieldError, StoreError
 from specshield.service import problems
+from specshield.service.access.keys import Keys
 from specshield.service.bounds import body
 from specshield.service.bounds.bodies import Bodies
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe, guarded
@@ -35,6 +39,7 @@ from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
+log = logging.getLogger("specshield")
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
 set of actions; the service answers the closest distribution that still lets a Signal Temporal Logic
@@ -72,9 +77,8 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
     for module in (specs, maps, policies, sessions, events, system):
         app.include_router(module.router)
     problems.install(app)
-    api_key = None if settings.api_key is None else settings.api_key.get_secret_value()
     app.add_middleware(Bodies, settings=settings)  # the innermost: nothing is read for who may not ask
-    app.add_middleware(Guard, api_key=api_key, allowed_hosts=settings.hosts)
+    app.add_middleware(Guard, allowed_hosts=settings.hosts)
     app.add_middleware(Observe)  # the outermost
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app
@@ -89,18 +93,36 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     if embedded is not None:
         await asyncio.to_thread(embedded.join)
     url = embedded.url if embedded is not None else str(settings.redis_url)
-    store, library = Store(url, settings.store_timeout, settings.session_ttl), Maps(settings)
-    known = Policies(settings, library)
+    store, jobs = Store(url, settings.store_timeout, settings.session_ttl), Jobs(url, settings)
+    claims = Claims(jobs.redis, settings)
+    library = Maps(settings, claims)
+    known = Policies(settings, library, claims)
     worker = TrainingWorker(settings) if wants_worker(settings) else None
     heavy, startup = Heavy(settings), Startup()
     sessions = Sessions(settings, store, known, heavy)
-    jobs = Jobs(url, settings)
-    gauges = Gauges(store, jobs)
+    own = None if settings.api_key is None else settings.api_key.get_secret_value()
+    keys, gauges = Keys(store.redis, own), Gauges(store, jobs)
     watchers = Watchers(store, settings.max_watchers, lambda: startup.stopping)
-    server = Server(settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy)
+    server = Server(
+        settings,
+        store,
+        library,
+        known,
+        sessions,
+        jobs,
+        gauges,
+        watchers,
+        worker,
+        startup,
+        heavy,
+        keys,
+        claims,
+    )
     body.clear(settings.data_dir / "incoming")
     app.state.server = server
-    running = (tend(embedded, worker), prepare(startup), watchers.run())
+    running = (
+        tend(embedded, worker), prepare(startup), watchers.run(), keys.follow(), _adopt(library, known)
+    )  # fmt: skip
     tasks = [asyncio.create_task(each) for each in running]
     try:
         yield
@@ -115,6 +137,21 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         await store.aclose()
         if embedded is not None:
             embedded.leave()
+
+
+async def _adopt(library: Maps, known: Policies) -> None:
+    """Once the store answers."""
+    waiting = True
+    while waiting:
+        waiting = False
+        try:
+            await asyncio.to_thread(library.adopt)
+            await asyncio.to_thread(known.adopt)
+        except StoreError:
+            waiting = True
+            await asyncio.sleep(1.0)
+        except SpecshieldError as error:  # no room for them, say
+            log.error("maps and policies of a time before owners stay unseen: %s", error)
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:
@@ -146,6 +183,8 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
                 said["_421"] = "`misdirected-request`: Host does not name this server."
                 if guarded(path):
                     said["_401"] = "The server asks for a key, and this is not it."
+                    said["_429"] = operation["responses"].get("429", {}).get("description", "")
+                    said["_429"] = f"{said['_429']} `rate-limited`: wait for Retry-After.".strip()
                 if path.startswith("/v1/"):
                     said["_503"] = operation["responses"].get("503", {}).get("description", "")
                     said["_503"] = f"{said['_503']} `starting`: the server is not ready yet.".strip()

@@ -17,6 +17,7 @@ from starlette.types import Receive, Scope, Send
 
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
+from specshield.service.library.files import is_full
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_GONE = 499  # what nginx logs for a request whose client went away; it is never sent
@@ -41,6 +42,7 @@ STATUS: Mapping[type[SpecshieldError], int] = {
     errors.LimitReached: 429,
     errors.Busy: 503,
     errors.RequestTimeout: 408,
+    errors.InsufficientStorage: 507,
     errors.TrainingUnavailable: 503,
     errors.Starting: 503,
     errors.StoreError: 503,
@@ -100,6 +102,8 @@ def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -
         extra["WWW-Authenticate"] = "Bearer"
     if status == 503:
         extra["Retry-After"] = "1"
+    if isinstance(error, errors.RateLimited):
+        extra["Retry-After"] = str(error.details["retry_after"])
     return ProblemResponse(error, status, extra)
 
 
@@ -227,6 +231,12 @@ def install(app: FastAPI) -> None:
         request.scope["state"]["status"] = CLIENT_GONE
         return Response(status_code=CLIENT_GONE)  # which nobody reads
 
+    async def disk(request: Request, error: Exception) -> Response:
+        assert isinstance(error, OSError)
+        if not is_full(error):
+            raise error
+        return response(errors.InsufficientStorage("the server's disk is full", expected="a disk with room"))
+
     async def unknown(request: Request, error: Exception) -> Response:
         # The traceback goes to the log: starlette raises the error again after this answer.
         return response(errors.ServerError("the server failed on this request; its log says more"))
@@ -235,4 +245,5 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, invalid)
     app.add_exception_handler(HTTPException, http)
     app.add_exception_handler(ClientGone, gone)
+    app.add_exception_handler(OSError, disk)
     app.add_exception_handler(Exception, unknown)

@@ -86,6 +86,17 @@ class Settings(BaseSettings):
         default=1 << 30, ge=256 << 20, description="Most memory of a process that does it [bytes]."
     )
 
+    max_owner_bytes: int = Field(
+        default=8 << 30, ge=0, description="Most that one key's maps and policies take on the disk [bytes]."
+    )
+    max_stored_bytes: int = Field(
+        default=32 << 30, ge=0, description="Most that all maps and policies take on the disk [bytes]."
+    )
+    disk_reserve_bytes: int = Field(
+        default=64 << 20,
+        ge=0,
+        description="Free space of the data folder's disk that only running sessions use up [bytes].",
+    )
     max_maps: int = Field(default=1000, ge=1, description="Most uploaded maps kept.")
     max_policies: int = Field(default=1000, ge=1, description="Most policies kept.")
     max_sessions: int = Field(default=100_000, ge=1, description="Most sessions kept.")

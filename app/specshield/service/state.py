@@ -7,7 +7,9 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
+from specshield.service.access.keys import Keys
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions.sessions import Sessions
@@ -35,6 +37,8 @@ class Server:
     worker: TrainingWorker | None
     startup: Startup
     heavy: Heavy
+    keys: Keys
+    claims: Claims
 
 
 def _server(request: Request) -> Server:

@@ -3,7 +3,7 @@
 Any web page may make its visitor's browser send requests to this machine. The page cannot read the answers,
 unless its own name is made to point here (DNS rebinding): the Host header then holds that name. So:
 
-- Host has to name the server. On a connection to a loopback address: `localhost`, `127.0.0.1` or `[::1]`, with
+- Host has to name the server. On a connection to a loopback address: `localhost`, `127.0.0.1` or `[::1]` with
   the server's port. On any other, where a balancer or a port mapping may stand in between: any literal
   address or `localhost`, since neither can be made to point elsewhere; so a probe may ask a pod by its
   address. Other names are those of SPECSHIELD_ALLOWED_HOSTS. A unix socket takes any: no browser reaches it.

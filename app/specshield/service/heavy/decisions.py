@@ -31,6 +31,6 @@ def step(
 
 
 def begin(
-    settings: Settings, request: SessionRequest, config: Config
+    settings: Settings, request: SessionRequest, config: Config, owner: str
 ) -> tuple[dict[str, Any], bool, str, Floats]:
-    return sessions.begin(policies_of(settings), _shields(settings), request, config, None)
+    return sessions.begin(policies_of(settings), _shields(settings), request, config, None, owner)

@@ -5,6 +5,8 @@ Every function takes the settings first, and gives what the server needs for its
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,15 +17,19 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import create_form_parser
 
 from specshield import stl
-from specshield.errors import BodyTooLarge, FormulaError, FragmentError, InputError
+from specshield.errors import BodyTooLarge, FormulaError, FragmentError, InputError, PolicyError
 from specshield.policy.methods import METHODS
 from specshield.policy.options import options_to_json, read_options
+from specshield.service.access.keys import Key
+from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Description, Policies, Record, describe
 from specshield.service.problems import from_validation
 from specshield.service.schemas.policies import Card, PolicyRequest
 from specshield.service.schemas.specs import SpecRequest
 from specshield.service.settings import Settings
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.training.jobs import Jobs
 from specshield.task import names_for, parse_regions, parse_signals
 from specshield.world.formats import read_map
 from specshield.world.regions import Polygon
@@ -42,15 +48,21 @@ Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))  # loads numba's compiler, once fo
 
 @cache
 def policies_of(settings: Settings) -> Policies:
-    return Policies(settings, _maps(settings))
+    return Policies(settings, _maps(settings), _claims(settings))
 
 
 @cache
 def _maps(settings: Settings) -> Maps:
-    return Maps(settings)
+    return Maps(settings, _claims(settings))
 
 
-def add_map(settings: Settings, content_type: str, content: Content) -> dict[str, Any]:
+@cache
+def _claims(settings: Settings) -> Claims:
+    url = settings.redis_url or EmbeddedStore(settings.data_dir).url
+    return Claims(Jobs(url, settings).redis, settings)
+
+
+def add_map(settings: Settings, content_type: str, content: Content, key: Key) -> dict[str, Any]:
     if is_multipart(content_type):
         members: dict[str, Any] = dict(_parts(content_type, content))
         name = members.pop("format", FILES.encode()).decode(errors="replace")
@@ -58,14 +70,14 @@ def add_map(settings: Settings, content_type: str, content: Content) -> dict[str
     else:
         members = _object(_bytes(content))
         made = read_map(members.pop("format", None), members)
-    return _maps(settings).add(*made).to_json()
+    return _maps(settings).add(*made, key).to_json()
 
 
-def draw_map(settings: Settings, key: str) -> bytes:
-    return _maps(settings).get(key).png()
+def draw_map(settings: Settings, key: str, owner: str) -> bytes:
+    return _maps(settings).find(key, owner).png()
 
 
-def add_policy(settings: Settings, content_type: str, content: Content) -> Record:
+def add_policy(settings: Settings, content_type: str, content: Content, key: Key) -> Record:
     """Keeps a policy that was made elsewhere."""
     files = _parts(content_type, content)
     if files.keys() != PARTS.keys():
@@ -75,10 +87,25 @@ def add_policy(settings: Settings, content_type: str, content: Content) -> Recor
         expected = f"at most {settings.max_body_bytes} bytes"
         raise BodyTooLarge("the card is too large", path="card", got=len(files["card"]), expected=expected)
     card = parse(CARD, files["card"], "card").model_dump(exclude_unset=True)
-    return policies_of(settings).add_card(describe(card), card, files["weights"])
+    for path, number in _numbers(card, "card"):
+        if not math.isfinite(number):
+            raise PolicyError("not a finite number", path=path, got=number, expected="a finite number")
+    return policies_of(settings).add_card(describe(card), card, files["weights"], key)
 
 
-def check_policy(settings: Settings, content: Content) -> Record:
+def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
+    """The floats in JSON, each with its path."""
+    if isinstance(value, float):
+        yield path, value
+    elif isinstance(value, dict):
+        for name, member in value.items():
+            yield from _numbers(member, f"{path}.{name}")
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            yield from _numbers(item, f"{path}[{i}]")
+
+
+def check_policy(settings: Settings, content: Content, owner: str) -> Record:
     """What is asked for, once it is checked; nothing is kept."""
     body = parse(REQUEST, _bytes(content)).model_dump(exclude_unset=True)
     asked = PolicyRequest(**body)
@@ -87,7 +114,7 @@ def check_policy(settings: Settings, content: Content) -> Record:
     robot, settled = body.get("robot", "stretch"), options_to_json(options)
     about = Description(asked.map_id, robot, body["spec"], asked.method, asked.seed, settled)
     policies = policies_of(settings)
-    about = policies.resolve(about)
+    about = policies.resolve(about, owner)
     task = policies.task(about)
     try:
         method.check(task, options)
@@ -96,17 +123,17 @@ def check_policy(settings: Settings, content: Content) -> Record:
     return policies.described(about, task)
 
 
-def check_spec(settings: Settings, content: bytes) -> dict[str, Any]:
-    return explain(_maps(settings), settings, content)
+def check_spec(settings: Settings, content: bytes, owner: str) -> dict[str, Any]:
+    return explain(_maps(settings), settings, content, owner)
 
 
-def explain(maps: Maps, settings: Settings, content: bytes) -> dict[str, Any]:
+def explain(maps: Maps, settings: Settings, content: bytes, owner: str) -> dict[str, Any]:
     """What a formula means, as the contract shows it."""
     request = parse(SPEC, content)
     body = request.model_dump()
     regions = parse_regions(body["regions"] or {})
     signals = parse_signals(body["signals"] or {}, regions)
-    rooms = maps.get(request.map_id).rooms if request.map_id else {}
+    rooms = maps.find(request.map_id, owner).rooms if request.map_id else {}
     declared = any(given is not None for given in (request.regions, request.signals, request.map_id))
     names = names_for({**rooms, **regions}, signals) if declared else None
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -9,12 +10,13 @@ import shutil
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from specshield.errors import InputError, LimitReached
+from specshield.errors import InputError, InsufficientStorage
 
 HASH = re.compile(r"[0-9a-f]{64}")
 PAGE_BYTES = 256 << 10  # chosen by hand: read and shown in a few ms
@@ -63,6 +65,16 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
+def weight(content: Mapping[str, bytes]) -> int:
+    """Bytes that these files take."""
+    return sum(len(part) for part in content.values())
+
+
+def weight_of(folder: Path) -> int:
+    """Bytes that the files of a folder take."""
+    return sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+
+
 def write_file(path: Path, content: bytes) -> None:
     """Replaces the file as a whole: a reader sees the old one or the new one."""
     draft = path.with_name(f".draft-{path.name}")
@@ -79,13 +91,28 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(grave, ignore_errors=True)
 
 
-def check_room(folder: Path, limit: int, what: str) -> None:
-    """Raises LimitReached where `folder` holds `limit` of them."""
-    if len(ids(folder)) >= limit:
-        raise LimitReached(
-            f"the server keeps no more than {limit} {what}",
-            expected=f"room for one more: its operator can raise SPECSHIELD_MAX_{what.upper()}",
+def check_free(folder: Path, wanted: int) -> None:
+    """Raises InsufficientStorage where the disk of `folder` has fewer free bytes. One system call."""
+    free = shutil.disk_usage(folder).free
+    if free < wanted:
+        raise InsufficientStorage(
+            "the server's disk is full", got=free, expected=f"at least {wanted} bytes free: delete something"
         )
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """A disk that fills up while it is written to is InsufficientStorage."""
+    try:
+        yield
+    except OSError as error:
+        if not is_full(error):
+            raise
+        raise InsufficientStorage("the server's disk is full", expected="a disk with room") from None
+
+
+def is_full(error: OSError) -> bool:
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def page(

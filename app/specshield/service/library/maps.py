@@ -1,20 +1,26 @@
-"""The maps a server has: those of `maps/`, under their names, and those sent, in `<data>/maps/<id>/`."""
+"""The maps a server has: those of `maps/`, under their names, and those sent, in `<data>/maps/<id>/`.
+
+A folder holds `map.yaml` and `map.png`, as map_server has them, one bit a cell (older ones a `map.pgm`), and
+`map.json`: what is shown of the map.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import logging
+import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from PIL import Image
 
-from specshield.errors import MapError, NotFound, SpecshieldError
+from specshield.errors import InUse, MapError, NotFound, SpecshieldError
+from specshield.service.access.keys import OPEN, Key
 from specshield.service.library import files
+from specshield.service.library.claims import Claims
 from specshield.service.settings import Settings
 from specshield.task import parse_regions
 from specshield.world.map_server import dump_map, load_map
@@ -45,69 +51,124 @@ class Map:
         }
 
     def png(self) -> bytes:
-        """Black is occupied; row 0 of the image is the map's highest y."""
+        """Black is occupied; row 0 of the image is the map's highest y. One bit a cell, compressed."""
         buffer = io.BytesIO()
-        Image.fromarray(np.where(self.grid.occupied[::-1], 0, 255).astype(np.uint8)).save(buffer, "PNG")
+        Image.fromarray(~self.grid.occupied[::-1]).save(buffer, "PNG")
         return buffer.getvalue()
 
 
 class Maps:
-    """The calls block: they read and write files."""
+    """The calls block: they read and write files. claims: whose they are; needed to find, add and delete."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._folder, self._limit = settings.data_dir / "maps", settings.max_maps
+    def __init__(self, settings: Settings, claims: Claims | None = None) -> None:
+        self._folder, self._claims = settings.data_dir / "maps", claims
         self._folder.mkdir(parents=True, exist_ok=True)
         self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
         self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
 
     def get(self, key: str) -> Map:
-        """By id, by the name of one that came with the server, or by the hash of the grid alone, which is
-        what a policy's card knows. Raises NotFound."""
+        """By id, or one that came with the server, whoever asks. Raises NotFound."""
+        found = self.shipped(key)
+        if found is not None:
+            return found
+        if files.HASH.fullmatch(key) and (self._folder / key).is_dir():
+            return self._recent.get(key, lambda: self._read(key))
+        raise _missing(key)
+
+    def shipped(self, key: str) -> Map | None:
+        """One that came with the server, by its id, its name, or the hash of its grid."""
         for found in self._named.values():
             if key in (found.name, found.id, found.grid.content_hash):
                 return found
+        return None
+
+    def find(self, key: str, owner: str) -> Map:
+        """One that this owner may see: by id or name, or by the hash of the grid alone, which is what a
+        policy's card knows. Raises NotFound.
+        """
+        assert self._claims is not None
+        found = self.shipped(key)
+        if found is not None:
+            return found
         if files.HASH.fullmatch(key):
-            if (self._folder / key).is_dir():
-                return self._recent.get(key, lambda: self._read(key))
-            for id in files.ids(self._folder):
+            if self._claims.holds("maps", key, owner):
+                return self.get(key)
+            for id in self._own(owner):
                 if files.read_json(self._folder / id / "map.json")["grid"] == key:
                     return self.get(id)
-        raise NotFound(
-            f"there is no map {key!r}", path="map_id", got=key, expected="an id or name from /v1/maps"
-        )
+        raise _missing(key)
 
-    def show(self, key: str) -> dict[str, Any]:
+    def show(self, key: str, owner: str) -> dict[str, Any]:
         """The map as JSON, which can be had without reading the cells. Raises NotFound."""
-        if files.HASH.fullmatch(key) and (self._folder / key).is_dir():
+        assert self._claims is not None
+        if self.shipped(key) is None and self._claims.holds("maps", key, owner):
             return self._shown(key)
-        return self.get(key).to_json()
+        return self.find(key, owner).to_json()
 
-    def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region]) -> Map:
-        """Keeps a map, unless there is one of this content already. Raises LimitReached."""
+    def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region], key: Key) -> Map:
+        """Keeps a map for an owner, its content once. Raises LimitReached and InsufficientStorage."""
+        assert self._claims is not None
         id = _id(grid, rooms)
-        try:
-            return self.get(id)
-        except NotFound:
-            files.check_room(self._folder, self._limit, "maps")
+        found = self.shipped(id)
+        if found is not None:
+            return found
         if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
             raise MapError(
                 "the outlines of the rooms are too large", path="rooms",
                 expected=f"at most {self._max_rooms} bytes as JSON: simpler outlines",
             )  # fmt: skip
-        text, image = dump_map(grid)
-        made = Map(id, grid, rooms)
+        made, folder = Map(id, grid, rooms), self._folder / id
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
-        files.write_folder(self._folder / id, {"map.yaml": text.encode(), "map.pgm": image, "map.json": meta})
+        content = {"map.yaml": dump_map(grid)[0].encode(), "map.png": made.png(), "map.json": meta}
+        with self._claims.adding("maps", id, key, files.weight(content)):
+            if not folder.is_dir():
+                files.write_folder(folder, content)
         return self._recent.get(id, lambda: made)
 
-    def page(self, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
-        """One page of maps, as JSON, which can be had without reading the cells."""
+    def delete(self, key: str, owner: str) -> None:
+        """Takes an owner's map; its content goes with the last owner. Raises NotFound, InUse and Conflict."""
+        assert self._claims is not None
+        found = self.shipped(key)
+        if found is not None:
+            raise InUse(
+                f"map {found.name!r} came with the server and cannot be deleted",
+                path="map_id", got=key, expected="a map that was sent here",
+            )  # fmt: skip
+        token = secrets.token_hex(8)
+        user = self._claims.mark("maps", key, owner, token)
+        if user is not None:
+            raise InUse(
+                f"policy {user!r} is for this map", path="map_id", got=key,
+                expected="a map that no policy is for: delete the policy first", policy_id=user,
+            )  # fmt: skip
+        try:
+            if self._claims.free("maps", key, owner, token):
+                self._recent.drop(key)
+                files.remove_folder(self._folder / key)
+        finally:
+            self._claims.unmark("maps", key, token)
+
+    def page(self, owner: str, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
+        """One page of an owner's maps and those of all, as JSON, had without reading the cells."""
         keys, following = files.page(
-            [*self._named, *files.ids(self._folder)], after, limit,
+            [*self._named, *self._own(owner)], after, limit,
             lambda key: files.size(self._folder / key / "map.json"),
         )  # fmt: skip
         return [self._shown(key) for key in keys], following
+
+    def adopt(self) -> None:
+        """Gives the maps that nobody has, of a time before owners, to the owner without a name."""
+        assert self._claims is not None
+        for id in files.ids(self._folder):
+            if self._claims.unowned("maps", id):
+                with self._claims.adding("maps", id, OPEN, files.weight_of(self._folder / id)):
+                    pass
+
+    def _own(self, owner: str) -> list[str]:
+        """Ids that the owner has; one whose files are not there was not written to the end."""
+        assert self._claims is not None
+        return [id for id in self._claims.ids("maps", owner) if (self._folder / id).is_dir()]
 
     def _shown(self, key: str) -> dict[str, Any]:
         if key in self._named:
@@ -117,8 +178,15 @@ class Maps:
 
     def _read(self, id: str) -> Map:
         folder = self._folder / id
-        grid = load_map((folder / "map.yaml").read_text(), (folder / "map.pgm").read_bytes())
+        image = next(path for kind in ("png", "pgm") if (path := folder / f"map.{kind}").is_file())
+        grid = load_map((folder / "map.yaml").read_text(), image.read_bytes())
         return Map(id, grid, parse_regions(self._shown(id)["rooms"]))
+
+
+def _missing(key: str) -> NotFound:
+    return NotFound(
+        f"there is no map {key!r}", path="map_id", got=key, expected="an id or name from /v1/maps"
+    )
 
 
 def _shipped(folder: Path) -> Iterator[Map]:

@@ -5,8 +5,10 @@ A folder holds `policy.json` (what it is of), and once trained `policy.safetenso
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -16,7 +18,9 @@ from specshield.errors import FormulaError, InputError, NotFound, PolicyError, S
 from specshield.policy.card import policy_id
 from specshield.policy.methods import load_policy
 from specshield.robot import robot_from_json
+from specshield.service.access.keys import OPEN, Key
 from specshield.service.library import files
+from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.settings import Settings
 from specshield.shield.proposal import Proposer
@@ -53,8 +57,9 @@ class Record:
 class Policies:
     """The calls block on files. A key is an id, or the name of a policy that came with the server."""
 
-    def __init__(self, settings: Settings, maps: Maps) -> None:
-        self._maps, self._models, self._limit = maps, settings.models_dir, settings.max_policies
+    def __init__(self, settings: Settings, maps: Maps, claims: Claims | None = None) -> None:
+        """claims: whose they are; needed to find, add and delete."""
+        self._maps, self._models, self._claims = maps, settings.models_dir, claims
         self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
         self._folder = settings.data_dir / "policies"
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -62,17 +67,32 @@ class Policies:
         self._named = {str(record.name): record for record in self._shipped()}
 
     def record(self, key: str) -> Record:
-        """Raises NotFound."""
+        """By id, or one that came with the server, whoever asks. Raises NotFound."""
         for found in self._named.values():
             if key in (found.name, found.id):
                 return found
         folder = self._folder / key
         if not files.HASH.fullmatch(key) or not (folder / "policy.json").is_file():
-            expected = "an id or name from /v1/policies"
-            raise NotFound(f"there is no policy {key!r}", path="policy_id", got=key, expected=expected)
+            raise _missing(key)
         stored = files.read_json(folder / "policy.json")
         card = files.read_json(folder / "card.json") if (folder / "card.json").is_file() else None
         return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
+
+    def find(self, key: str, owner: str) -> Record:
+        """One that this owner may see. Raises NotFound."""
+        assert self._claims is not None
+        found = self.record(key)
+        if found.name is None and not self._claims.holds("policies", found.id, owner):
+            raise _missing(key)
+        return found
+
+    def still_there(self, ids: Sequence[str], owner: str) -> None:
+        """Raises NotFound where a policy is gone: asked once whoever deletes it can see that it is used."""
+        assert self._claims is not None
+        shipped = {record.id for record in self._named.values()}
+        for id in ids:
+            if id not in shipped and not self._claims.settled("policies", id, owner):
+                raise _missing(id)
 
     def task(self, about: Description) -> Task:
         """Raises NotFound for the map, RobotError, and what `make_task` raises."""
@@ -112,9 +132,9 @@ class Policies:
         folder = self._models / record.name if record.name else self._folder / record.id
         return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
 
-    def resolve(self, about: Description) -> Description:
+    def resolve(self, about: Description, owner: str) -> Description:
         """The same with the map's id, whatever it was called. Raises NotFound."""
-        return replace(about, map_id=self._maps.get(about.map_id).id)
+        return replace(about, map_id=self._maps.find(about.map_id, owner).id)
 
     def described(self, about: Description, task: Task) -> Record:
         """The policy of this description, whether there is one or not. Its spec is left with the regions and
@@ -132,75 +152,108 @@ class Policies:
             )  # fmt: skip
         return Record(_id(about, task), replace(about, spec=spec), task.horizon)
 
-    def find(self, id: str) -> Record | None:
-        """The policy of this id, if there is one."""
+    def made_here(self, id: str) -> Record | None:
+        """The policy of this id, if anybody asked for it."""
         try:
             return self.record(id)
         except NotFound:
             return None
 
-    def add(self, record: Record) -> Record:
-        """Notes a policy that is still to be made, unless there is one already. Raises LimitReached."""
-        return self._add(record, {})
+    def add(self, record: Record, key: Key) -> Record:
+        """Notes a policy that is still to be made, unless there is one already. Raises LimitReached,
+        InsufficientStorage.
+        """
+        return self._add(record, {}, key)
 
-    def add_card(self, about: Description, card: Mapping[str, Any], weights: bytes) -> Record:
-        """Keeps a policy that was made elsewhere, once all of it is checked. Raises PolicyError."""
+    def add_card(self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key) -> Record:
+        """Keeps a policy that was made elsewhere, once all of it is checked. Its id covers all that was sent,
+        so that it cannot take the place of another one, or of one that is made here. Raises PolicyError.
+        """
         try:
-            about = self.resolve(about)
+            about = self.resolve(about, key.name)
             task = self.task(about)
         except SpecshieldError as error:
             raise PolicyError(error.message, path=error.path, got=error.got, expected=error.expected).at(
                 "card"
             ) from None
         record = self.described(about, task)
-        card = {**card, "id": record.id, "spec": record.about.spec}  # never the sender's id
+        id = sent_id(record.id, card, weights)
+        card = {**card, "id": id, "spec": record.about.spec}  # never the sender's id
         load_policy(weights, card, task)
         return self._add(
-            replace(record, card=card), {"policy.safetensors": weights, "card.json": files.to_json(card)}
+            replace(record, id=id, card=card),
+            {"policy.safetensors": weights, "card.json": files.to_json(card)},
+            key,
         )
 
-    def _add(self, record: Record, trained: Mapping[str, bytes]) -> Record:
-        try:
-            found = self.record(record.id)
-        except NotFound:
-            files.check_room(self._folder, self._limit, "policies")
-            record = replace(record, created_at=files.now())
-            stored = asdict(replace(record, card=None))
-            del stored["card"]
-            files.write_folder(self._folder / record.id, {"policy.json": files.to_json(stored), **trained})
-            return record
-        if found.card is None and record.card is not None:  # asked for here before, trained elsewhere
-            self.finish(record.id, trained["policy.safetensors"], record.card)
+    def _add(self, record: Record, trained: Mapping[str, bytes], key: Key) -> Record:
+        assert self._claims is not None
+        if record.id in (found.id for found in self._named.values()):
             return self.record(record.id)
-        return found
+        record = replace(record, created_at=files.now())
+        stored = asdict(replace(record, card=None))
+        del stored["card"]
+        content, folder = {"policy.json": files.to_json(stored), **trained}, self._folder / record.id
+        with self._claims.adding("policies", record.id, key, files.weight(content), self._own_map(record)):
+            if not folder.is_dir():
+                files.write_folder(folder, content)
+        return self.record(record.id)
+
+    def _own_map(self, record: Record) -> str:
+        """The id of a policy's map; "" where that is everybody's."""
+        map_id = record.about.map_id
+        return "" if self._maps.shipped(map_id) is not None else map_id
 
     def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
         """Keeps what a run made. The card comes last: it makes the policy ready. Raises NotFound."""
         folder = self._folder / id
         if not folder.is_dir():
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
-        files.write_file(folder / "policy.safetensors", weights)
-        files.write_file(folder / "card.json", files.to_json({**card, "id": id}))
+        with files.full_disk():
+            files.write_file(folder / "policy.safetensors", weights)
+            files.write_file(folder / "card.json", files.to_json({**card, "id": id}))
+        if self._claims is not None:
+            self._claims.weigh("policies", id, files.weight_of(folder))
 
     def checkpoints(self, id: str) -> Path:
         return self._folder / id / "checkpoint"
 
-    def delete(self, record: Record) -> None:
-        self._recent.drop(record.id)
-        files.remove_folder(self._folder / record.id)
+    def delete(self, record: Record, owner: str, token: str) -> bool:
+        """Takes the claim of an owner who has marked the deletion by this token. True where the policy went
+        with it. Raises Conflict where the marking is too long ago.
+        """
+        assert self._claims is not None
+        last = self._claims.free("policies", record.id, owner, token, self._own_map(record))
+        if last:
+            self._recent.drop(record.id)
+            files.remove_folder(self._folder / record.id)
+        return last
 
-    def page(self, after: str | None, limit: int) -> tuple[list[Record], str | None]:
+    def page(self, owner: str, after: str | None, limit: int) -> tuple[list[Record], str | None]:
+        """One page of an owner's policies and those of all."""
+        assert self._claims is not None
+        own = (id for id in self._claims.ids("policies", owner) if (self._folder / id).is_dir())
         keys, following = files.page(
-            [*self._named, *files.ids(self._folder)], after, limit,
+            [*self._named, *own], after, limit,
             lambda key: sum(files.size(self._folder / key / name) for name in ("policy.json", "card.json")),
         )  # fmt: skip
         return [self.record(key) for key in keys], following
+
+    def adopt(self) -> None:
+        """Gives the policies that nobody has, of a time before owners, to the owner without a name."""
+        assert self._claims is not None
+        for id in files.ids(self._folder):
+            if self._claims.unowned("policies", id):
+                size, record = files.weight_of(self._folder / id), self.record(id)
+                with self._claims.adding("policies", id, OPEN, size, self._own_map(record)):
+                    pass
 
     def _shipped(self) -> Iterator[Record]:
         for path in sorted(self._models.glob("*/card.json")):
             with _left_out(path.parent):
                 card = files.read_json(path)
-                about = self.resolve(describe(card))
+                about = describe(card)
+                about = replace(about, map_id=self._maps.get(about.map_id).id)
                 yield Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)
 
 
@@ -215,6 +268,23 @@ def _left_out(folder: Path) -> Iterator[None]:
 
 def describe(card: Mapping[str, Any]) -> Description:
     return Description(*(card[name] for name in ("map_id", "robot", "spec", "method", "seed", "options")))
+
+
+def _missing(key: str) -> NotFound:
+    expected = "an id or name from /v1/policies"
+    return NotFound(f"there is no policy {key!r}", path="policy_id", got=key, expected=expected)
+
+
+def sent_id(made_here: str, card: Mapping[str, Any], weights: bytes) -> str:
+    """The id of a policy that was made elsewhere: sha256 over the id of the one that would be made here, the
+    rest of the card, and the weights, as hex. That of one that is made here is over other members.
+    """
+    content = {
+        "made_of": made_here,
+        "card": {name: value for name, value in card.items() if name != "id"},
+        "weights": hashlib.sha256(weights).hexdigest(),
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _id(about: Description, task: Task) -> str:

@@ -11,7 +11,7 @@ import anyio
 from fastapi import APIRouter, Header, Query, Response
 from starlette.types import Receive, Scope, Send
 
-from specshield.service.routes.sessions import GONE, SessionId
+from specshield.service.routes.sessions import GONE, PathId, SessionKey
 from specshield.service.sessions import chain
 from specshield.service.state import ServerState, problems
 
@@ -66,7 +66,7 @@ class EventStream(Response):
     },
 )
 async def events(
-    session_id: SessionId,
+    key: SessionKey,
     server: ServerState,
     last_event_id: Annotated[
         int | None, Header(ge=-1, le=1_000_000, description="As `after`; a browser sends it by itself.")
@@ -82,7 +82,7 @@ async def events(
     when the session is finished, and when this server stops: then ask again. A reader who is too slow is cut
     off.
     """
-    stream = await server.watchers.open(session_id, after if last_event_id is None else last_event_id)
+    stream = await server.watchers.open(key, after if last_event_id is None else last_event_id)
     return Response(status_code=204) if stream is None else EventStream(stream)
 
 
@@ -98,12 +98,12 @@ async def events(
         **problems(**GONE),
     },
 )
-async def read_record(session_id: SessionId, server: ServerState) -> Response:
+async def read_record(key: SessionKey, session_id: PathId, server: ServerState) -> Response:
     """The session's config, poses, signals, what was asked and answered at each step: a chain of hashes.
 
     `specshield verify` checks the chain, and decides every step again, to the same bytes.
     """
-    content, seal = await server.sessions.record(session_id)
+    content, seal = await server.sessions.record(key)
     name = f'attachment; filename="{session_id}.record"'
     headers = {"Content-Disposition": name, "X-Record-Seal": seal}
     return Response(content, media_type=chain.MEDIA_TYPE, headers=headers)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
 
+from specshield.service.access.owners import Caller, Owner
 from specshield.service.heavy.uploads import FILES
 from specshield.service.routes.uploads import TOO_MUCH, received
 from specshield.service.schemas.base import Id
@@ -15,6 +16,7 @@ from specshield.service.state import Cursor, Limit, ServerState, problems
 from specshield.world.formats import FORMATS
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
+FULL = "`insufficient-storage`: the disk is full, or what you may keep there."
 MapId = Annotated[
     Id, Path(description="Id or name of a map.", openapi_examples={"case1": {"value": "case1"}})
 ]
@@ -47,31 +49,33 @@ def _described() -> dict[str, Any]:
     status_code=201,
     response_model=MapResponse,
     summary="Send a map",
-    responses=problems(_429="The server keeps no more maps.", **TOO_MUCH),
+    responses=problems(_429="The server keeps no more maps.", _507=FULL, **TOO_MUCH),
     openapi_extra=_described(),
 )
-async def create(request: Request, server: ServerState) -> Any:
+async def create(request: Request, server: ServerState, caller: Caller) -> Any:
     """Maps are immutable and known by the hash of their content: the same map again is the one there is.
+    It is there for the key that sent it.
 
     Outside the map everything is occupied, and so is what is unknown. Rooms become names for formulas.
     """
     body = received(request)
-    return await server.heavy.run(request, "add_map", body.content_type, body.content)
+    return await server.heavy.run(request, "add_map", body.content_type, body.content, caller)
 
 
 @router.get("", response_model=MapList, summary="List the maps", responses=problems())
-async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """The maps, in order of name and id. A page may be shorter than `limit`."""
-    found, following = await asyncio.to_thread(server.maps.page, cursor, limit)
+async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, limit: Limit = 100) -> Any:
+    """Those that came with the server and your own, in order of name and id. A page may be shorter than
+    `limit`."""
+    found, following = await asyncio.to_thread(server.maps.page, owner, cursor, limit)
     return {"items": found, "next": following}
 
 
 @router.get(
     "/{map_id}", response_model=MapResponse, summary="Read a map", responses=problems(_404="No such map.")
 )
-async def read(map_id: MapId, server: ServerState) -> Any:
+async def read(map_id: MapId, server: ServerState, owner: Owner) -> Any:
     """Its size, place and named areas."""
-    return await asyncio.to_thread(server.maps.show, map_id)
+    return await asyncio.to_thread(server.maps.show, map_id, owner)
 
 
 @router.get(
@@ -83,6 +87,20 @@ async def read(map_id: MapId, server: ServerState) -> Any:
         **problems(_404="No such map.", **TOO_MUCH),
     },
 )
-async def image(map_id: MapId, request: Request, server: ServerState) -> Response:
+async def image(map_id: MapId, request: Request, server: ServerState, owner: Owner) -> Response:
     """White is free, black occupied; up is the map's y."""
-    return Response(await server.heavy.run(request, "draw_map", map_id), media_type="image/png")
+    return Response(await server.heavy.run(request, "draw_map", map_id, owner), media_type="image/png")
+
+
+@router.delete(
+    "/{map_id}",
+    status_code=204,
+    summary="Remove a map",
+    responses=problems(
+        _404="No such map.", _409="`in-use`: a policy is for it (`policy_id`), or it came with the server."
+    ),
+)
+async def delete(map_id: MapId, server: ServerState, owner: Owner) -> Response:
+    """It goes for the key that asks; another key that sent the same map keeps it."""
+    await asyncio.to_thread(server.maps.delete, map_id, owner)
+    return Response(status_code=204)

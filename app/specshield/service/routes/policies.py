@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
@@ -10,6 +11,8 @@ from fastapi import APIRouter, Path, Request, Response
 from specshield.errors import InUse, TrainingUnavailable
 from specshield.policy.methods import METHODS
 from specshield.service import examples
+from specshield.service.access.keys import Key
+from specshield.service.access.owners import Caller, Owner
 from specshield.service.heavy.uploads import PARTS, is_multipart
 from specshield.service.library.policies import Record
 from specshield.service.routes.uploads import TOO_MUCH, received
@@ -34,6 +37,7 @@ PolicyId = Annotated[
         _404="No such map.",
         _429="The server keeps no more policies.",
         _503=f"`training-unavailable`: no worker is there to train; the store is away; or {TOO_MUCH['_503']}",
+        _507="`insufficient-storage`: the disk is full, or what you may keep there.",
     ),
     openapi_extra={
         "requestBody": {
@@ -58,24 +62,25 @@ PolicyId = Annotated[
         }
     },
 )
-async def create(request: Request, server: ServerState) -> Any:
+async def create(request: Request, server: ServerState, caller: Caller) -> Any:
     """The answer comes at once; making the policy takes seconds to minutes: read it to see how far it is.
 
-    Policies are immutable and known by the hash of task, method, options and seed: the same request again
-    answers the policy there is, and queues it once more if it failed.
+    Policies are immutable. One that is made here is known by the hash of task, method, options and seed: the
+    same request again answers the policy there is, and queues it once more if it failed. The hash of one
+    that is sent covers its weights and its card as well, so that its id is never that of a policy made here.
     """
     body = received(request)
     if is_multipart(body.content_type):
-        kept = await server.heavy.run(request, "add_policy", body.content_type, body.content)
+        kept = await server.heavy.run(request, "add_policy", body.content_type, body.content, caller)
         return await asyncio.to_thread(_show, server, kept)
-    asked = await server.heavy.run(request, "check_policy", body.content)
-    return await asyncio.to_thread(_ask, server, asked)
+    asked = await server.heavy.run(request, "check_policy", body.content, caller.name)
+    return await asyncio.to_thread(_ask, server, caller, asked)
 
 
-def _ask(server: Server, asked: Record) -> dict[str, Any]:
-    record = server.policies.find(asked.id)
+def _ask(server: Server, caller: Key, asked: Record) -> dict[str, Any]:
+    record = server.policies.made_here(asked.id)
     if record is not None and _training(server, record).status != "failed":
-        return _show(server, record)
+        return _show(server, server.policies.add(asked, caller))
     name = asked.about.method
     own = [] if server.worker is None else server.worker.methods
     if name not in own and not server.jobs.worker_there(name):
@@ -87,7 +92,7 @@ def _ask(server: Server, asked: Record) -> dict[str, Any]:
             got=name,
             expected=f"a worker: start one with `specshield worker`{installed}, then ask again",
         )
-    record = record or server.policies.add(asked)
+    record = server.policies.add(asked, caller)
     server.jobs.start(record.id, name)
     return _show(server, record)
 
@@ -125,11 +130,13 @@ def _show(server: Server, record: Record) -> dict[str, Any]:
 @router.get(
     "", response_model=PolicyList, summary="List the policies", responses=problems(_503="The store is away.")
 )
-async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
-    """The policies, in order of name and id. Their `spec` is without `regions` here."""
+async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, limit: Limit = 100) -> Any:
+    """Those that came with the server and your own, in order of name and id. Their `spec` is
+    without `regions` here.
+    """
 
     def show() -> dict[str, Any]:
-        found, following = server.policies.page(cursor, limit)
+        found, following = server.policies.page(owner, cursor, limit)
         return {"items": [_listed(server, record) for record in found], "next": following}
 
     return await asyncio.to_thread(show)
@@ -141,9 +148,9 @@ async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 10
     summary="Read a policy",
     responses=problems(_404="No such policy.", _503="The store is away."),
 )
-async def read(policy_id: PolicyId, server: ServerState) -> Any:
+async def read(policy_id: PolicyId, server: ServerState, owner: Owner) -> Any:
     """How far it is, and what was measured."""
-    return await asyncio.to_thread(lambda: _show(server, server.policies.record(policy_id)))
+    return await asyncio.to_thread(lambda: _show(server, server.policies.find(policy_id, owner)))
 
 
 @router.delete(
@@ -156,9 +163,11 @@ async def read(policy_id: PolicyId, server: ServerState) -> Any:
         _503="The store is away.",
     ),
 )
-async def delete(policy_id: PolicyId, server: ServerState) -> Response:
-    """A training is cancelled, and the policy stays as failed; any other policy is removed."""
-    record = await asyncio.to_thread(server.policies.record, policy_id)
+async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Response:
+    """A training is cancelled, and the policy stays as failed; any other policy is removed, for the key that
+    asks: another key that asked for the same policy keeps it.
+    """
+    record = await asyncio.to_thread(server.policies.find, policy_id, owner)
     if record.name is not None:
         raise InUse(
             f"policy {record.name!r} came with the server and cannot be deleted",
@@ -166,20 +175,26 @@ async def delete(policy_id: PolicyId, server: ServerState) -> Response:
             got=policy_id,
             expected="a policy that was made or sent here",
         )
+    claims, token = server.claims, secrets.token_hex(8)
     training = await asyncio.to_thread(_training, server, record)
-    if training.status in ("queued", "training"):
+    if training.status in ("queued", "training") and not await asyncio.to_thread(
+        claims.shared, "policies", record.id
+    ):
         await asyncio.to_thread(server.jobs.cancel, record.id)
         return Response(status_code=204)
-    session = await server.sessions.using(record.id)
-    if session is not None:
-        message = f"session {session!r} still uses this policy"
-        raise InUse(
-            message,
-            path="policy_id",
-            got=policy_id,
-            expected="a policy that no session uses: close the session first",
-            session_id=session,
-        )
-    await asyncio.to_thread(server.policies.delete, record)
-    await asyncio.to_thread(server.jobs.forget, record.id)
+    await asyncio.to_thread(claims.mark, "policies", record.id, owner, token)
+    try:
+        session = await server.sessions.using(owner, record.id)
+        if session is not None:
+            raise InUse(
+                f"session {session!r} still uses this policy",
+                path="policy_id",
+                got=policy_id,
+                expected="a policy that no session uses: close the session first",
+                session_id=session,
+            )
+        if await asyncio.to_thread(server.policies.delete, record, owner, token):
+            await asyncio.to_thread(server.jobs.forget, record.id)
+    finally:
+        await asyncio.to_thread(claims.unmark, "policies", record.id, token)
     return Response(status_code=204)

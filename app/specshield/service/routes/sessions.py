@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from specshield.service import examples
+from specshield.service.access.owners import Caller, Owner, scoped
 from specshield.service.schemas.answers import to_json
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse
@@ -23,9 +24,16 @@ from specshield.service.state import Cursor, Limit, ServerState, problems
 from specshield.service.watch import logs
 
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
-SessionId = Annotated[
+PathId = Annotated[
     Id, Path(description="Id of a session.", openapi_examples={"example": {"value": examples.SESSION["id"]}})
 ]
+
+
+def _key(session_id: PathId, owner: Owner) -> str:
+    return scoped(owner, session_id)
+
+
+SessionKey = Annotated[str, Depends(_key)]
 NDJSON = "application/x-ndjson"
 GONE = {"_404": "No such session; it may have expired.", "_503": "The store is away: try again."}
 
@@ -42,14 +50,14 @@ GONE = {"_404": "No such session; it may have expired.", "_503": "The store is a
         _503="The store is away: try again.",
     ),
 )
-async def create(request: SessionRequest, server: ServerState) -> Any:
+async def create(request: SessionRequest, server: ServerState, caller: Caller) -> Any:
     """A session is one episode of one robot: it holds the trajectory, and every answer given.
 
     Refused with `invalid-pose` where x_0 is outside the map or in collision, with `infeasible-start` where no
     action from x_0 has a future that satisfies the specification (unless `allow_infeasible`). It is erased
     when it has not changed for the server's time to live.
     """
-    begun = await server.sessions.create(request)
+    begun = await server.sessions.create(request, caller)
     logs.tell("session begun", session_id=begun["id"], policy_ids=begun["policy_ids"])
     return begun
 
@@ -57,27 +65,27 @@ async def create(request: SessionRequest, server: ServerState) -> Any:
 @router.get(
     "", response_model=SessionList, summary="List the sessions", responses=problems(_503="The store is away.")
 )
-async def list_all(server: ServerState, cursor: Cursor = None, limit: Limit = 100) -> Any:
+async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, limit: Limit = 100) -> Any:
     """The sessions, in order of id; ids that the server makes up are in order of time.
 
     Their `spec` is without `regions` here, and a page may be shorter than `limit`.
     """
-    found, following = await server.sessions.page(cursor, limit)
+    found, following = await server.sessions.page(owner, cursor, limit)
     return {"items": found, "next": following}
 
 
 @router.get(
     "/{session_id}", response_model=SessionResponse, summary="Read a session", responses=problems(**GONE)
 )
-async def read(session_id: SessionId, server: ServerState) -> Any:
+async def read(key: SessionKey, server: ServerState) -> Any:
     """Where the session stands; `next_t` is the step to ask for."""
-    return await server.sessions.read(session_id)
+    return await server.sessions.read(key)
 
 
 @router.delete("/{session_id}", status_code=204, summary="Erase a session", responses=problems(**GONE))
-async def delete(session_id: SessionId, server: ServerState) -> Response:
+async def delete(key: SessionKey, server: ServerState) -> Response:
     """Erases the session with its trajectory and its answers."""
-    await server.sessions.delete(session_id)
+    await server.sessions.delete(key)
     logs.tell("session erased")
     return Response(status_code=204)
 
@@ -97,7 +105,7 @@ async def delete(session_id: SessionId, server: ServerState) -> Response:
         ),
     },
 )
-async def step(session_id: SessionId, body: StepRequest, request: Request, server: ServerState) -> Response:
+async def step(key: SessionKey, body: StepRequest, request: Request, server: ServerState) -> Response:
     """Send where the robot is and what its model proposes; get the closest distribution that keeps the rule.
 
     `poses` ends with x_t and holds any newest part of the history that joins what the server has. A step that
@@ -105,7 +113,7 @@ async def step(session_id: SessionId, body: StepRequest, request: Request, serve
     for byte, so a lost answer can be asked for again. Nothing is stored on an error.
     """
     timing = request.scope["state"]["timing"]
-    answer = await server.sessions.steps.decide(session_id, body, timing)
+    answer = await server.sessions.steps.decide(key, body, timing)
     return Response(to_json(answer), media_type="application/json")
 
 
@@ -117,9 +125,9 @@ async def step(session_id: SessionId, body: StepRequest, request: Request, serve
         **GONE, _409="`history-gap`, `history-conflict`, or `session-finished` for states after a close."
     ),
 )
-async def close(session_id: SessionId, body: CloseRequest, server: ServerState) -> Any:
+async def close(key: SessionKey, body: CloseRequest, server: ServerState) -> Any:
     """Hand in the last states, which no decision follows, and get the verdict. The trajectory stays."""
-    closed = await server.sessions.close(session_id, body)
+    closed = await server.sessions.close(key, body)
     logs.tell("session closed", spec_status=closed["spec_status"], next_t=closed["next_t"])
     return closed
 
@@ -138,7 +146,7 @@ async def close(session_id: SessionId, body: CloseRequest, server: ServerState) 
     },
 )
 async def trajectory(
-    session_id: SessionId,
+    key: SessionKey,
     server: ServerState,
     accept: Annotated[str, Header(include_in_schema=False)] = "",
     format: Annotated[
@@ -146,7 +154,7 @@ async def trajectory(
     ] = None,
 ) -> Response:
     """x_0 to x_t with the answers, streamed: as one JSON object, or newline-delimited."""
-    lines = await server.sessions.trajectory(session_id)
+    lines = await server.sessions.trajectory(key)
     if format == "ndjson" or (format is None and NDJSON in accept):
         return StreamingResponse(_each(lines), media_type=NDJSON)
     return StreamingResponse(_listed(lines), media_type="application/json")

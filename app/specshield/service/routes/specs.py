@@ -8,6 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 
 from specshield.service import examples
+from specshield.service.access.owners import Owner
 from specshield.service.heavy.uploads import explain
 from specshield.service.routes.uploads import TOO_MUCH
 from specshield.service.schemas.specs import SpecRequest, SpecResponse
@@ -35,7 +36,7 @@ SHORT = 16 << 10  # [bytes] of a body that is read in a few ms
         }
     },
 )
-async def validate(request: Request, server: ServerState) -> Any:
+async def validate(request: Request, server: ServerState, owner: Owner) -> Any:
     """Parse a formula and give its canonical text, its horizon and its names.
 
     A formula that does not parse is answered with the `position` of the error in the text. Names are checked
@@ -43,5 +44,5 @@ async def validate(request: Request, server: ServerState) -> Any:
     """
     content = await request.body()
     if len(content) > SHORT:
-        return await server.heavy.run(request, "check_spec", content)
-    return await asyncio.to_thread(explain, server.maps, server.settings, content)
+        return await server.heavy.run(request, "check_spec", content, owner)
+    return await asyncio.to_thread(explain, server.maps, server.settings, content, owner)

@@ -12,6 +12,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
+from specshield.service.access.owners import shown
 from specshield.service.library import files
 from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.schemas.steps import StepRequest
@@ -73,7 +74,7 @@ class Session:
 
 def describe(config: Mapping[str, Any], state: State) -> dict[str, Any]:
     """The session as the contract shows it."""
-    shown = {name: value for name, value in config.items() if name not in ("robot", "nonce")}
+    shown = {name: value for name, value in config.items() if name not in ("robot", "nonce", "owner")}
     names = ("next_t", "feasible", "spec_status", "main_task_done", "finished")
     return {
         **shown,
@@ -169,7 +170,8 @@ def over(session: Session, t: int) -> SessionFinished:
     )
 
 
-def missing(id: str) -> NotFound:
+def missing(key: str) -> NotFound:
+    id = shown(key)
     return NotFound(
         f"there is no session {id!r}; it may have expired",
         path="id",
@@ -178,7 +180,8 @@ def missing(id: str) -> NotFound:
     )
 
 
-def contended(id: str) -> Conflict:
+def contended(key: str) -> Conflict:
+    id = shown(key)
     return Conflict(
         f"several callers write to session {id!r} at once", path="id", got=id, expected="one caller a session"
     )

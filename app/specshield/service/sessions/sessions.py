@@ -17,10 +17,12 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import FragmentError, InfeasibleStart, InputError, LimitReached
+from specshield.errors import FragmentError, InfeasibleStart, InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
+from specshield.service.access.keys import OPEN, Key
+from specshield.service.access.owners import scoped
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
@@ -52,7 +54,9 @@ R = TypeVar("R")
 
 
 class Sessions:
-    """What takes longer than a moment runs in threads; the store is awaited."""
+    """What takes longer than a moment runs in threads; the store is awaited. A session is known by its key,
+    which says whose it is (access/owners.py).
+    """
 
     def __init__(self, settings: Settings, store: Store, policies: Policies, heavy: Heavy) -> None:
         self._settings, self._store, self._policies = settings, store, policies
@@ -61,35 +65,44 @@ class Sessions:
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl)
         self._heavy = heavy
 
-    async def create(self, request: SessionRequest) -> dict[str, Any]:
+    async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
-        await self._check_room()
+        await self._check_room(None, self._settings.max_sessions)
+        await self._check_room(key.name, key.sessions)
+        if self._settings.redis_url is None:  # the store writes to this disk
+            files.check_free(self._settings.data_dir, self._settings.disk_reserve_bytes)
         settings = self._checked(request)
         preference = None
         if request.shaping != PROJECTION:
             try:
-                preparing = await self._run(self._shields.prepared, request)
+                preparing = await self._run(self._shields.prepared, request, key.name)
                 preference = await asyncio.shield(asyncio.wrap_future(preparing))
             except FragmentError as error:
                 raise refused(request.shaping, error) from None
-        config, feasible, status, rows = await self._begun(request, settings, preference)
+        config, feasible, status, rows = await self._begun(request, settings, preference, key.name)
         content = files.to_json(config)
         state = State(1, 0, feasible, status, self._expiry(), record.digest(content))
-        await self._store.create(config["id"], content, Change(state.packed(), pack(rows)))
+        stored_as = scoped(key.name, config["id"])
+        await self._store.create(stored_as, content, Change(state.packed(), pack(rows)))
+        try:  # whoever deletes a policy sees this session now, or has marked the policy before
+            await self._run(self._policies.still_there, config["policy_ids"], key.name)
+        except SpecshieldError:
+            await self._store.delete(stored_as)
+            raise
         return describe(config, state)
 
     async def _begun(
-        self, request: SessionRequest, settings: Config, preference: Preference | None
+        self, request: SessionRequest, settings: Config, preference: Preference | None, owner: str
     ) -> tuple[dict[str, Any], bool, str, Floats]:
         """In a thread, or in another process where the policies' decisions take long."""
         if preference is None:
-            ids = await self._run(lambda: [self._policies.record(key).id for key in request.policies])
+            ids = await self._run(lambda: [self._policies.find(key, owner).id for key in request.policies])
             if await self._run(self._shields.slow_policies, ids):
                 begun: tuple[dict[str, Any], bool, str, Floats] = await self._heavy.decide(
-                    "begin", request, settings, session=",".join(ids), key=tuple(ids)
+                    "begin", request, settings, owner, session=",".join(ids), key=tuple(ids)
                 )
                 return begun
-        return await self._run(begin, self._policies, self._shields, request, settings, preference)
+        return await self._run(begin, self._policies, self._shields, request, settings, preference, owner)
 
     def _checked(self, request: SessionRequest) -> Config:
         """The session's settings. Raises InputError for those that cannot be had."""
@@ -106,8 +119,10 @@ class Sessions:
         session = Session.of(await self._load(id))
         return describe(session.config, session.state)
 
-    async def page(self, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
-        found, following = await self._store.page(after, limit)
+    async def page(
+        self, owner: str, after: str | None, limit: int
+    ) -> tuple[list[dict[str, Any]], str | None]:
+        found, following = await self._store.page(owner, after, limit)
         shown = [describe(json.loads(config), State.of(state)) for config, state in found]
         for item in shown:  # they can be long, and whoever wants them reads the session
             item["spec"] = {name: held for name, held in item["spec"].items() if name != "regions"}
@@ -174,11 +189,11 @@ class Sessions:
             raise missing(id)
         return found
 
-    async def using(self, policy_id: str) -> str | None:
-        """A session that may still ask this policy, if there is one."""
+    async def using(self, owner: str, policy_id: str) -> str | None:
+        """An owner's session that may still ask this policy, if there is one."""
         after = None
         while True:
-            found, after = await self._store.page(after, 1000)
+            found, after = await self._store.page(owner, after, 1000)
             for config, state in found:
                 fixed = json.loads(config)
                 if policy_id in fixed["policy_ids"] and not State.of(state).finished:
@@ -192,18 +207,14 @@ class Sessions:
             raise missing(id)
         return found
 
-    async def _check_room(self) -> None:
-        limit = self._settings.max_sessions
-        if await self._store.count() < limit:
+    async def _check_room(self, owner: str | None, limit: int | None) -> None:
+        """Raises LimitReached where this owner, or with None all of them, keep `limit` sessions."""
+        if limit is None or await self._store.count(owner) < limit:
             return
-        after: str | None = None  # reading them all drops the names of those that have expired
-        while True:
-            _, after = await self._store.page(after, 1000)
-            if after is None:
-                break
-        if await self._store.count() >= limit:
+        await self._store.sweep(owner)
+        if await self._store.count(owner) >= limit:
             raise LimitReached(
-                f"the server keeps no more than {limit} sessions",
+                f"no more than {limit} sessions are kept",
                 expected="room for one more: delete a session, or wait until one expires",
             )
 
@@ -220,9 +231,10 @@ def begin(
     request: SessionRequest,
     settings: Config,
     preference: Preference | None,
+    owner: str,
 ) -> tuple[dict[str, Any], bool, str, Floats]:
     """The config, whether the start is feasible, the formula's verdict on it, and the first row."""
-    records = [policies.record(key) for key in request.policies]
+    records = [policies.find(key, owner) for key in request.policies]
     ids = [record.id for record in records]
     shield = replace(shields.get(ids, settings), preference=preference)
     feasible = True
@@ -253,6 +265,7 @@ def begin(
         "shaping": request.shaping,
         "max_steps": shield.max_steps,
         "created_at": files.now(),
+        "owner": owner,
         "nonce": secrets.token_hex(8),
     }
     return config, feasible, status, rows

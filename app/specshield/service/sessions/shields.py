@@ -63,9 +63,9 @@ class Shields:
             return shield
         return replace(shield, preference=self._preference_at_hand(shield, session))
 
-    def prepared(self, request: SessionRequest) -> Future[Preference]:
+    def prepared(self, request: SessionRequest, owner: str) -> Future[Preference]:
         """The preference that a new session asks for, or will be."""
-        ids = [self._policies.record(key).id for key in request.policies]
+        ids = [self._policies.find(key, owner).id for key in request.policies]
         return self._prepare(request.shaping, ids, self.get(ids, Config()), request.initial_pose)
 
     def _prepare(

@@ -1,8 +1,9 @@
 """Sessions in a store of the Redis protocol. Bytes in, bytes out; what they mean is for sessions.py.
 
 A session is three keys of one slot, expiring together: `specshield:v2:{id}:session`, a hash of config, state
-and version; `:rows`, its poses and signals; `:steps`, the list of what each step left, by t. Ids are also in
-`specshield:sessions`, a sorted set for listing; it may name sessions that have expired.
+and version; `:rows`, its poses and signals; `:steps`, the list of what each step left, by t. A session's
+id here says whose it is (access/owners.py). Ids are also in `specshield:sessions`, a sorted set for listing,
+in which those of one owner stand together; it may name sessions that have expired.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from redis.asyncio.retry import Retry
 from redis.backoff import ExponentialBackoff
 
 from specshield.errors import SessionExists, StoreError
+from specshield.service.access.owners import between, shown
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
 AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
@@ -105,8 +107,9 @@ class Store:
             raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
 
     async def ping(self) -> None:
+        """Whether it takes a write: one whose disk is full still answers reads."""
         async with self._reaching():
-            await self.redis.ping()
+            await self.redis.set("specshield:ready", 1, ex=60)
 
     async def create(self, id: str, config: bytes, change: Change) -> bytes:
         """The first version. Raises SessionExists. `config` has to be unlike any other, so that a retry knows
@@ -120,7 +123,7 @@ class Store:
                 await self.redis.zadd(INDEX, {id: 0})
                 return begun
         raise SessionExists(
-            f"there is a session {id!r} already", path="id", got=id, expected="an id not in use"
+            f"there is a session {shown(id)!r} already", path="id", got=shown(id), expected="an id not in use"
         )
 
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
@@ -183,27 +186,41 @@ class Store:
             await self.redis.zrem(INDEX, id)
         return bool(found)
 
-    async def page(self, after: str | None, limit: int) -> tuple[list[tuple[bytes, bytes]], str | None]:
-        """Up to `limit` of (config, state) in order of id, and the id to go on after, None at the end. There
-        are fewer where the configs are long: reading them must not hold up steps.
+    async def page(
+        self, owner: str, after: str | None, limit: int
+    ) -> tuple[list[tuple[bytes, bytes]], str | None]:
+        """Up to `limit` of an owner's (config, state) in order of id, and the id to go on after, None at the
+        end. There are fewer where the configs are long: reading them must not hold up steps.
         """
         listed: list[tuple[bytes, bytes]] = []
-        room = PAGE_BYTES
+        (first, end), room = between(owner), PAGE_BYTES
         while len(listed) < limit and room > 0:
             async with self._reaching():
-                low = "-" if after is None else f"({after}"
-                ids = await self.redis.zrangebylex(INDEX, low, "+", 0, min(limit - len(listed), AT_ONCE))
+                low, count = f"[{first}" if after is None else f"({first}{after}", limit - len(listed)
+                ids = await self.redis.zrangebylex(INDEX, low, f"({end}", 0, min(count, AT_ONCE))
                 if not ids:
                     return listed, None
                 ids, room = await self._that_fit(ids, room)
                 listed += await self._configs(ids)
-                after = ids[-1].decode()
+                after = shown(ids[-1].decode())
         return listed, after
 
-    async def count(self) -> int:
-        """How many sessions there are; some may have expired."""
+    async def count(self, owner: str | None) -> int:
+        """How many sessions an owner has, or with None all of them; some may have expired."""
+        low, high = _range(owner)
         async with self._reaching():
-            return int(await self.redis.zcard(INDEX))
+            return int(await self.redis.zlexcount(INDEX, low, high))
+
+    async def sweep(self, owner: str | None) -> None:
+        """Drops the names of sessions that have expired."""
+        low, high = _range(owner)
+        while True:
+            async with self._reaching():
+                ids = await self.redis.zrangebylex(INDEX, low, high, 0, AT_ONCE)
+                if not ids:
+                    return
+                await self._configs(ids)
+                low = f"({ids[-1].decode()}"
 
     async def versions(self, ids: Sequence[str]) -> list[bytes | None]:
         """Of each session the version, None where the store has none. One round trip."""
@@ -250,6 +267,13 @@ class Store:
         if expired:
             await self.redis.zrem(INDEX, *expired)
         return [(config, state) for config, state in found if config is not None]
+
+
+def _range(owner: str | None) -> tuple[str, str]:
+    if owner is None:
+        return "-", "+"
+    first, end = between(owner)
+    return f"[{first}", f"({end}"
 
 
 def _keys(id: str) -> list[str]:

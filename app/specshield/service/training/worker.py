@@ -191,10 +191,12 @@ def _ended(jobs: Jobs, job: Any, state: str, error: str | None) -> None:
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
     # numba, torch and the rest are for the process of the run alone: the worker stays small.
+    from specshield.service.library.claims import Claims
     from specshield.service.library.maps import Maps
     from specshield.service.library.policies import Policies
 
-    policies = Policies(settings, Maps(settings))
+    claims = Claims(jobs.redis, settings)
+    policies = Policies(settings, Maps(settings, claims), claims)
     about = policies.record(id).about
 
     def on_progress(done: float, seconds_left: float, said: str) -> None:

@@ -35,7 +35,7 @@ class Gauges:
         return self._found
 
     async def _families(self) -> Iterator[Metric]:
-        sessions, held = await self._store.count(), await self._store.held_bytes()
+        sessions, held = await self._store.count(None), await self._store.held_bytes()
         waiting, ended = await anyio.to_thread.run_sync(self._jobs.counts)
         return iter(
             (

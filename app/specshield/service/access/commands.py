@@ -1,0 +1,74 @@
+"""`specshield keys`: the API keys of the store that the settings name."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from specshield.service.access.keys import Keys
+    from specshield.service.settings import Settings
+
+R = TypeVar("R")
+app = typer.Typer(
+    name="keys", help="API keys: each owns what is made with it, and may have limits.", no_args_is_help=True
+)
+Name = Annotated[str, typer.Argument(help="Whose key it is: what was made with it belongs to this name.")]
+
+
+@app.command()
+def create(
+    name: Name,
+    requests: Annotated[
+        float | None, typer.Option(help="Most requests a second, steps counted apart.", min=0.1)
+    ] = None,
+    sessions: Annotated[int | None, typer.Option(help="Most sessions kept.", min=0)] = None,
+    bytes: Annotated[int | None, typer.Option(help="Most bytes of maps and policies kept.", min=0)] = None,
+) -> None:
+    """Make a key and print it: it cannot be read again."""
+    print(on_keys(lambda keys: keys.create(name, requests=requests, sessions=sessions, bytes=bytes)))
+
+
+@app.command("list")
+def show() -> None:
+    """The names of the keys, with their limits."""
+    for key in on_keys(lambda keys: keys.listed()):
+        limits = {"requests a second": key.requests, "sessions": key.sessions, "bytes": key.bytes}
+        told = ", ".join(f"{limit:g} {what}" for what, limit in limits.items() if limit is not None)
+        print(f"{key.name}  made {key.created_at}  {told or 'no limits'}")
+
+
+@app.command()
+def revoke(name: Name) -> None:
+    """Take a key back: servers refuse it within 2 s. What was made with it stays."""
+    on_keys(lambda keys: keys.revoke(name))
+
+
+def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = None) -> R:
+    """What the action answers, with the store open meanwhile. Raises StoreError."""
+    from specshield.service.access.keys import Keys
+    from specshield.service.settings import read_settings
+    from specshield.service.storage.embedded import EmbeddedStore
+    from specshield.service.storage.store import Store
+
+    settings = settings or read_settings()
+    embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
+    if embedded is not None:
+        embedded.join()
+    url = embedded.url if embedded is not None else str(settings.redis_url)
+
+    async def act() -> R:
+        store = Store(url, settings.store_timeout, settings.session_ttl)
+        try:
+            return await action(Keys(store.redis))
+        finally:
+            await store.aclose()
+
+    try:
+        return asyncio.run(act())
+    finally:
+        if embedded is not None:
+            embedded.leave()

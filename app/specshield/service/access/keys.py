@@ -1,0 +1,150 @@
+"""API keys with names. The store holds a hash of each, and what it may use; a key itself is shown once.
+
+They are in one hash of the store, `specshield:keys`, by name; the field "" counts the changes. A server keeps
+all of them in memory and asks every REFRESH seconds whether they have changed: so a request costs no trip to
+the store, whatever key it shows, and a revoked key is refused that long after at the latest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import logging
+import math
+import re
+import secrets
+import time
+from collections.abc import Awaitable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, TypeVar
+
+import redis
+
+from specshield.errors import InputError, LimitReached, NotFound, StoreError, Unauthorized
+from specshield.service.library.files import now
+
+T = TypeVar("T")
+KEYS = "specshield:keys"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+MOST_KEYS = 1000  # each takes some 300 bytes of every server; chosen by hand
+REFRESH = 2.0  # [s] chosen by hand: how long a revoked key may still work
+MISS_EVERY = 0.2  # [s] at most so often do keys that are not known make a server ask the store; by hand
+log = logging.getLogger("specshield")
+
+
+@dataclass(frozen=True)
+class Key:
+    """digest: SHA-256 of the key in hex; a key has 256 random bits, so that one plain hash is enough.
+
+    requests: the most a second, for each server process; steps are counted apart, against the same number.
+    sessions: the most kept. bytes: the most on disk. None is no limit of its own.
+    """
+
+    name: str
+    digest: str
+    created_at: str = ""
+    requests: float | None = None
+    sessions: int | None = None
+    bytes: int | None = None
+
+
+class Keys:
+    """own: the key of SPECSHIELD_API_KEY, which has the empty name and no limits. store: redis.asyncio."""
+
+    def __init__(self, store: Any, own: str | None = None) -> None:
+        self._store, self._lock = store, asyncio.Lock()
+        self._own = {} if own is None else {digest_of(own.encode()): Key("", digest_of(own.encode()))}
+        self._known: Mapping[str, Key] = self._own
+        self._version: bytes | None = None
+        self._read, self._tried_at = False, -math.inf
+
+    # --- for servers
+
+    async def check(self, authorization: bytes) -> Key:
+        """The key that a request shows. Raises Unauthorized, and StoreError while no key can be known."""
+        scheme, _, given = authorization.partition(b" ")
+        # The digest is looked up, not the key: how long that takes tells nothing of a key.
+        digest = digest_of(given.strip()) if scheme.lower() == b"bearer" else ""
+        found = self._known.get(digest)
+        if found is None and (given or not self._read):
+            await self.refresh()
+            found = self._known.get(digest)
+        if found is None:
+            if self._read and not self._own and self._version is None:
+                return OPEN
+            if not (self._read or self._own):
+                raise StoreError("the store cannot be reached: which keys there are is not known yet")
+            raise Unauthorized("an API key is needed", path="Authorization", expected="Bearer <key>")
+        return found
+
+    async def refresh(self) -> None:
+        """Reads the keys where they have changed; all who ask for that within MISS_EVERY share one reading.
+        Without the store, what was read last holds. Once there was a key, the server is never open again.
+        """
+        asked_at = time.monotonic()
+        async with self._lock:
+            if self._tried_at >= asked_at:
+                return
+            await asyncio.sleep(max(0.0, self._tried_at + MISS_EVERY - time.monotonic()))
+            began = time.monotonic()
+            try:
+                version = await _reached(self._store.hget(KEYS, ""))
+                if version is not None and version != self._version:
+                    listed = {key.digest: key for key in await self.listed()}
+                    self._known, self._version = {**listed, **self._own}, version
+                self._read = True
+            except StoreError as error:
+                log.debug("the keys could not be read: %s", error)
+            self._tried_at = began
+
+    async def follow(self) -> None:
+        """Keeps to what the store says, until it is cancelled."""
+        while True:
+            await self.refresh()
+            await asyncio.sleep(REFRESH)
+
+    # --- for the command line
+
+    async def listed(self) -> list[Key]:
+        found = await _reached(self._store.hgetall(KEYS))
+        return sorted((Key(**json.loads(v)) for k, v in found.items() if k), key=lambda key: key.name)
+
+    async def create(self, name: str, **limits: Any) -> str:
+        """The key itself, which cannot be read again. Raises InputError for a name that cannot be had."""
+        if not NAME.fullmatch(name):
+            expected = "1 to 64 letters, digits, '_', '.' or '-', the first a letter or digit"
+            raise InputError("a key cannot have this name", path="name", got=name, expected=expected)
+        if await _reached(self._store.hlen(KEYS)) > MOST_KEYS:
+            raise LimitReached(f"there are {MOST_KEYS} keys", expected="room for one more: revoke one")
+        secret = f"ss_{secrets.token_urlsafe(32)}"
+        record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
+        if not await _reached(self._store.hsetnx(KEYS, name, record)):
+            raise InputError(
+                "there is a key of this name",
+                path="name",
+                got=name,
+                expected="another; or revoke that one first",
+            )
+        await _reached(self._store.hincrby(KEYS, "", 1))
+        return secret
+
+    async def revoke(self, name: str) -> None:
+        """What it made stays, and belongs to the next key of this name. Raises NotFound."""
+        if not name or not await _reached(self._store.hdel(KEYS, name)):
+            raise NotFound("there is no such key", path="name", got=name, expected="a name of `keys list`")
+        await _reached(self._store.hincrby(KEYS, "", 1))
+
+
+OPEN = Key("", "")  # whoever asks a server that asks for no key
+
+
+def digest_of(key: bytes) -> str:
+    return hashlib.sha256(key).hexdigest()
+
+
+async def _reached(answer: Awaitable[T]) -> T:
+    try:
+        return await answer
+    except (redis.RedisError, OSError) as error:
+        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error

@@ -1,0 +1,169 @@
+"""Whose the maps and policies are, and what they take of the disk. Blocking, like the files they are about.
+
+Content is kept once, under its hash; each owner that sent or asked for it has a claim on it, and it goes with
+the last one. One script decides every change (claims.lua), so that of a deletion and of a creation that needs
+what is deleted only one succeeds, whichever servers they came to: a deletion marks first, looks for users,
+then takes the claim; whoever uses a policy looks at the mark after its use can be seen (`Claims.settled`).
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import redis
+
+from specshield.errors import Conflict, InsufficientStorage, LimitReached, NotFound, StoreError
+from specshield.service.access.keys import Key
+from specshield.service.library import files
+from specshield.service.settings import Settings
+
+SCRIPT = Path(__file__).with_name("claims.lua").read_text()
+PATIENCE = 5.0  # [s] to wait for a deletion of the same id; one takes milliseconds. Chosen by hand
+WAIT = 0.02  # [s] between two looks at it
+
+
+class Claims:
+    """kind: "maps" or "policies". Every method raises StoreError where the store cannot be reached."""
+
+    def __init__(self, store: Any, settings: Settings) -> None:
+        """store: a blocking connection of redis."""
+        self._store, self._script = store, store.register_script(SCRIPT)
+        self._settings = settings
+
+    def ids(self, kind: str, owner: str) -> list[str]:
+        return sorted(id.decode() for id in _reached(lambda: self._store.hkeys(_owned(kind, owner))))
+
+    def holds(self, kind: str, id: str, owner: str) -> bool:
+        return bool(_reached(lambda: self._store.hexists(_owned(kind, owner), id)))
+
+    def settled(self, kind: str, id: str, owner: str) -> bool:
+        """Whether the owner holds it, once no deletion of it is under way."""
+        deadline = time.monotonic() + PATIENCE
+        while _reached(lambda: self._store.exists(_mark(kind, id))):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(WAIT)
+        return self.holds(kind, id, owner)
+
+    @contextmanager
+    def adding(self, kind: str, id: str, key: Key, size: int, map_id: str = "") -> Iterator[None]:
+        """Around the writing of `size` bytes: room is taken before, and given back where writing fails.
+
+        map_id: of a policy on a map that is not everybody's. Raises LimitReached and
+        InsufficientStorage, Conflict where a deletion goes on for long, and NotFound for a map that is gone.
+        """
+        settings = self._settings
+        files.check_free(settings.data_dir, settings.disk_reserve_bytes + size)
+        count = settings.max_maps if kind == "maps" else settings.max_policies
+        most = settings.max_owner_bytes if key.bytes is None else min(key.bytes, settings.max_owner_bytes)
+        limits = [size, count, most, settings.max_stored_bytes, map_id]
+        said = self._patiently("claim", kind, id, key.name, "", *limits)
+        if said == "count":
+            raise LimitReached(
+                f"the server keeps no more than {count} {kind}",
+                expected=f"room for one more: delete one, or raise SPECSHIELD_MAX_{kind.upper()}",
+            )
+        if said in ("owner", "all"):
+            whose, limit = ("this key's", most) if said == "owner" else ("the server's", limits[3])
+            raise InsufficientStorage(
+                f"{whose} maps and policies may take {limit} bytes, and {size} more do not fit",
+                expected="room for it: delete a map or a policy", limit=limit,
+            )  # fmt: skip
+        if said == "no map":
+            raise NotFound("the map was deleted", path="map_id", got=map_id, expected="an id from /v1/maps")
+        try:
+            with files.full_disk():
+                yield
+        except BaseException:
+            if said == "made":
+                self._give_back(kind, id, key.name, map_id)
+            raise
+
+    def mark(self, kind: str, id: str, owner: str, token: str) -> str | None:
+        """Begins a deletion: from now on nobody begins to use it. The policy that uses a map, if one does."""
+        said = self._patiently("mark", kind, id, owner, token)
+        if said == "none":
+            what = "map" if kind == "maps" else "policy"
+            expected = f"an id from /v1/{kind}"
+            raise NotFound(f"there is no {what} {id!r}", path=f"{what}_id", got=id, expected=expected)
+        return None if said == "marked" else said
+
+    def free(self, kind: str, id: str, owner: str, token: str, map_id: str = "") -> bool:
+        """Takes an owner's claim. True where it was the last one: the files have to go, then `unmark`."""
+        said = self._run("free", kind, id, owner, token, map_id=map_id)
+        if said == "lost":
+            raise Conflict("the deletion took too long", path="id", got=id, expected="to be asked for again")
+        return said == "last"
+
+    def unmark(self, kind: str, id: str, token: str) -> None:
+        self._run("unmark", kind, id, "", token)
+
+    def weigh(self, kind: str, id: str, size: int) -> None:
+        """Notes what was written after the claim was made."""
+        owners = sorted(_reached(lambda: self._store.smembers(_owners(kind, id))))
+        for i, owner in enumerate(owners):
+            self._run("weigh", kind, id, owner.decode(), "", size, int(i == 0))
+
+    def shared(self, kind: str, id: str) -> bool:
+        """Whether several owners hold it."""
+        return bool(_reached(lambda: self._store.scard(_owners(kind, id))) > 1)
+
+    def unowned(self, kind: str, id: str) -> bool:
+        return not _reached(lambda: self._store.exists(_owners(kind, id)))
+
+    def _give_back(self, kind: str, id: str, owner: str, map_id: str) -> None:
+        token = secrets.token_hex(8)
+        self._run("mark", kind, id, owner, token)
+        self._run("free", kind, id, owner, token, map_id=map_id)
+        self.unmark(kind, id, token)
+
+    def _patiently(self, what: str, *args: Any) -> str:
+        """Waits while another deletes the same thing. Raises Conflict where that takes long."""
+        deadline = time.monotonic() + PATIENCE
+        while (said := self._run(what, *args)) == "busy":
+            if time.monotonic() > deadline:
+                raise Conflict(
+                    "it is being deleted", path="id", got=args[1], expected="to be asked for again"
+                )
+            time.sleep(WAIT)
+        return said
+
+    def _run(
+        self, what: str, kind: str, id: str, owner: str, token: str, *more: Any, map_id: str = ""
+    ) -> str:
+        about = id if kind == "maps" else (more[-1] if what == "claim" else map_id)
+        keys = [_owned(kind, owner), _owners(kind, id), SUMS, _mark(kind, id), _uses(about, owner)]
+        keys += [_owned("maps", owner), _mark("maps", about)]
+        said = _reached(lambda: self._script(keys=keys, args=[what, kind, id, owner, token, *more]))
+        return str(said.decode())
+
+
+SUMS = "specshield:{library}:sums"
+
+
+def _owned(kind: str, owner: str) -> str:
+    return f"specshield:{{library}}:{kind}:{owner}"
+
+
+def _owners(kind: str, id: str) -> str:
+    return f"specshield:{{library}}:owners:{kind}:{id}"
+
+
+def _mark(kind: str, id: str) -> str:
+    return f"specshield:{{library}}:mark:{kind}:{id}"
+
+
+def _uses(map_id: str, owner: str) -> str:
+    return f"specshield:{{library}}:uses:{map_id}:{owner}"
+
+
+def _reached(action: Any) -> Any:
+    try:
+        return action()
+    except (redis.RedisError, OSError) as error:
+        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error

@@ -1,0 +1,135 @@
+"""What pages of other origins reach in a real browser: nothing. Needs Chromium on the machine."""
+
+import json
+import shutil
+import subprocess
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+ATTACKS = """<!doctype html><body><iframe name="sink"></iframe><pre id="told">pending</pre><script>
+const target = "%(target)s", told = {};
+const grid = JSON.stringify(%(grid)s);
+async function attack(name, path, options) {
+  try {
+    const answer = await fetch(target + path, options);
+    told[name] = answer.type === "opaque" ? "opaque" : "read " + (await answer.text()).slice(0, 80);
+  } catch (error) { told[name] = "failed"; }
+}
+function files() {
+  const form = new FormData();
+  form.append("metadata", new Blob([%(yaml)s]));
+  form.append("image", new Blob(["P5\\n2 2\\n255\\n\\xfe"]));
+  return form;
+}
+function socket() {
+  return new Promise((done) => {
+    const ws = new WebSocket(target.replace("http", "ws") + "/v1/sessions/robot/stream");
+    ws.onopen = () => { told.socket = "open"; done(); };
+    ws.onerror = () => { told.socket = "failed"; done(); };
+  });
+}
+(async () => {
+  const form = Object.assign(document.createElement("form"), {
+    method: "POST", action: target + "/v1/maps", enctype: "text/plain", target: "sink"});
+  const name = grid.slice(0, -1) + ',"x":"';
+  form.append(Object.assign(document.createElement("input"), {name, value: '"}'}));
+  document.body.append(form);
+  form.submit();
+  await attack("read", "/v1/maps", {});
+  await attack("read opaque", "/v1/maps", {mode: "no-cors"});
+  await attack("json", "/v1/maps", {
+    method: "POST", body: grid, headers: {"Content-Type": "application/json"}});
+  await attack("text", "/v1/maps", {method: "POST", body: grid, mode: "no-cors"});
+  await attack("blob", "/v1/maps", {method: "POST", body: new Blob([grid]), mode: "no-cors"});
+  await attack("files", "/v1/maps", {method: "POST", body: files(), mode: "no-cors"});
+  await attack("delete", "/v1/sessions/robot", {method: "DELETE"});
+  await socket();
+  document.getElementById("told").textContent = JSON.stringify(told);
+})();
+</script></body>"""
+
+
+@pytest.fixture
+def page(client):
+    """page(target): the address of a page on another port that attacks the target."""
+    from tests.service.test_bad_input import YAML
+    from tests.service.world import grid_json
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            grid = json.dumps({**grid_json(), "info": {**grid_json()["info"], "resolution": 0.77}})
+            content = ATTACKS % {
+                "target": self.server.target,
+                "grid": grid,
+                "yaml": json.dumps(YAML.decode()),
+            }
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.end_headers()
+            self.wfile.write(content.encode())
+
+        def log_message(self, *args):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+
+        def serve(target):
+            server.target = target
+            return server.server_address[1]
+
+        yield serve
+        server.shutdown()
+
+
+@pytest.fixture
+def kept(client, begin):
+    """What is there stays as it is: a session of this name, and no map more."""
+    begin(id="robot")
+
+    def show():
+        return [client.get(f"/v1/{what}", params={"limit": 1000}).json() for what in ("maps", "sessions")]
+
+    before = show()
+    yield
+    assert show() == before
+    assert client.delete("/v1/sessions/robot").status_code == 204
+
+
+def see(url, folder):
+    """The page as the browser has it once its scripts are done."""
+    done = subprocess.run(
+        [
+            CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+            f"--user-data-dir={folder}", "--host-resolver-rules=MAP evil.example 127.0.0.1",
+            "--virtual-time-budget=20000", "--dump-dom", url,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )  # fmt: skip
+    return done.stdout
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "evil.example"])
+def test_a_page_of_another_origin_makes_reads_and_deletes_nothing(client, kept, page, tmp_path, host):
+    """As evil.example, which is made to point here, the page asks under its own name: DNS rebinding."""
+    port = page(f"http://{host}:{client.base_url.port}")
+    content = see(f"http://{host}:{port}/", tmp_path)
+    told = json.loads(content.partition('<pre id="told">')[2].partition("</pre>")[0])
+    assert len(told) == 8, told
+    assert set(told.values()) <= {"failed", "opaque"}, told
+
+
+def test_a_name_that_is_made_to_point_here_is_misdirected(client, tmp_path):
+    seen = see(f"http://evil.example:{client.base_url.port}/v1/maps", tmp_path)
+    assert "misdirected-request" in seen
+    assert "case1" not in seen
+
+
+def test_the_servers_own_pages_work(client, tmp_path):
+    assert "Send a map" in see(f"http://127.0.0.1:{client.base_url.port}/docs", tmp_path)

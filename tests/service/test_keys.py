@@ -1,0 +1,197 @@
+"""API keys with names: what each may, what each owns, and what it may use."""
+
+import asyncio
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import httpx
+import pytest
+
+from specshield.errors import InputError, NotFound, RateLimited, Unauthorized
+from specshield.service.access.keys import REFRESH, Key, Keys
+from specshield.service.access.rates import Rates
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.store import Store
+from tests.service.test_bad_input import problem
+from tests.service.world import START, grid_json, send_policy
+from tests.serving import serving, wait_for
+
+BARE = {"PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path)}
+
+
+@pytest.fixture(scope="module")
+def keyed(tmp_path_factory):
+    """A server whose operator has a key, and the store beside it."""
+    with serving(tmp_path_factory.mktemp("keyed") / "data", SPECSHIELD_API_KEY="operator") as running:
+        yield running
+
+
+def on_keys(server, action):
+    """What `specshield keys` does, without a process."""
+
+    async def act():
+        store = Store(EmbeddedStore(server.data_dir).url, 30.0, 60)
+        try:
+            return await action(Keys(store.redis))
+        finally:
+            await store.aclose()
+
+    return asyncio.run(act())
+
+
+@contextmanager
+def caller(server, name, **limits):
+    """A client with a key of this name, which is revoked afterwards."""
+    secret = on_keys(server, lambda keys: keys.create(name, **limits))
+    with httpx.Client(
+        base_url=server.url, timeout=None, headers={"Authorization": f"Bearer {secret}"}
+    ) as client:
+        yield client
+    on_keys(server, lambda keys: keys.revoke(name))
+
+
+def begin(client, **fields):
+    body = {"policy_id": "case1", "initial_pose": [0.9, 5.0, 0.0], "allow_infeasible": True, **fields}
+    return client.post("/v1/sessions", json=body)
+
+
+def own_world(client):
+    assert client.post("/v1/maps", json=grid_json()).status_code == 201
+    return send_policy(client)["id"]
+
+
+def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
+    def keys(*arguments):
+        return subprocess.run(
+            [sys.executable, "-m", "specshield.cli", "keys", *arguments],
+            env={**BARE, "SPECSHIELD_DATA_DIR": str(keyed.data_dir)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )  # fmt: skip
+
+    made = keys("create", "carol", "--requests", "7.5", "--sessions", "3")
+    secret = made.stdout.strip()
+    assert len(secret) > 40, made.stderr
+    with httpx.Client(base_url=keyed.url, headers={"Authorization": f"Bearer {secret}"}) as client:
+        assert client.get("/v1/sessions").status_code == 200  # at once
+        listed = keys("list").stdout
+        assert "carol" in listed
+        assert "7.5 requests a second, 3 sessions" in listed
+        assert secret not in listed
+        assert keys("revoke", "carol").returncode == 0
+        wait_for(lambda: client.get("/v1/sessions").status_code == 401, 60.0)
+    assert "carol" not in keys("list").stdout
+    again = keys("revoke", "carol")
+    assert again.returncode == 1
+    assert "Traceback" not in again.stderr
+
+
+def test_what_a_name_may_be(keyed):
+    for name in ("", "../x", "a b", "a@b", "x" * 65):
+        with pytest.raises(InputError):
+            on_keys(keyed, lambda keys, name=name: keys.create(name))
+    with pytest.raises(NotFound):
+        on_keys(keyed, lambda keys: keys.revoke(""))
+    with caller(keyed, "twice"), pytest.raises(InputError):
+        on_keys(keyed, lambda keys: keys.create("twice"))
+
+
+def test_only_the_hash_of_a_key_is_kept(keyed):
+    secret = on_keys(keyed, lambda keys: keys.create("hashed"))
+    kept = b"".join(path.read_bytes() for path in keyed.data_dir.rglob("*.aof"))
+    assert b"hashed" in kept
+    assert secret.encode() not in kept
+    on_keys(keyed, lambda keys: keys.revoke("hashed"))
+
+
+def test_a_key_owns_its_sessions(keyed):
+    with caller(keyed, "alice") as alice, caller(keyed, "alice2") as other:
+        session = begin(alice, id="run-1")
+        assert session.status_code == 201, session.text
+        assert "owner" not in session.json()
+        for method, path in (
+            ("GET", ""),
+            ("GET", "/trajectory"),
+            ("DELETE", ""),
+            ("POST", "/close"),
+            ("POST", "/steps"),
+        ):
+            body = {"t": 0, "poses": [START], "logits": [0.0] * 20} if path == "/steps" else {}
+            answer = other.request(
+                method, f"/v1/sessions/run-1{path}", json=body if method == "POST" else None
+            )
+            problem(answer, 404, "not-found")
+            assert "alice" not in answer.text
+        assert other.get("/v1/sessions").json()["items"] == []
+        assert begin(other, id="run-1").status_code == 201  # its own, of the same id
+        problem(begin(alice, id="run-1"), 409, "session-exists", "id")
+        assert other.delete("/v1/sessions/run-1").status_code == 204
+        assert [s["id"] for s in alice.get("/v1/sessions").json()["items"]] == ["run-1"]
+        assert alice.delete("/v1/sessions/run-1").status_code == 204
+
+
+def test_pages_of_one_owners_sessions(keyed):
+    with caller(keyed, "dora") as dora, caller(keyed, "dora-x") as other:
+        for i in range(3):
+            assert begin(dora, id=f"s{i}").status_code == 201
+        assert begin(other, id="s1b").status_code == 201
+        page = dora.get("/v1/sessions", params={"limit": 2}).json()
+        rest = dora.get("/v1/sessions", params={"limit": 2, "cursor": page["next"]}).json()
+        assert [s["id"] for s in page["items"] + rest["items"]] == ["s0", "s1", "s2"]
+
+
+def test_a_key_keeps_no_more_sessions_than_it_may(keyed):
+    with caller(keyed, "small", sessions=1) as small:
+        assert begin(small, id="one").status_code == 201
+        problem(begin(small, id="two"), 429, "limit-reached")
+        assert small.delete("/v1/sessions/one").status_code == 204
+        assert begin(small, id="two").status_code == 201
+
+
+def test_the_rate_of_a_key_leaves_its_robots_room(keyed):
+    with caller(keyed, "busy", requests=0.1) as busy:
+        with httpx.Client(base_url=keyed.url, headers=busy.headers, timeout=None) as client:
+            session = begin(client, id="robot")
+            assert session.status_code == 201, session.text
+            refused = client.get("/v1/maps")
+        told = problem(refused, 429, "rate-limited")
+        assert 1 <= int(refused.headers["retry-after"]) == told["retry_after"] <= 10
+        step = {"t": 0, "poses": [[0.9, 5.0, 0.0]], "logits": [0.0] * 20}
+        assert busy.post("/v1/sessions/robot/steps", json=step).status_code == 200
+
+
+def test_a_rate_counts_what_was_asked_and_fills_up_again():
+    rates, key = Rates(), Key("k", "", requests=2.0)
+    for step in (True, False):
+        rates.take(key, step)
+        rates.take(key, step)
+        with pytest.raises(RateLimited):
+            rates.take(key, step)
+    bucket = rates._buckets["k", True]
+    bucket.at -= 0.6  # as if that long had passed
+    rates.take(key, True)
+    with pytest.raises(RateLimited):
+        rates.take(key, True)
+
+
+def test_unknown_keys_do_not_ask_the_store_each():
+    asked = 0
+
+    class Counting:
+        async def hget(self, key, field):
+            nonlocal asked
+            asked += 1
+
+    async def try_many():
+        keys = Keys(Counting(), "own")
+        tried = await asyncio.gather(
+            *(keys.check(b"Bearer %d" % i) for i in range(1000)), return_exceptions=True
+        )
+        assert {type(error) for error in tried} == {Unauthorized}
+        assert (await keys.check(b"Bearer own")).name == ""
+
+    asyncio.run(try_many())
+    assert asked <= 2
+    assert REFRESH <= 2.0  # as the help of `keys revoke` says

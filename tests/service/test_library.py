@@ -1,0 +1,240 @@
+"""Maps and policies: whose they are, what an id promises, how they go, and what they may take of the disk."""
+
+import io
+import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+from safetensors.numpy import load, save
+
+from specshield.service.access.keys import OPEN, Key
+from specshield.service.library.claims import Claims
+from specshield.service.library.maps import Maps
+from specshield.service.settings import Settings
+from specshield.service.training.jobs import Jobs
+from specshield.world.map_server import dump_map
+from specshield.world.occupancy import OccupancyGrid
+from tests.service.test_bad_input import YAML, problem
+from tests.service.test_keys import caller, keyed
+from tests.service.world import START, grid_json, policy_files, send_policy
+
+__all__ = ["keyed"]  # a fixture
+
+
+def grid(seed):
+    """A map that no other test sends."""
+    return json.loads(json.dumps(grid_json()).replace('"resolution": 0.1', f'"resolution": 0.1{seed}'))
+
+
+def files(**change):
+    """A policy's two files: with other weights, or with more in its card."""
+    made = policy_files(seed=change.pop("seed", 1))
+    tensors = {**load(made["weights"]), **change.pop("tensors", {})}
+    card = {**json.loads(made["card"]), **change}
+    return {"weights": ("w", save(tensors)), "card": ("c", json.dumps(card).encode())}
+
+
+def test_the_id_of_a_policy_that_was_sent_covers_all_of_it(client, policy):
+    bias = load(files()["weights"][1])["b1"]
+    sent = [files(), files(tensors={"b1": bias + 1.0}), files(metrics={"satisfied": 0.5}), files(seed=2)]
+    answers = [client.post("/v1/policies", files=parts) for parts in sent]
+    assert [answer.status_code for answer in answers] == [202] * 4
+    ids = [answer.json()["id"] for answer in answers]
+    assert len(set(ids)) == 4
+    assert json.loads(policy_files(seed=1)["card"])["id"] not in ids  # that of one that is made here
+    assert client.post("/v1/policies", files=sent[0]).json()["id"] == ids[0]
+    for id in ids:
+        assert client.delete(f"/v1/policies/{id}").status_code == 204
+        assert client.get(f"/v1/policies/{id}").status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("change", "path"),
+    [
+        ({"tensors": {"more": np.zeros(3, np.float32)}}, "weights"),
+        ({"tensors": {"more": np.zeros(3, np.float16)}}, "weights"),
+        ({"tensors": {"b1": np.zeros((2, 2), np.float32)}}, "weights.b1"),
+        ({"tensors": {"b2": np.full(4, np.nan, np.float32)}}, "weights.b2"),
+        ({"metrics": {"satisfied": float("nan")}}, "card.metrics.satisfied"),
+        ({"metrics": {"each": [1.0, float("inf")]}}, "card.metrics.each[1]"),
+        ({"note": {"deep": [{"x": -float("inf")}]}}, "card.note.deep[0].x"),
+    ],
+)
+def test_a_policy_that_does_not_fit_is_refused_when_it_is_sent(client, policy, server, change, path):
+    before = client.get("/v1/policies").json()
+    answer = client.post("/v1/policies", files=files(**change))
+    problem(answer, 422, "invalid-policy", path)
+    assert str(server.data_dir) not in answer.text
+    assert client.get("/v1/policies").json() == before
+
+
+def test_a_map_goes_once_no_policy_is_for_it(client):
+    map_id = client.post("/v1/maps", json=grid(1)).json()["id"]
+    assert client.delete(f"/v1/maps/{map_id}").status_code == 204
+    problem(client.get(f"/v1/maps/{map_id}"), 404, "not-found", "map_id")
+    problem(client.delete(f"/v1/maps/{map_id}"), 404, "not-found", "map_id")
+    assert map_id not in client.get("/v1/maps", params={"limit": 1000}).text
+    problem(client.delete("/v1/maps/case1"), 409, "in-use", "map_id")
+
+
+def test_a_map_and_a_policy_that_are_used_stay(keyed):
+    with caller(keyed, "user") as user:
+        map_id = user.post("/v1/maps", json=grid_json()).json()["id"]
+        policy_id = send_policy(user)["id"]
+        told = problem(user.delete(f"/v1/maps/{map_id}"), 409, "in-use", "map_id")
+        assert told["policy_id"] == policy_id
+        body = {"policy_id": policy_id, "initial_pose": START, "id": "r"}
+        assert user.post("/v1/sessions", json=body).status_code == 201
+        told = problem(user.delete(f"/v1/policies/{policy_id}"), 409, "in-use", "policy_id")
+        assert told["session_id"] == "r"
+        assert user.post("/v1/sessions/r/close", json={}).status_code == 200
+        assert user.delete(f"/v1/policies/{policy_id}").status_code == 204
+        body["id"] = "late"  # the shield of this policy is still in the server's memory
+        problem(user.post("/v1/sessions", json=body), 404, "not-found", "policy_id")
+        assert user.delete(f"/v1/maps/{map_id}").status_code == 204
+
+
+def test_two_owners_of_one_content(keyed):
+    with caller(keyed, "ann") as ann, caller(keyed, "ben") as ben:
+        map_id = ann.post("/v1/maps", json=grid_json()).json()["id"]
+        policy_id = send_policy(ann)["id"]
+        for path in (f"/v1/maps/{map_id}", f"/v1/maps/{map_id}/image.png", f"/v1/policies/{policy_id}"):
+            problem(ben.get(path), 404, "not-found")
+            assert ben.delete(path.removesuffix("/image.png")).status_code == 404
+        for what in ("maps", "policies"):
+            assert {item["name"] for item in ben.get(f"/v1/{what}").json()["items"]} >= {"case1", "case2"}
+            assert all(item["name"] for item in ben.get(f"/v1/{what}").json()["items"])
+        body = {"policy_id": policy_id, "initial_pose": START}
+        problem(ben.post("/v1/sessions", json=body), 404, "not-found", "policy_id")
+        spec = {"formula": "x > 0", "map_id": map_id}
+        problem(ben.post("/v1/specs/validate", json=spec), 404, "not-found", "map_id")
+        unseen = ben.post("/v1/policies", files=files())
+        assert unseen.status_code == 422, "a policy on a map that is another's"
+        assert ben.post("/v1/maps", json=grid_json()).json()["id"] == map_id
+        assert send_policy(ben)["id"] == policy_id
+        assert ann.delete(f"/v1/policies/{policy_id}").status_code == 204
+        assert ann.delete(f"/v1/maps/{map_id}").status_code == 204
+        assert ann.get(f"/v1/maps/{map_id}").status_code == 404
+        assert ben.post("/v1/sessions", json={**body, "id": "b"}).status_code == 201
+        assert ben.delete("/v1/sessions/b").status_code == 204
+        assert ben.delete(f"/v1/policies/{policy_id}").status_code == 204
+        assert ben.delete(f"/v1/maps/{map_id}").status_code == 204
+        assert not (keyed.data_dir / "maps" / map_id).exists()
+
+
+def test_a_key_keeps_no_more_bytes_than_it_may(keyed):
+    with caller(keyed, "full", bytes=2000) as full:
+        first = answer = full.post("/v1/maps", json=grid(2))
+        sides = iter(range(10, 99))
+        while answer.is_success:
+            answer = full.post("/v1/maps", json=grid(next(sides)))
+        assert problem(answer, 507, "insufficient-storage")["limit"] == 2000
+        assert full.delete(f"/v1/maps/{first.json()['id']}").status_code == 204
+        assert full.post("/v1/maps", json=grid(3)).status_code == 201
+
+
+def test_of_a_deletion_and_a_creation_one_wins(keyed):
+    with caller(keyed, "race") as race:
+        assert race.post("/v1/maps", json=grid_json()).status_code == 201
+        for i in range(6):
+            policy_id, together = send_policy(race)["id"], threading.Barrier(2)
+            body = {"policy_id": policy_id, "initial_pose": START, "id": f"race-{i}"}
+
+            def erase(policy_id=policy_id, together=together):
+                together.wait()
+                return race.delete(f"/v1/policies/{policy_id}").status_code
+
+            def make(body=body, together=together):
+                together.wait()
+                return race.post("/v1/sessions", json=body).status_code
+
+            with ThreadPoolExecutor(2) as both:
+                erased, made = both.submit(erase), both.submit(make)
+            assert (erased.result(), made.result()) in ((204, 404), (409, 201))
+            assert race.get(f"/v1/sessions/race-{i}").status_code == (200 if made.result() == 201 else 404)
+            race.delete(f"/v1/sessions/race-{i}")
+
+
+@pytest.fixture
+def claims(keyed):
+    settings = Settings(data_dir=keyed.data_dir, store_timeout=30.0)
+    return Claims(Jobs(f"unix://{keyed.data_dir}/store/socket", settings).redis, settings)
+
+
+def test_nobody_begins_to_use_what_is_being_deleted(claims, monkeypatch):
+    monkeypatch.setattr("specshield.service.library.claims.PATIENCE", 0.05)
+    key, id = Key("marks", ""), "0" * 64
+    with claims.adding("policies", id, key, 10):
+        pass
+    assert claims.mark("policies", id, "marks", "one") is None
+    assert not claims.settled("policies", id, "marks")
+    with pytest.raises(Exception, match="being deleted"), claims.adding("policies", id, Key("other", ""), 10):
+        pass
+    with pytest.raises(Exception, match="being deleted"):
+        claims.mark("policies", id, "marks", "two")
+    with pytest.raises(Exception, match="too long"):
+        claims.free("policies", id, "marks", "two")
+    assert claims.free("policies", id, "marks", "one")
+    claims.unmark("policies", id, "one")
+    assert claims.ids("policies", "marks") == []
+
+
+def test_what_cannot_be_written_is_not_claimed(claims):
+    before = claims._store.hgetall("specshield:{library}:sums")
+    for _ in range(2):
+        with pytest.raises(Exception, match="disk is full"), claims.adding("maps", "1" * 64, OPEN, 10):
+            raise OSError(28, "No space left on device", "/secret/path")
+    assert claims.ids("maps", "") == []
+    after = claims._store.hgetall("specshield:{library}:sums")
+    assert {k: v for k, v in after.items() if v != b"0"} == {k: v for k, v in before.items() if v != b"0"}
+
+
+def test_maps_are_compressed_and_old_folders_are_read(claims, tmp_path):
+    cells = np.zeros((900, 1100), bool)
+    cells[200:210] = True
+    made, settings = OccupancyGrid(cells, 0.05, (1.0, -2.0, 0.5)), Settings(data_dir=tmp_path)
+    id = Maps(settings, claims).add(made, {}, OPEN).id
+    folder = tmp_path / "maps" / id
+    assert sum(path.stat().st_size for path in folder.iterdir()) < 5000  # a byte a cell were 990,000
+    assert Maps(settings, claims).find(id, "").grid == made
+    text, image = dump_map(made)
+    (folder / "map.png").unlink()
+    (folder / "map.yaml").write_text(text)
+    (folder / "map.pgm").write_bytes(image)
+    assert Maps(settings, claims).find(id, "").grid == made
+    Maps(settings, claims).delete(id, "")
+    assert not folder.exists()
+
+
+def test_maps_of_a_time_before_owners_are_the_operators(claims, tmp_path):
+    settings = Settings(data_dir=tmp_path)
+    id = Maps(settings, claims).add(OccupancyGrid(np.zeros((5, 7), bool), 0.3), {}, OPEN).id
+    claims._store.delete("specshield:{library}:maps:", f"specshield:{{library}}:owners:maps:{id}")
+    maps = Maps(settings, claims)
+    assert id not in [item["id"] for item in maps.page("", None, 1000)[0]]
+    maps.adopt()
+    assert id in [item["id"] for item in maps.page("", None, 1000)[0]]
+    maps.delete(id, "")
+
+
+def test_a_full_disk_refuses_what_is_new_and_says_so(tmp_path, claims):
+    few = Settings(data_dir=tmp_path, disk_reserve_bytes=1 << 60)
+    claims._settings = few
+    with pytest.raises(Exception, match="disk is full"):
+        Maps(few, claims).add(OccupancyGrid(np.zeros((5, 8), bool), 0.3), {}, OPEN)
+
+
+def test_the_image_of_a_map_is_the_map(client):
+    buffer = io.BytesIO()
+    shades = np.full((6, 9), 255, np.uint8)
+    shades[0, :4] = 0
+    Image.fromarray(shades).save(buffer, "PNG")
+    parts = {"metadata": ("m", YAML), "image": ("i", buffer.getvalue())}
+    id = client.post("/v1/maps", files=parts).json()["id"]
+    shown = httpx.get(f"{client.base_url}/v1/maps/{id}/image.png")
+    assert (np.asarray(Image.open(io.BytesIO(shown.content)).convert("L")) == shades).all()
+    assert client.delete(f"/v1/maps/{id}").status_code == 204
