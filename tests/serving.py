@@ -30,15 +30,20 @@ class RunningServer:
         self.process.wait()
 
 
+def free_port(port: int = 0) -> int:
+    """This port, or any that is free."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(("127.0.0.1", port))
+        return int(probe.getsockname()[1])
+
+
 @contextmanager
 def serving(
     data_dir: Path, *options: str, ready: bool = True, port: int = 0, **environment: str
 ) -> Iterator[RunningServer]:
     """`specshield serve`. port: 0 is a free one. environment: settings, as in SPECSHIELD_SESSION_TTL="1"."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind(("127.0.0.1", port))
-        port = probe.getsockname()[1]
+    port = free_port(port)
     kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
     data_dir.mkdir(parents=True, exist_ok=True)
     log = data_dir / "server.log"

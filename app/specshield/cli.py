@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import socket
 import sys
 import tempfile
@@ -12,7 +14,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from specshield.errors import InputError, SpecshieldError
+from specshield.errors import InputError, SpecshieldError, StoreError
 
 if TYPE_CHECKING:
     from specshield.service.settings import Settings
@@ -94,7 +96,9 @@ def serve(
     import uvicorn
 
     from specshield.service.bounds.protocol import raise_file_limit
+    from specshield.service.drain import GRACE
     from specshield.service.storage.embedded import EmbeddedStore
+    from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs
 
     settings = _settings()  # what is wrong with them is said here, in one line
@@ -104,14 +108,20 @@ def serve(
         embedded.join()  # and so is why it does not start
     if not insecure:
         _check_exposure(host, settings)
+    with contextlib.suppress(StoreError):  # a store that is away now may come
+        url = embedded.url if embedded is not None else str(settings.redis_url)
+        check_files(url, settings.files_at, settings.store_timeout)
     raise_file_limit()
     options: dict[str, Any] = {
         "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
-        "timeout_graceful_shutdown": 5, "log_config": logs.config(settings.log_format, settings.log_level),
+        "timeout_graceful_shutdown": GRACE,
+        "log_config": logs.config(settings.log_format, settings.log_level),
         "http": "specshield.service.bounds.protocol:BoundedProtocol",
         "timeout_keep_alive": settings.keep_alive_timeout, "ws_max_size": settings.max_body_bytes,
     }  # fmt: skip
-    if workers == 1:  # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up
+    # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    if workers == 1:
         from specshield.service.app import create_app
 
         uvicorn.run(create_app(settings, embedded), **options)

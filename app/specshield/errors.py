@@ -36,6 +36,7 @@ SpecshieldError
 ├── RequestTimeout              the request took too long to arrive
 ├── TrainingUnavailable         no worker is there to train
 ├── Starting                    the server is not ready yet; ask again after Retry-After
+├── Stopping                    the server is about to stop; it goes on with what it is asked until then
 ├── StoreError                  the trajectory store cannot be reached
 ├── ServerError                 the server failed; what it knows is in its log
 └── TransportError              the client could not reach the server
@@ -231,6 +232,10 @@ class TrainingUnavailable(SpecshieldError):
 
 class Starting(SpecshieldError):
     type = "starting"
+
+
+class Stopping(SpecshieldError):
+    type = "stopping"
 
 
 class StoreError(SpecshieldError):

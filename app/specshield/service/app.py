@@ -8,6 +8,7 @@ import logging
 import multiprocessing
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 from fastapi import FastAPI
@@ -20,6 +21,7 @@ from specshield.service import problems
 from specshield.service.access.keys import Keys
 from specshield.service.bounds import body
 from specshield.service.bounds.bodies import Bodies
+from specshield.service.drain import drain_at_sigterm
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
@@ -27,13 +29,17 @@ from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe, guarded
 from specshield.service.routes import events, maps, policies, sessions, specs, system
 from specshield.service.schemas.base import Problem
+from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
 from specshield.service.startup import Startup, prepare
 from specshield.service.state import Server, problem_documents
+from specshield.service.storage.archive import Archive
+from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
-from specshield.service.storage.store import Store
+from specshield.service.storage.marker import check_files
+from specshield.service.storage.objects import open_objects
 from specshield.service.training.children import TrainingWorker, tend, wants_worker
 from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
@@ -93,7 +99,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     if embedded is not None:
         await asyncio.to_thread(embedded.join)
     url = embedded.url if embedded is not None else str(settings.redis_url)
-    store, jobs = Store(url, settings.store_timeout, settings.session_ttl), Jobs(url, settings)
+    archive = Archive(open_objects(f"{settings.files_at}/archive"))
+    store = ArchivingStore(url, settings.store_timeout, settings.session_ttl, archive)
+    check = partial(check_files, url, settings.files_at, settings.store_timeout)
+    mover, jobs = Mover(store, settings), Jobs(url, settings)
     claims = Claims(jobs.redis, settings)
     library = Maps(settings, claims)
     known = Policies(settings, library, claims)
@@ -120,8 +129,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     )
     body.clear(settings.data_dir / "incoming")
     app.state.server = server
+    drain_at_sigterm(startup, settings.drain)
     running = (
-        tend(embedded, worker), prepare(startup), watchers.run(), keys.follow(), _adopt(library, known)
+        tend(embedded, worker), prepare(startup, check), mover.run(), watchers.run(), keys.follow(),
+        _adopt(library, known),
     )  # fmt: skip
     tasks = [asyncio.create_task(each) for each in running]
     try:

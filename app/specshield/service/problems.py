@@ -45,6 +45,7 @@ STATUS: Mapping[type[SpecshieldError], int] = {
     errors.InsufficientStorage: 507,
     errors.TrainingUnavailable: 503,
     errors.Starting: 503,
+    errors.Stopping: 503,
     errors.StoreError: 503,
     SpecshieldError: 500,
 }
@@ -204,7 +205,7 @@ def install(app: FastAPI) -> None:
 
     async def known(request: Request, error: Exception) -> Response:
         assert isinstance(error, SpecshieldError)
-        if status_of(error) >= 500 and not isinstance(error, errors.Starting):  # startup.py logs that
+        if status_of(error) >= 500 and not isinstance(error, errors.Starting | errors.Stopping):
             log.warning("%s %s: %s", request.method, request.url.path, error.message)
         return response(error)
 

@@ -9,11 +9,11 @@ from typing import Literal
 
 from pydantic import AliasChoices, Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
-from redis import ConnectionPool
 
 from specshield import shipped
 from specshield.errors import InputError
 from specshield.service.access.site import AUTHORITY
+from specshield.service.storage.connect import FORMS, connect
 
 HEADER_TEXT = re.compile(r"[!-~]([ -~]*[!-~])?")
 
@@ -28,6 +28,11 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         default=Path("data"), description="Uploaded maps, trained policies and the embedded store."
     )
+    data_url: str | None = Field(
+        default=None,
+        description="Folder or fsspec URL (s3://bucket/prefix) of maps, policies and archived sessions, the "
+        "same for all servers and workers of one store; unset, the data folder.",
+    )
     models_dir: Path = Field(default=shipped.MODELS, description="Policies there at start, one folder each.")
     maps_dir: Path = Field(
         default=shipped.MAPS, description="Maps there at start, <name>.yaml beside its image."
@@ -35,7 +40,7 @@ class Settings(BaseSettings):
     redis_url: str | None = Field(
         default=None,
         validation_alias=AliasChoices("redis_url", "REDIS_URL"),
-        description="redis://, rediss:// or unix:// of the store; unset, the server starts its own.",
+        description="The store, as storage/connect.py says; unset, the server starts its own.",
     )
     store_timeout: float = Field(
         default=2.0, gt=0, description="Longest wait for one answer of the store [s]."
@@ -103,6 +108,19 @@ class Settings(BaseSettings):
     session_ttl: int = Field(
         default=7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
     )
+    archive_after: int = Field(
+        default=3600, ge=1,
+        description="A session that has not changed for so long moves to the archive [s]; one that has ended "
+        "does after 60 s, or after this long.",
+    )  # fmt: skip
+    archive_bytes: int = Field(
+        default=100 << 30, ge=1 << 20,
+        description="Where the archive holds so much, none moves there and none is begun [bytes].",
+    )  # fmt: skip
+    drain: float = Field(
+        default=0.0, ge=0, le=3600,
+        description="How long a server that was told to stop goes on answering, /readyz excepted [s].",
+    )  # fmt: skip
     shield_cache: int = Field(default=32, ge=1, description="Prepared shields kept in memory.")
 
     max_watchers: int = Field(
@@ -130,9 +148,9 @@ class Settings(BaseSettings):
     def _is_a_store(cls, url: str | None) -> str | None:
         try:
             if url is not None:
-                ConnectionPool.from_url(url)  # opens nothing yet
-        except ValueError:
-            raise ValueError("a URL as redis://127.0.0.1:6379/0, rediss://... or unix:///path") from None
+                connect(url)  # opens nothing yet
+        except (ValueError, TypeError):
+            raise ValueError(f"a URL as {FORMS}") from None
         return url
 
     @field_validator("api_key")
@@ -153,6 +171,11 @@ class Settings(BaseSettings):
     def hosts(self) -> frozenset[str]:
         """`allowed_hosts`, one by one."""
         return frozenset(_listed(self.allowed_hosts))
+
+    @property
+    def files_at(self) -> str:
+        """Where maps, policies and archived sessions are: a folder, or an fsspec URL."""
+        return self.data_url or str(self.data_dir.resolve())
 
     def environment(self) -> dict[str, str]:
         """The environment that gives a child process these same settings."""

@@ -14,13 +14,13 @@ import fcntl
 import logging
 import os
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from specshield import compiled
-from specshield.errors import ServerError, SpecshieldError, Starting
+from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
 KERNELS = 155  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
@@ -45,7 +45,9 @@ class Startup:
     parts: list[str] = field(default_factory=list)
 
     def problem(self) -> SpecshieldError | None:
-        """What a request is told that cannot be answered yet; None once the server is ready."""
+        """Why the server should not be asked: it is not ready yet, or about to stop. None where it should."""
+        if self.stopping:
+            return Stopping("the server is about to stop", expected="another server behind the same address")
         if self.ready:
             return None
         if self.failure is not None:
@@ -66,21 +68,37 @@ class Startup:
         return min(compiled.on_disk() - (self.before or 0), KERNELS)
 
 
-async def prepare(startup: Startup) -> None:
-    """Returns when the server is ready, or cannot become it."""
+async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
+    """Returns when the server is ready, or cannot become it.
+
+    check: blocks, and raises what keeps the server from serving; StoreError where that cannot be known yet.
+    """
     try:
         mark = compiled.mark("ready")
         if mark is not None and not mark.exists():
             await _compile(startup, mark)
         for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here
             await asyncio.to_thread(warmup.warm_up, part)
+        while not await asyncio.to_thread(_passes, check):
+            await asyncio.sleep(CHECK_EVERY)
         startup.ready = True
         log.info("ready")
+    except InputError as error:
+        log.error("%s", error)
+        startup.failure = str(error)
     except Exception as error:
         log.exception("the kernels cannot be compiled")
         startup.failure = (
             f"the kernels cannot be compiled: {type(error).__name__}; the server's log says more"
         )
+
+
+def _passes(check: Callable[[], object]) -> bool:
+    try:
+        check()
+    except StoreError:  # /readyz says that it is away
+        return False
+    return True
 
 
 async def _compile(startup: Startup, mark: Path) -> None:

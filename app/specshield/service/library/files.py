@@ -17,14 +17,46 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from specshield.errors import InputError, InsufficientStorage
+from specshield.service.library.mirror import Mirror
+from specshield.service.settings import Settings
+from specshield.service.storage.objects import open_objects
 
 HASH = re.compile(r"[0-9a-f]{64}")
 PAGE_BYTES = 256 << 10  # chosen by hand: read and shown in a few ms
 V = TypeVar("V")
+_mirrors: dict[Path, Mirror] = {}  # of the folders whose things are behind a URL
+
+
+def kept(settings: Settings, kind: str) -> Path:
+    """The folder of all `maps` or `policies`; where they are behind a URL, that of this server's copies."""
+    place = Path(settings.files_at) if "://" not in settings.files_at else settings.data_dir / "copies"
+    folder = place / kind
+    folder.mkdir(parents=True, exist_ok=True)
+    if "://" in settings.files_at:
+        _mirrors[folder] = Mirror(folder, open_objects(settings.files_at), kind)
+    return folder
 
 
 def ids(folder: Path) -> list[str]:
-    return sorted(entry.name for entry in folder.iterdir() if HASH.fullmatch(entry.name))
+    mirror = _mirrors.get(folder)
+    names = mirror.ids() if mirror is not None else [entry.name for entry in folder.iterdir()]
+    return sorted(name for name in names if HASH.fullmatch(name))
+
+
+def there(folder: Path) -> bool:
+    """Whether a map or policy is there. A copy is brought up to date first."""
+    mirror = _mirrors.get(folder.parent)
+    if mirror is None:
+        return folder.is_dir()
+    missing = mirror.missing(folder.name)
+    if missing is None:
+        return False
+    if not folder.is_dir():
+        _write_folder(folder, missing)
+    else:
+        for name, content in missing.items():
+            _write_file(folder / name, content)
+    return True
 
 
 def check_writable(folder: Path, name: str) -> None:
@@ -52,6 +84,12 @@ def to_json(value: Any) -> bytes:
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """Writes all of the files, or none. A folder that is there already has the same content, and stays."""
+    _write_folder(folder, files)
+    if folder.parent in _mirrors:
+        _mirrors[folder.parent].send(folder.name, dict(files))
+
+
+def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".draft-"))
     try:
         for name, content in files.items():
@@ -77,6 +115,12 @@ def weight_of(folder: Path) -> int:
 
 def write_file(path: Path, content: bytes) -> None:
     """Replaces the file as a whole: a reader sees the old one or the new one."""
+    _write_file(path, content)
+    if path.parent.parent in _mirrors:
+        _mirrors[path.parent.parent].send(path.parent.name, {path.name: content})
+
+
+def _write_file(path: Path, content: bytes) -> None:
     draft = path.with_name(f".draft-{path.name}")
     _write(draft, content)
     os.replace(draft, path)
@@ -85,6 +129,8 @@ def write_file(path: Path, content: bytes) -> None:
 
 def remove_folder(folder: Path) -> None:
     """Takes the folder out of the others' sight at once, then erases it."""
+    if folder.parent in _mirrors:
+        _mirrors[folder.parent].remove(folder.name)
     grave = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".deleted-"))
     if folder.is_dir():
         os.rename(folder, grave / folder.name)

@@ -61,8 +61,7 @@ class Maps:
     """The calls block: they read and write files. claims: whose they are; needed to find, add and delete."""
 
     def __init__(self, settings: Settings, claims: Claims | None = None) -> None:
-        self._folder, self._claims = settings.data_dir / "maps", claims
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self._folder, self._claims = files.kept(settings, "maps"), claims
         self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
         self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
@@ -72,7 +71,7 @@ class Maps:
         found = self.shipped(key)
         if found is not None:
             return found
-        if files.HASH.fullmatch(key) and (self._folder / key).is_dir():
+        if files.HASH.fullmatch(key) and files.there(self._folder / key):
             return self._recent.get(key, lambda: self._read(key))
         raise _missing(key)
 
@@ -95,7 +94,8 @@ class Maps:
             if self._claims.holds("maps", key, owner):
                 return self.get(key)
             for id in self._own(owner):
-                if files.read_json(self._folder / id / "map.json")["grid"] == key:
+                folder = self._folder / id
+                if files.there(folder) and files.read_json(folder / "map.json")["grid"] == key:
                     return self.get(id)
         raise _missing(key)
 
@@ -122,7 +122,7 @@ class Maps:
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
         content = {"map.yaml": dump_map(grid)[0].encode(), "map.png": made.png(), "map.json": meta}
         with self._claims.adding("maps", id, key, files.weight(content)):
-            if not folder.is_dir():
+            if not files.there(folder):
                 files.write_folder(folder, content)
         return self._recent.get(id, lambda: made)
 
@@ -168,11 +168,12 @@ class Maps:
     def _own(self, owner: str) -> list[str]:
         """Ids that the owner has; one whose files are not there was not written to the end."""
         assert self._claims is not None
-        return [id for id in self._claims.ids("maps", owner) if (self._folder / id).is_dir()]
+        return [id for id in self._claims.ids("maps", owner) if files.there(self._folder / id)]
 
     def _shown(self, key: str) -> dict[str, Any]:
         if key in self._named:
             return self._named[key].to_json()
+        files.there(self._folder / key)
         shown: dict[str, Any] = files.read_json(self._folder / key / "map.json")["shown"]
         return shown
 

@@ -61,8 +61,7 @@ class Policies:
         """claims: whose they are; needed to find, add and delete."""
         self._maps, self._models, self._claims = maps, settings.models_dir, claims
         self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
-        self._folder = settings.data_dir / "policies"
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self._folder = files.kept(settings, "policies")
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
         self._named = {str(record.name): record for record in self._shipped()}
 
@@ -72,7 +71,7 @@ class Policies:
             if key in (found.name, found.id):
                 return found
         folder = self._folder / key
-        if not files.HASH.fullmatch(key) or not (folder / "policy.json").is_file():
+        if not files.HASH.fullmatch(key) or not files.there(folder):
             raise _missing(key)
         stored = files.read_json(folder / "policy.json")
         card = files.read_json(folder / "card.json") if (folder / "card.json").is_file() else None
@@ -207,7 +206,7 @@ class Policies:
     def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
         """Keeps what a run made. The card comes last: it makes the policy ready. Raises NotFound."""
         folder = self._folder / id
-        if not folder.is_dir():
+        if not files.there(folder):
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
         with files.full_disk():
             files.write_file(folder / "policy.safetensors", weights)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from specshield.errors import SpecshieldError, Starting
+from specshield.errors import SpecshieldError, Stopping
 from specshield.service import problems
 from specshield.service.access.rates import Rates
 from specshield.service.access.site import check_site
@@ -37,7 +37,7 @@ class Guard:
             self._rates.take(key, path.endswith("/steps"))
             scope["state"].update(key=key, owner=key.name, rates=self._rates)
         starting = server.startup.problem() if path.startswith("/v1/") else None
-        if isinstance(starting, Starting):
+        if starting is not None and not isinstance(starting, Stopping):
             raise starting
 
 

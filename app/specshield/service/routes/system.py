@@ -20,13 +20,16 @@ async def livez() -> Health:
 @router.get(
     "/readyz",
     summary="Is it ready?",
-    responses=problems(_503="`starting`: it says how far it is; or the store is away."),
+    responses=problems(
+        _503="`starting`: it says how far it is; `stopping`: it was told to stop; or the store is away."
+    ),
 )
 async def readyz(server: ServerState) -> Health:
     """Whether it can decide: the store answers, and the kernels are compiled.
 
     The first start of an installation compiles them, in about half a minute; `kernels` says how many of how
-    many are done. Until then every path under /v1 answers 503 `starting`, with Retry-After.
+    many are done. Until then every path under /v1 answers 503 `starting`, with Retry-After. A server that was
+    told to stop says so here first, and answers everything else until it stops.
     """
     await server.store.ping()
     problem = server.startup.problem()

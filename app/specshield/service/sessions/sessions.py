@@ -45,7 +45,8 @@ from specshield.service.sessions.shields import Shields, refused
 from specshield.service.sessions.state import State
 from specshield.service.sessions.steps import Steps
 from specshield.service.settings import Settings
-from specshield.service.storage.store import Change, Dump, Record, Store
+from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.store import Change, Dump, Record
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring
 from specshield.shield.preference import Preference
@@ -58,7 +59,7 @@ class Sessions:
     which says whose it is (access/owners.py).
     """
 
-    def __init__(self, settings: Settings, store: Store, policies: Policies, heavy: Heavy) -> None:
+    def __init__(self, settings: Settings, store: ArchivingStore, policies: Policies, heavy: Heavy) -> None:
         self._settings, self._store, self._policies = settings, store, policies
         self._shields = Shields(policies, settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
@@ -122,7 +123,7 @@ class Sessions:
     async def page(
         self, owner: str, after: str | None, limit: int
     ) -> tuple[list[dict[str, Any]], str | None]:
-        found, following = await self._store.page(owner, after, limit)
+        found, following = await self._store.everything(f"{owner}@", after, limit)
         shown = [describe(json.loads(config), State.of(state)) for config, state in found]
         for item in shown:  # they can be long, and whoever wants them reads the session
             item["spec"] = {name: held for name, held in item["spec"].items() if name != "regions"}
@@ -209,6 +210,11 @@ class Sessions:
 
     async def _check_room(self, owner: str | None, limit: int | None) -> None:
         """Raises LimitReached where this owner, or with None all of them, keep `limit` sessions."""
+        if self._store.full:
+            raise LimitReached(
+                f"the archive holds {self._settings.archive_bytes} bytes, and takes no more sessions",
+                expected="room: delete sessions; the server's operator can raise SPECSHIELD_ARCHIVE_BYTES",
+            )
         if limit is None or await self._store.count(owner) < limit:
             return
         await self._store.sweep(owner)

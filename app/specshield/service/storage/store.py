@@ -16,11 +16,10 @@ from typing import Any
 
 import anyio
 import redis.asyncio as redis
-from redis.asyncio.retry import Retry
-from redis.backoff import ExponentialBackoff
 
 from specshield.errors import SessionExists, StoreError
 from specshield.service.access.owners import between, shown
+from specshield.service.storage.connect import connect
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
 AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
@@ -77,25 +76,14 @@ class Store:
     """Every method raises StoreError where the store cannot be reached in time."""
 
     def __init__(self, url: str, timeout: float, ttl: int) -> None:
-        pool: Any = redis.BlockingConnectionPool.from_url(
-            url,
-            max_connections=64,
-            timeout=timeout,
-            socket_timeout=timeout,
-            socket_connect_timeout=timeout,
-            # Sent twice, an append changes nothing: the second finds the version gone on.
-            retry=Retry(ExponentialBackoff(cap=0.2, base=0.02), 3),
-            retry_on_error=[redis.ConnectionError, redis.TimeoutError],
-        )
-        self.redis: Any = redis.Redis(
-            connection_pool=pool
-        )  # redis-py's types admit str where bytes come back
+        # What is lost on the way is sent again. Twice, an append changes nothing: the second finds the
+        # version gone on.
+        self.redis: Any = connect(url, socket_timeout=timeout)
         self._append, self._drop = self.redis.register_script(APPEND), self.redis.register_script(DROP)
         self._timeout, self._ttl = timeout, ttl
 
     async def aclose(self) -> None:
         await self.redis.aclose()
-        await self.redis.connection_pool.disconnect()
 
     @asynccontextmanager
     async def _reaching(self) -> AsyncIterator[None]:
@@ -145,12 +133,12 @@ class Store:
             config,
             self._ttl * 1000,
         ]
-        written = await self._append(keys=_keys(id), args=args)
+        written = await self._append(keys=keys(id), args=args)
         return written if isinstance(written, bytes) else _record(*written)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """The session, with what step t left; None where there is none. One round trip."""
-        session, rows, steps = _keys(id)
+        session, rows, steps = keys(id)
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
             # In this order a write in between is harmless: rows past what the state counts are not looked at,
             # and a step that is there is the answer, whatever the state says.
@@ -163,7 +151,7 @@ class Store:
 
     async def dump(self, id: str) -> Dump | None:
         """All of a session as it is at one moment; None where there is none."""
-        session, rows, steps = _keys(id)
+        session, rows, steps = keys(id)
         async with self._reaching(), self.redis.pipeline(transaction=True) as pipe:
             pipe.hmget(session, "config", "state", "version")
             pipe.get(rows)
@@ -174,7 +162,7 @@ class Store:
     async def drop(self, id: str, version: bytes) -> bool:
         """Erase all of it if `version` is still the latest. False where it is not."""
         async with self._reaching():
-            if not await self._drop(keys=_keys(id), args=[version]):
+            if not await self._drop(keys=keys(id), args=[version]):
                 return False
             await self.redis.zrem(INDEX, id)
         return True
@@ -182,7 +170,7 @@ class Store:
     async def delete(self, id: str) -> bool:
         """Erase all of it. False where there was nothing."""
         async with self._reaching():
-            found = await self.redis.unlink(*_keys(id))
+            found = await self.redis.unlink(*keys(id))
             await self.redis.zrem(INDEX, id)
         return bool(found)
 
@@ -226,7 +214,7 @@ class Store:
         """Of each session the version, None where the store has none. One round trip."""
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
             for id in ids:
-                pipe.hget(_keys(id)[0], "version")
+                pipe.hget(keys(id)[0], "version")
             found: list[bytes | None] = await pipe.execute()
         return found
 
@@ -234,7 +222,7 @@ class Store:
         """For each (id, t, bytes of a row, count): what it has from step t on, at most so many steps."""
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
             for id, t, width, count in asked:
-                session, rows, steps = _keys(id)
+                session, rows, steps = keys(id)
                 pipe.hget(session, "state")
                 pipe.lrange(steps, t, t + count - 1)
                 pipe.getrange(rows, t * width, (t + count) * width - 1)  # last: it has all rows of the steps
@@ -251,7 +239,7 @@ class Store:
         """The first ids whose configs come to about `room` bytes, at least one, and what is left of it."""
         async with self.redis.pipeline(transaction=False) as pipe:
             for id in ids:
-                pipe.hstrlen(_keys(id.decode())[0], "config")
+                pipe.hstrlen(keys(id.decode())[0], "config")
             for taken, size in enumerate(await pipe.execute(), start=1):
                 room -= size
                 if room <= 0:
@@ -261,7 +249,7 @@ class Store:
     async def _configs(self, ids: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
         async with self.redis.pipeline(transaction=False) as pipe:
             for id in ids:
-                pipe.hmget(_keys(id.decode())[0], "config", "state")
+                pipe.hmget(keys(id.decode())[0], "config", "state")
             found = await pipe.execute()
         expired = [id for id, (config, _) in zip(ids, found, strict=True) if config is None]
         if expired:
@@ -276,7 +264,7 @@ def _range(owner: str | None) -> tuple[str, str]:
     return f"[{first}", f"({end}"
 
 
-def _keys(id: str) -> list[str]:
+def keys(id: str) -> list[str]:
     return [f"specshield:v2:{{{id}}}:{part}" for part in ("session", "rows", "steps")]
 
 

@@ -9,17 +9,17 @@ from __future__ import annotations
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import redis
-from redis.backoff import ExponentialBackoff
-from redis.retry import Retry
 from rq import Queue
 from rq.serializers import JSONSerializer
 
 from specshield.errors import StoreError
 from specshield.policy.methods import METHODS
 from specshield.service.settings import Settings
+from specshield.service.storage.connect import connect
 from specshield.service.watch import logs
 
 ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
@@ -45,16 +45,17 @@ class Jobs:
     """Every method raises StoreError where the store cannot be reached in time."""
 
     def __init__(self, url: str, settings: Settings) -> None:
-        self.redis: Any = redis.Redis.from_url(
-            url,
-            socket_timeout=settings.store_timeout,
-            socket_connect_timeout=settings.store_timeout,
-            # A lost connection is tried again; a store that does not answer would hold the caller once a try.
-            retry=Retry(ExponentialBackoff(cap=0.2, base=0.02), 3, (redis.ConnectionError,)),
-            retry_on_error=[redis.ConnectionError],
-        )
+        self._url, self._wait = url, settings.store_timeout
         self._settings = settings
-        self._write = self.redis.register_script(WRITE)
+
+    @cached_property
+    def redis(self) -> Any:
+        """Opened when it is first asked: a cluster is asked at once for its nodes, and may be away."""
+        return connect(self._url, blocking=True, socket_timeout=self._wait)
+
+    @cached_property
+    def _write(self) -> Any:
+        return self.redis.register_script(WRITE)
 
     def worker_there(self, method: str) -> bool:
         return bool(self._try(lambda: self.redis.exists(_worker(method))))
@@ -66,20 +67,23 @@ class Jobs:
 
         def enqueue() -> None:
             self.redis.hset(_key(id), mapping=state)
-            queue = Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer)
-            queue.enqueue(
-                "specshield.service.training.worker.train",
-                id,
-                attempt,
-                job_timeout=(
-                    self._settings.training_timeout if learns(method) else self._settings.synthesis_timeout
-                ),
-                result_ttl=0,
-                failure_ttl=24 * 3600,
-            )
+            self._enqueue(id, attempt, method)
 
         self._try(enqueue)
         logs.tell("policy queued", policy_id=id, method=method)
+
+    def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
+        Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer).enqueue(
+            "specshield.service.training.worker.train",
+            id,
+            attempt,
+            job_timeout=(
+                self._settings.training_timeout if learns(method) else self._settings.synthesis_timeout
+            ),
+            result_ttl=0,
+            failure_ttl=24 * 3600,
+            at_front=at_front,
+        )
 
     def get(self, id: str) -> Training:
         """How the training of a policy stands. One that the store knows nothing of counts as failed."""
@@ -127,6 +131,11 @@ class Jobs:
     def ended(self, method: str, state: str) -> None:
         """Counts a run that came to its end, `ready` or `failed`."""
         self._try(lambda: self.redis.hincrby(ENDED, f"{method} {state}", 1))
+
+    def hand_back(self, id: str, attempt: str, method: str) -> None:
+        """Queue a run whose worker stops before all others, unless it was cancelled or asked for again."""
+        if self.report(id, attempt, status="queued", eta_s=""):
+            self._try(lambda: self._enqueue(id, attempt, method, at_front=True))
 
     # --- for the run itself
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-import redis
 from rq import Worker, get_current_job
 from rq.job import Job
 from rq.serializers import JSONSerializer
@@ -22,11 +21,14 @@ from specshield.errors import SpecshieldError, StoreError
 from specshield.policy.methods import METHODS, Run, available, missing
 from specshield.policy.options import read_options
 from specshield.service.settings import Settings
+from specshield.service.storage.connect import connect_to_jobs
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
+from specshield.service.storage.marker import check_files
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, learns, queue_of
 from specshield.service.watch import logs
 
+CONNECT = 5.0  # [s] for a connection to the store; its answers may take as long as there is no work
 NICE = 10  # below servers on the same machine, and below what decides their steps (heavy/heavy.py)
 log = logging.getLogger("specshield")
 
@@ -47,6 +49,8 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
     url = os.environ.get("REDIS_URL") or str(settings.redis_url)
     os.environ["REDIS_URL"] = url  # for the second process, too
     os.nice(NICE)
+    with suppress(StoreError):  # rq tells of a store that is away
+        check_files(url, settings.files_at, settings.store_timeout)
     jobs = Jobs(url, settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
@@ -95,7 +99,9 @@ class _Second:
 
 
 class _Worker(Worker):
-    """rq's worker, which on SIGTERM ends the run at once: what it has learned is in its checkpoint."""
+    """rq's worker, which on SIGTERM ends the run at once and hands it back: what it has learned is in its
+    checkpoint, with which the next worker goes on.
+    """
 
     def __init__(self, url: str, jobs: Jobs, methods: Sequence[str], others: Sequence[str]) -> None:
         self._training = [queue_of(method) for method in methods]
@@ -103,7 +109,7 @@ class _Worker(Worker):
             [*self._training, *others],
             # Not that of `jobs`: rq waits for work longer than any answer of the store may take, and sets the
             # time limit of these connections, before the first of them is made, to fit.
-            connection=redis.Redis.from_url(url, socket_timeout=None),
+            connection=connect_to_jobs(url, socket_timeout=None, socket_connect_timeout=CONNECT),
             serializer=JSONSerializer,
             work_horse_killed_handler=self._killed,
             worker_ttl=60,
@@ -118,11 +124,11 @@ class _Worker(Worker):
 
     def request_stop(self, signum: int, frame: Any) -> None:
         if self._running is not None:
-            self._fail(
-                self._running,
-                "its worker was stopped; ask for it again, and it goes on from its last checkpoint",
-            )
             self.kill_horse()
+            if self._running.origin in self._training:
+                method = self._running.origin.removeprefix(queue_of(""))
+                id, attempt = self._running.args
+                self._jobs.hand_back(id, attempt, method)
         raise SystemExit(0)
 
     def _killed(self, job: Job, pid: int, status: int, usage: Any) -> None:

@@ -1,0 +1,84 @@
+"""Moves what has ended, or been idle for long, from the store to the archive; erases there what has expired.
+
+Every server has a mover, and of all that share a store one moves at a time. Nothing rests on that: two that
+move the same session write the same file.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+import time
+from itertools import islice
+
+from specshield.errors import SpecshieldError
+from specshield.service.sessions.state import State
+from specshield.service.settings import Settings
+from specshield.service.storage.archive import Entry
+from specshield.service.storage.archiving import ArchivingStore
+
+BATCH = 1000  # ids, or files, that are looked at in one go
+AT_ONCE = 4  # sessions that move side by side; each waits for its file to be on the disk
+ENDED = 60  # [s] for which a session that has ended stays, so that its last answers can be asked for again
+EVERY = 10.0  # [s] between two looks at the store, at most
+SWEEP_EVERY = 3600  # [s] between two looks at all files, at most
+log = logging.getLogger("specshield")
+
+
+class Mover:
+    """Where the archive is full nothing moves, and `ArchivingStore.full` tells."""
+
+    def __init__(self, store: ArchivingStore, settings: Settings) -> None:
+        self._store, self._after, self._ttl = store, settings.archive_after, settings.session_ttl
+        self._room, self._ended = settings.archive_bytes, min(ENDED, settings.archive_after)
+        self._me = secrets.token_hex(8)
+
+    async def run(self) -> None:
+        """Until it is cancelled."""
+        every = min(EVERY, self._ended)
+        while True:
+            try:
+                mine = await self._store.my_turn(self._me, int(3 * every) + 1)
+                if mine and await self._store.first_within("sweep", min(SWEEP_EVERY, self._ttl)):
+                    await self._store.count_bytes(exactly=await self.sweep())
+                self._store.full = await self._store.count_bytes() >= self._room
+                if mine and not self._store.full:
+                    await self.move()
+            except SpecshieldError as error:
+                log.warning("nothing moves to the archive now: %s", error)
+            await asyncio.sleep(every)
+
+    async def move(self) -> int:
+        """Moves what is to be moved; how many sessions that were."""
+        moved, after = 0, None
+        while True:
+            idle, after = await self._store.idle(after, BATCH, self._ended)
+            due = [id for id, seconds, state in idle if seconds >= self._after or State.of(state).finished]
+            free = asyncio.Semaphore(AT_ONCE)
+            moved += sum(await asyncio.gather(*(self._move(id, free) for id in due)))
+            if after is None:
+                return moved
+
+    async def _move(self, id: str, free: asyncio.Semaphore) -> bool:
+        async with free:
+            dump = await self._store.dump(id)
+            if dump is None:
+                return False
+            return await self._store.put_away(id, State.of(dump.state).expires_at, dump)
+
+    async def sweep(self) -> int:
+        """Removes what has expired and what a newer file replaces; the bytes of what is left."""
+        files, kept, total = self._store.archive.sizes(), None, 0
+        while batch := await self._store.in_thread(lambda: list(islice(files, BATCH))):
+            for entry, size in batch:
+                if entry.expires <= time.time():
+                    await self._remove(entry)
+                    continue
+                if kept is not None and (kept.key, kept.beginning) == (entry.key, entry.beginning):
+                    await self._remove(kept)
+                kept, total = entry, total + size
+        return total
+
+    async def _remove(self, entry: Entry) -> None:
+        await self._store.in_thread(self._store.archive.remove, entry)

@@ -1,0 +1,223 @@
+"""The store and the archive as one: what the store has let go of is read from files, and goes on from there.
+
+Two copies of a session never go on side by side, whoever is killed when:
+
+- A session leaves the store when its file is on the disk, and only if its version is still the file's.
+- It comes back under a script that refuses where there is one already. For `FENCE` seconds the store also
+  remembers with which version a session left, or that it was erased, and refuses any other: a server that
+  read an older file, and was slow, comes too late.
+- Where both have it, the store's is the one that counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice
+from typing import ParamSpec, TypeVar
+
+import anyio
+
+from specshield.errors import SessionExists
+from specshield.service.storage.archive import Archive
+from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, keys
+
+P = ParamSpec("P")
+R = TypeVar("R")
+TURN = "specshield:archive:turn"  # the name of the server whose turn it is to move sessions
+SIZE = "specshield:archive:bytes"
+FENCE = 600  # [s]; longer than any server takes from reading a file to bringing it back. Chosen by hand.
+TRIES = 5  # of reading a file that a newer one replaces
+AT_ONCE = 8  # reads and writes of files of one server process; more would wait for the same disk
+
+# KEYS of all: session, rows, steps, fence.  ARGV: version, FENCE.  Returns 1 where the session has left the
+# store with this version, now or before; 0 where it goes on; -1 where it was erased.
+LEAVE = """\
+local version, fence = redis.call('HGET', KEYS[1], 'version'), redis.call('GET', KEYS[4])
+if version and version ~= ARGV[1] then return 0 end
+if not version then return (not fence or fence == ARGV[1]) and 1 or -1 end
+redis.call('SET', KEYS[4], ARGV[1], 'EX', ARGV[2])
+redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])
+return 1"""
+
+# ARGV: version, FENCE, time to live [ms], config, state, rows, steps...  Returns 1 where it is back.
+RETURN = """\
+local fence = redis.call('GET', KEYS[4])
+if redis.call('EXISTS', KEYS[1]) == 1 or (fence and fence ~= ARGV[1]) then return 0 end
+redis.call('UNLINK', KEYS[2], KEYS[3])
+redis.call('HSET', KEYS[1], 'version', ARGV[1], 'config', ARGV[4], 'state', ARGV[5])
+redis.call('SET', KEYS[2], ARGV[6])
+for i = 7, #ARGV do redis.call('RPUSH', KEYS[3], ARGV[i]) end
+for i = 1, 3 do redis.call('PEXPIRE', KEYS[i], ARGV[3]) end
+return 1"""
+
+# ARGV: '', FENCE.  Returns 1 where there was one.
+ERASE = """\
+redis.call('SET', KEYS[4], 'erased', 'EX', ARGV[2])
+return redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3]) > 0 and 1 or 0"""
+
+
+class ArchivingStore(Store):
+    """A `Store` whose sessions may lie in the archive. Its `page` and `count` are of those in the store."""
+
+    def __init__(self, url: str, timeout: float, ttl: int, archive: Archive) -> None:
+        super().__init__(url, timeout, ttl)
+        self.archive = archive
+        self._leave, self._return, self._erase = map(self.redis.register_script, (LEAVE, RETURN, ERASE))
+        self.full = False
+        self._files = anyio.CapacityLimiter(AT_ONCE)
+
+    async def create(self, id: str, config: bytes, change: Change) -> bytes:
+        if await self.in_thread(self.archive.find, id) is not None:
+            raise SessionExists(
+                f"there is a session {id!r} already", path="id", got=id, expected="an id not in use"
+            )
+        return await super().create(id, config, change)
+
+    async def load(self, id: str, t: int | None = None) -> Record | None:
+        """Two round trips and a file where the session is not in the store."""
+        found = await super().load(id, t)
+        if found is not None:
+            return found
+        dump = await self.in_thread(self._archived, id)
+        if dump is None:  # or it has just come back
+            return await super().load(id, t)
+        step = dump.steps[t] if t is not None and t < len(dump.steps) else None
+        return Record(dump.config, dump.state, dump.version, dump.rows, step or None)
+
+    async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
+        """Brings the session back first where it lies in the archive."""
+        found = await super().append(id, version, change)
+        if found is not None or not await self._bring_back(id):
+            return found
+        return await super().append(id, version, change)
+
+    async def dump(self, id: str) -> Dump | None:
+        found = await super().dump(id)
+        return found if found is not None else await self.in_thread(self._archived, id)
+
+    async def delete(self, id: str) -> bool:
+        async with self._reaching():
+            found = await self._erase(keys=_keys(id), args=["", FENCE])
+            await self.redis.zrem(INDEX, id)
+        return bool(await self.in_thread(self.archive.erase, id)) or bool(found)
+
+    async def everything(
+        self, owner: str, after: str | None, limit: int
+    ) -> tuple[list[tuple[bytes, bytes]], str | None]:
+        """As `page`, of store and archive. owner: what comes before the id in a key, as in `alice@`."""
+        entries = await self.in_thread(lambda: list(islice(self.archive.after(owner, after), limit)))
+        archived = {entry.key: entry for entry in entries}
+        async with self._reaching():
+            low = f"({owner}{after or ''}" if owner or after else "-"
+            high = f"({owner[:-1]}A" if owner else "+"  # A follows @
+            running = [id.decode() for id in await self.redis.zrangebylex(INDEX, low, high, 0, limit)]
+            ids = sorted({*running, *archived})[:limit]
+            fit, room = await self._that_fit([id.encode() for id in ids], PAGE_BYTES) if ids else ([], 0)
+            more, ids = len(ids) == limit or len(fit) < len(ids), ids[: len(fit)]
+            async with self.redis.pipeline(transaction=False) as pipe:
+                for id in ids:
+                    pipe.hmget(keys(id)[0], "config", "state")
+                live = await pipe.execute() if ids else []
+        found: list[tuple[bytes, bytes]] = []
+        for id, (config, state) in zip(ids, live, strict=True):
+            after = id.removeprefix(owner)
+            if config is not None:
+                found.append((config, state))
+                continue
+            entry = archived.get(id) or await self.in_thread(self.archive.find, id)  # it may just have left
+            head = None if entry is None else await self.in_thread(self.archive.head, entry)
+            if head is not None:
+                found.append(head)
+                room -= len(head[0])
+                if room <= 0:
+                    return found, after
+        return found, after if more else None
+
+    async def idle(
+        self, after: str | None, limit: int, least: float
+    ) -> tuple[list[tuple[str, float, bytes]], str | None]:
+        """Of `limit` sessions in the store, in order of id, those that have not changed for `least` seconds:
+        (id, seconds, state), and the id to go on after.
+        """
+        async with self._reaching():
+            low = "-" if after is None else f"({after}"
+            ids = [id.decode() for id in await self.redis.zrangebylex(INDEX, low, "+", 0, limit)]
+            async with self.redis.pipeline(transaction=False) as pipe:
+                for id in ids:
+                    pipe.pttl(keys(id)[0])  # every change sets it anew
+                left = await pipe.execute() if ids else []
+                waits = {id: self._ttl - ms / 1000 for id, ms in zip(ids, left, strict=True) if ms >= 0}
+                idle = [id for id, seconds in waits.items() if seconds >= least]
+                for id in idle:
+                    pipe.hget(keys(id)[0], "state")
+                states = await pipe.execute() if idle else []
+            expired = [id for id, ms in zip(ids, left, strict=True) if ms == -2]
+            if expired:
+                await self.redis.zrem(INDEX, *expired)
+        found = [(id, waits[id], state) for id, state in zip(idle, states, strict=True) if state is not None]
+        return found, ids[-1] if len(ids) == limit else None
+
+    async def my_turn(self, name: str, seconds: int) -> bool:
+        """Whether nobody but `name` moved sessions in so many seconds; it is then the turn of `name`."""
+        async with self._reaching():
+            if await self.redis.set(TURN, name, nx=True, ex=seconds):
+                return True
+            mine: bool = await self.redis.get(TURN) == name.encode()
+            return mine and bool(await self.redis.expire(TURN, seconds))
+
+    async def first_within(self, what: str, seconds: int) -> bool:
+        """Whether nobody has asked for this in so many seconds."""
+        async with self._reaching():
+            return bool(await self.redis.set(f"specshield:archive:{what}", 1, nx=True, ex=seconds))
+
+    async def count_bytes(self, more: int = 0, exactly: int | None = None) -> int:
+        """The bytes of the archive: as they were last counted, and what has moved there since."""
+        async with self._reaching():
+            if exactly is None:
+                return int(await self.redis.incrby(SIZE, more))
+            await self.redis.set(SIZE, exactly)
+            return exactly
+
+    async def put_away(self, id: str, expires: float, dump: Dump) -> bool:
+        """Moves a session to the archive. False where it goes on, or was erased meanwhile."""
+        entry, size = await self.in_thread(self.archive.put, id, expires, dump)
+        async with self._reaching():
+            left = await self._leave(keys=_keys(id), args=[dump.version, FENCE])
+            if left > 0:
+                await self.redis.zrem(INDEX, id)
+        await self.count_bytes(size)
+        if left > 0:
+            for other in await self.in_thread(self.archive.entries, id):
+                if other < entry:
+                    await self.in_thread(self.archive.remove, other)
+        else:
+            await self.in_thread(self.archive.remove, entry)
+        return bool(left > 0)
+
+    async def _bring_back(self, id: str) -> bool:
+        """Whether the session was brought back, by us or by another."""
+        dump = await self.in_thread(self._archived, id)
+        if dump is None:
+            return False
+        contents = [dump.config, dump.state, dump.rows, *dump.steps]
+        async with self._reaching():
+            await self._return(keys=_keys(id), args=[dump.version, FENCE, self._ttl * 1000, *contents])
+            await self.redis.zadd(INDEX, {id: 0})
+        return True
+
+    def _archived(self, id: str) -> Dump | None:
+        for _ in range(TRIES):
+            entry = self.archive.find(id)
+            if entry is None:
+                return None
+            dump = self.archive.read(entry)
+            if dump is not None:
+                return dump
+        return None
+
+    async def in_thread(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+        return await anyio.to_thread.run_sync(lambda: function(*args, **kwargs), limiter=self._files)
+
+
+def _keys(id: str) -> list[str]:
+    return [*keys(id), f"specshield:{{{id}}}:left"]

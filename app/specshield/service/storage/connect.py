@@ -1,0 +1,97 @@
+"""Connections to a store of the Redis protocol: one server, one behind sentinels, or a cluster.
+
+    redis://HOST:PORT/DB   rediss://...?ssl_ca_certs=FILE   unix:///PATH
+    redis+sentinel://HOST:PORT,HOST:PORT/SERVICE/DB     the sentinels, and what they call the server
+    redis+cluster://HOST:PORT,HOST:PORT                 some nodes of the cluster
+
+`rediss+sentinel` and `rediss+cluster` are the same over TLS. Before the hosts there may be USER:PASSWORD@,
+which is for the store; options after a ? are redis-py's, as in ?ssl_ca_certs=/etc/ca.pem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+import redis
+import redis.asyncio
+import redis.asyncio.cluster
+import redis.asyncio.retry
+import redis.asyncio.sentinel
+import redis.cluster
+import redis.retry
+import redis.sentinel
+from redis.backoff import ExponentialBackoff
+
+FORMS = (
+    "redis://127.0.0.1:6379/0, rediss://..., unix:///path, redis+sentinel://h1,h2/service, redis+cluster://h1"
+)
+CONNECTIONS = 64  # of one server process to a single server; those who want more wait
+TRIES = 3  # after the first; all within the caller's time limit. Chosen by hand.
+JOBS = "{specshield}:rq"  # what rq's keys begin with in a cluster, so that one server of it has them all
+PORTS = {"sentinel": 26379, "cluster": 6379}
+
+
+def connect(url: str, blocking: bool = False, **options: Any) -> Any:
+    """A client for this URL, an asyncio one unless blocking. Only a blocking one of a cluster opens at once.
+
+    options: redis-py's, for every connection. Raises ValueError for a URL of no form above.
+    """
+    kit: Any = redis if blocking else redis.asyncio
+    kind = urlsplit(url).scheme.partition("+")[2]
+    # A lost connection is tried again. A store that does not answer would hold a blocking caller once a try.
+    only: Any = {"supported_errors": (redis.ConnectionError,)} if blocking else {}
+    retry = kit.retry.Retry(ExponentialBackoff(cap=0.2, base=0.02), TRIES, **only)
+    options = {"retry": retry, "socket_connect_timeout": options.get("socket_timeout"), **options}
+    if not kind:
+        pool: Any = kit.BlockingConnectionPool if not blocking else kit.ConnectionPool
+        waits = {"max_connections": CONNECTIONS, "timeout": options.get("socket_timeout")}
+        return kit.Redis.from_pool(pool.from_url(url, **options, **({} if blocking else waits)))
+    hosts, names, found = _parse(url)
+    options = {**options, **found}
+    if kind == "cluster":
+        if names:
+            raise ValueError("a cluster has no databases and no services")
+        node = kit.cluster.ClusterNode
+        return kit.cluster.RedisCluster(startup_nodes=[node(*host) for host in hosts], **options)
+    if kind != "sentinel" or not 1 <= len(names) <= 2:
+        raise ValueError("no such form")
+    limits = {name: value for name, value in options.items() if name.startswith(("socket_", "ssl"))}
+    sentinels = kit.sentinel.Sentinel(hosts, sentinel_kwargs=limits)
+    return sentinels.master_for(names[0], db=int(names[1]) if names[1:] else 0, **options)
+
+
+def connect_to_jobs(url: str, **options: Any) -> Any:
+    """A blocking client for rq's worker, which knows no clusters: of the one server that has its keys."""
+    if not is_cluster(url):
+        return connect(url, blocking=True, **options)
+    cluster = connect(url, blocking=True, socket_timeout=options.get("socket_connect_timeout"))
+    node = cluster.get_node_from_key(JOBS)
+    cluster.close()
+    return redis.Redis(host=node.host, port=node.port, **{**options, **_parse(url)[2]})
+
+
+def is_cluster(url: str) -> bool:
+    return urlsplit(url).scheme.endswith("+cluster")
+
+
+def _parse(url: str) -> tuple[list[tuple[str, int]], list[str], Mapping[str, Any]]:
+    """The hosts, the names in the path, and what user, password, TLS and options say."""
+    parts = urlsplit(url)
+    scheme, _, kind = parts.scheme.partition("+")
+    if scheme not in ("redis", "rediss") or kind not in PORTS:
+        raise ValueError("no such form")
+    user, _, listed = parts.netloc.rpartition("@")
+    hosts = []
+    for host in listed.split(","):
+        one = urlsplit(f"//{host}")
+        if not one.hostname:
+            raise ValueError("a host without a name")
+        hosts.append((one.hostname, one.port or PORTS[kind]))
+    found: dict[str, Any] = dict(parse_qsl(parts.query))
+    name, _, password = user.partition(":")
+    found |= {"username": unquote(name)} if name else {}
+    found |= {"password": unquote(password)} if password else {}
+    found |= {"ssl": True} if scheme == "rediss" else {}
+    return hosts, [unquote(name) for name in parts.path.split("/") if name], found

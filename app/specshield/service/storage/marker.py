@@ -1,0 +1,54 @@
+"""Servers and workers of one store have to share their files too, or one cannot find what another made.
+
+So the files hold a name in `store-id`, and the store holds the same. Who finds them to differ does not start.
+Blocking.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+
+import redis
+
+from specshield.errors import InputError, StoreError
+from specshield.service.storage.connect import connect
+from specshield.service.storage.objects import open_objects
+
+FILE = "store-id"
+KEY = "specshield:store-id"
+WAIT = 5.0  # [s] for another server, which starts for the first time at this moment, to write the file
+
+
+def check_files(url: str, place: str, timeout: float) -> None:
+    """place: the folder or URL of maps and policies. timeout: of the store [s].
+
+    Raises InputError where other servers of this store have other files, and StoreError where either cannot
+    be reached.
+    """
+    files = open_objects(place)
+    mine = files.read(FILE)
+    made = secrets.token_hex(16).encode()
+    try:
+        store = connect(url, blocking=True, socket_timeout=timeout)
+        try:
+            first = store.set(KEY, mine or made, nx=True)
+            theirs = store.get(KEY)
+        finally:
+            store.close()
+    except (redis.RedisError, OSError) as error:
+        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+    if first and mine is None:
+        files.write(FILE, made)
+        return
+    deadline = time.monotonic() + WAIT
+    while mine is None and time.monotonic() < deadline:
+        time.sleep(0.1)
+        mine = files.read(FILE)
+    if mine != theirs:
+        raise InputError(
+            f"the servers of this store keep their maps and policies elsewhere than in {place}",
+            path="SPECSHIELD_DATA_URL",
+            expected="one folder or URL for all servers and workers that share REDIS_URL. If these files are "
+            f"the right ones, delete the key {KEY} from the store and start all of them again",
+        )

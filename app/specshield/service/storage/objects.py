@@ -1,0 +1,188 @@
+"""Files that several machines share, in a folder or behind an fsspec URL: whole or not there. Blocking."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from functools import wraps
+from pathlib import Path
+from stat import S_ISDIR
+from typing import Any, ParamSpec, Protocol, TypeVar
+
+from specshield.errors import InputError, StoreError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+DRAFT = ".draft-"  # what a file is called until it is whole; names that begin with a dot are not listed
+LEFT = 3600  # [s] after which a draft is one that nobody will finish
+TRIES = 10  # of making a folder that another process removes because it is empty
+
+
+class Objects(Protocol):
+    """Paths are relative, with `/`. Every method raises StoreError where the files cannot be reached."""
+
+    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
+        """The bytes from `start` to before `end`; None where there is no such file."""
+
+    def write(self, path: str, content: bytes) -> None:
+        """Puts the file there, in place of another. When this returns the file outlives a power cut."""
+
+    def remove(self, path: str) -> None:
+        """Removes the file, if it is there."""
+
+    def names(self, folder: str) -> list[str]:
+        """What lies directly in a folder, in order; empty where there is no such folder."""
+
+    def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
+        """Every file below a folder in order of path: (path, bytes)."""
+
+
+def open_objects(place: str) -> Objects:
+    """The files of a folder, or of an fsspec URL. Raises InputError where nothing here reads such a URL."""
+    if "://" not in place:
+        return Folder(Path(place))
+    try:
+        from fsspec.core import url_to_fs
+
+        files, root = url_to_fs(place, use_listings_cache=False, skip_instance_cache=True)
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"files at {place!r} cannot be used: {error}",
+            expected="a folder, or a URL such as s3://bucket/prefix with the package that reads it (s3fs)",
+        ) from None
+    return Folder(Path(root)) if type(files).__name__ == "LocalFileSystem" else Remote(files, root)
+
+
+def _reaching(method: Callable[P, R]) -> Callable[P, R]:
+    @wraps(method)
+    def reach(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return method(*args, **kwargs)
+        except OSError as error:
+            reason = error.strerror or type(error).__name__
+            raise StoreError(f"the files of the archive or library cannot be reached: {reason}") from error
+
+    return reach
+
+
+class Folder:
+    """A folder of this machine, or one that several machines mount."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @_reaching
+    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
+        try:
+            with open(self.root / path, "rb") as file:
+                file.seek(start)
+                return file.read(-1 if end is None else end - start)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+
+    @_reaching
+    def write(self, path: str, content: bytes) -> None:
+        target = self.root / path
+        draft = target.with_name(f"{DRAFT}{secrets.token_hex(8)}")
+        for left in reversed(range(TRIES)):
+            made = [folder for folder in target.parents if not folder.exists()]
+            try:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with open(draft, "wb") as file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                os.replace(draft, target)
+                for folder in (target.parent, *(folder.parent for folder in made)):
+                    _sync(folder)
+                return
+            except FileNotFoundError:
+                if not left:
+                    raise
+            finally:
+                draft.unlink(missing_ok=True)
+
+    @_reaching
+    def remove(self, path: str) -> None:
+        target = self.root / path
+        target.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # not empty, or gone already
+            for folder in target.parents:
+                if folder == self.root:
+                    break
+                folder.rmdir()
+
+    @_reaching
+    def names(self, folder: str) -> list[str]:
+        try:
+            return sorted(name for name in os.listdir(self.root / folder) if not name.startswith("."))
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+
+    @_reaching
+    def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
+        return self._sizes(folder)
+
+    def _sizes(self, folder: str) -> Iterator[tuple[str, int]]:
+        for found in sorted((self.root / folder).iterdir()) if (self.root / folder).is_dir() else ():
+            with contextlib.suppress(FileNotFoundError):  # it may go at any time
+                path, about = found.relative_to(self.root).as_posix(), found.stat()
+                if found.name.startswith(DRAFT) and about.st_mtime < time.time() - LEFT:
+                    found.unlink()  # by a process that was killed
+                elif S_ISDIR(about.st_mode):
+                    yield from self._sizes(path)
+                elif not found.name.startswith("."):
+                    yield path, about.st_size
+
+
+class Remote:
+    """What an fsspec file system keeps. One write of such a store is whole or not there."""
+
+    def __init__(self, files: Any, root: str) -> None:
+        self._files, self._root = files, root.rstrip("/")
+
+    @_reaching
+    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
+        try:
+            return bytes(self._files.cat_file(self._at(path), start=start or None, end=end))
+        except FileNotFoundError:
+            return None
+
+    @_reaching
+    def write(self, path: str, content: bytes) -> None:
+        place = self._at(path)
+        self._files.makedirs(place.rpartition("/")[0], exist_ok=True)
+        self._files.pipe_file(place, content)
+
+    @_reaching
+    def remove(self, path: str) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            self._files.rm_file(self._at(path))
+
+    @_reaching
+    def names(self, folder: str) -> list[str]:
+        try:
+            found = self._files.ls(self._at(folder), detail=False)
+        except FileNotFoundError:
+            return []
+        return sorted({name.rstrip("/").rpartition("/")[2] for name in found} - {""})
+
+    @_reaching
+    def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
+        below = self._files.find(self._at(folder), detail=True)
+        skipped = len(self._at("")) + 1
+        return iter(sorted((name[skipped:], int(about["size"])) for name, about in below.items()))
+
+    def _at(self, path: str) -> str:
+        return f"{self._root}/{path}".rstrip("/")
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

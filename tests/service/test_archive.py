@@ -1,0 +1,330 @@
+"""What has left the store for the archive: nothing is lost, doubled or brought back from the dead."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import httpx
+import pytest
+import redis
+
+from specshield.errors import SessionExists, StoreError
+from specshield.service.storage.archive import Archive, Entry
+from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.objects import open_objects
+from specshield.service.storage.store import Change, Dump
+from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
+from tests.serving import serving, wait_for
+
+TTL = 3600
+ROW = bytes(range(24))
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory):
+    embedded = EmbeddedStore(tmp_path_factory.mktemp("data"))
+    embedded.join()
+    yield embedded.url
+    embedded.leave()
+
+
+@pytest.fixture(params=["folder", "fsspec"])
+def archive(request, tmp_path):
+    place = str(tmp_path / "archive") if request.param == "folder" else f"memory://{tmp_path.name}"
+    return Archive(open_objects(place))
+
+
+def run(url: str, archive: Archive, story: Callable[[ArchivingStore], Awaitable[None]]) -> None:
+    async def play() -> None:
+        store = ArchivingStore(url, 10.0, TTL, archive)
+        try:
+            await story(store)
+        finally:
+            await store.redis.flushall()
+            await store.aclose()
+
+    asyncio.run(play())
+
+
+def change(t: int) -> Change:
+    return Change(f"state after {t}".encode(), ROW, 24 * t, t, f"step {t}".encode() * 20)
+
+
+async def begin(store: ArchivingStore, id: str, steps: int) -> bytes:
+    version = await store.create(id, f"config of {id}".encode(), Change(b"state", ROW))
+    for t in range(steps):
+        version = await store.append(id, version, change(t))
+    return version
+
+
+async def move(store: ArchivingStore, id: str) -> Dump:
+    dump = await store.dump(id)
+    assert dump is not None
+    assert await store.put_away(id, time.time() + TTL, dump)
+    return dump
+
+
+async def in_store(store: ArchivingStore, id: str) -> bool:
+    return bool(await store.redis.exists(f"specshield:v2:{{{id}}}:session"))
+
+
+def test_a_session_that_has_left_is_read_byte_for_byte_and_goes_on(url, archive):
+    async def story(store):
+        await begin(store, "robot", 5)
+        before = await store.dump("robot")
+        await move(store, "robot")
+        assert not await in_store(store, "robot")
+        assert await store.dump("robot") == before
+        assert [(await store.load("robot", t)).step for t in range(5)] == before.steps
+        assert (await store.load("robot", 5)).step is None
+        with pytest.raises(SessionExists):
+            await store.create("robot", b"another", Change(b"state", ROW))
+
+        assert not await in_store(store, "robot")  # reading brings nothing back
+        version = await store.append("robot", before.version, change(5))
+        assert isinstance(version, bytes)
+        assert (await store.append("robot", before.version, change(5))).version == version  # lost the race
+        dump = await store.dump("robot")
+        assert dump.steps == [*before.steps, change(5).step]
+        assert dump.rows == before.rows + ROW
+        await move(store, "robot")
+        assert await store.dump("robot") == dump
+        assert len(archive.entries("robot")) == 1  # the older file has gone
+        assert await store.delete("robot")
+        assert await store.load("robot") is None
+        assert not await store.delete("robot")
+        assert archive.entries("robot") == []
+
+    run(url, archive, story)
+
+
+def test_two_servers_that_bring_a_session_back_decide_one_step(url, archive):
+    async def story(store):
+        version = await begin(store, "robot", 3)
+        await move(store, "robot")
+        other = ArchivingStore(url, 10.0, TTL, archive)
+        got = await asyncio.gather(*(s.append("robot", version, change(3)) for s in [store, other] * 8))
+        await other.aclose()
+        assert sum(isinstance(one, bytes) for one in got) == 1
+        assert len((await store.dump("robot")).steps) == 4
+
+    run(url, archive, story)
+
+
+class Held(Archive):
+    """An archive whose next read, or write, waits until it is let go."""
+
+    def __init__(self, archive: Archive) -> None:
+        super().__init__(archive._objects)
+        self.reached, self.go = threading.Event(), threading.Event()
+
+    def read(self, entry: Entry) -> Dump | None:
+        found = super().read(entry)
+        self.reached.set()
+        self.go.wait()
+        return found
+
+    def put(self, key: str, expires: float, dump: Dump) -> tuple[Entry, int]:
+        self.reached.set()
+        self.go.wait()
+        return super().put(key, expires, dump)
+
+
+def test_a_server_that_is_slow_to_bring_a_session_back_comes_too_late(url, archive):
+    """Or the robot would go on from a state that others have left behind, or from one that was erased."""
+
+    async def story(store):
+        for erased in (False, True):
+            version = await begin(store, "robot", 3)
+            await move(store, "robot")
+            slow = ArchivingStore(url, 10.0, TTL, Held(archive))
+            late = asyncio.create_task(slow.append("robot", version, change(3)))
+            await asyncio.to_thread(slow.archive.reached.wait)
+            assert isinstance(await store.append("robot", version, change(3)), bytes)
+            moved = await move(store, "robot")
+            if erased:
+                await store.delete("robot")
+            slow.archive.go.set()
+            assert await late is None
+            assert await store.dump("robot") == (None if erased else moved)
+            await slow.aclose()
+            await store.delete("robot")
+
+    run(url, archive, story)
+
+
+def test_a_server_that_is_slow_to_move_a_session_harms_nothing_that_came_after(url, archive):
+    async def story(store):
+        for after in ("goes on", "moves", "is erased"):
+            version = await begin(store, "robot", 3)
+            slow = ArchivingStore(url, 10.0, TTL, Held(archive))
+            dump = await store.dump("robot")
+            late = asyncio.create_task(slow.put_away("robot", time.time() + TTL, dump))
+            await asyncio.to_thread(slow.archive.reached.wait)
+            await store.append("robot", version, change(3))
+            kept = await store.dump("robot")
+            if after == "moves":
+                await move(store, "robot")
+            if after == "is erased":
+                await store.delete("robot")
+            slow.archive.go.set()
+            assert not await late
+            assert await store.dump("robot") == (None if after == "is erased" else kept)
+            assert len(archive.entries("robot")) == (after == "moves")
+            await slow.aclose()
+            await store.delete("robot")
+
+    run(url, archive, story)
+
+
+def test_a_listing_holds_store_and_archive_in_order_and_each_session_once(url, archive):
+    async def story(store):
+        ids = ["a", "abc", "abcdefgh", "abcdefghi", "abcdefghij", "b", "robot-1", "robot-10", "robot-2", "z"]
+        sample = random.Random(1).sample(ids, len(ids))
+        for owner in ("", "ann@", "ann.b@"):
+            for i, id in enumerate(sample):
+                version = await begin(store, owner + id, 1)
+                if i % 3:
+                    await move(store, owner + id)
+                if i % 3 == 2:  # is back, and its file is still there
+                    assert await store.append(owner + id, version, change(1))
+        for limit in (1, 3, 100):
+            for owner in ("ann@", "ann.b@"):
+                listed, after = [], None
+                while True:
+                    page, after = await store.everything(owner, after, limit)
+                    listed += [config.removeprefix(b"config of ").decode() for config, _ in page]
+                    if after is None:
+                        break
+                assert listed == [owner + id for id in ids]
+        assert {e.key for e, _ in archive.sizes()} == {
+            owner + id for owner in ("", "ann@", "ann.b@") for i, id in enumerate(sample) if i % 3
+        }
+
+    run(url, archive, story)
+
+
+def test_what_has_expired_is_not_read_and_its_file_is_removed(url, archive):
+    async def story(store):
+        await begin(store, "old", 1)
+        dump = await store.dump("old")
+        assert await store.put_away("old", time.time() - 2, dump)
+        assert await store.load("old") is None
+        assert await store.everything("", None, 10) == ([], None)
+        await begin(store, "old", 0)  # its id is free again
+
+    run(url, archive, story)
+
+
+def test_a_damaged_file_is_said_to_be_one(url, tmp_path):
+    archive = Archive(open_objects(str(tmp_path)))
+
+    async def story(store):
+        await begin(store, "robot", 3)
+        await move(store, "robot")
+        file = next(path for path in tmp_path.rglob("*") if path.is_file())
+        whole = file.read_bytes()
+        for broken in (b"", whole[:-9], whole[:40] + b"?" + whole[41:], whole[:-5] + b"????" + whole[-1:]):
+            file.write_bytes(broken)
+            with pytest.raises(StoreError, match="archive"):
+                await store.dump("robot")
+        file.write_bytes(whole)
+        (file.parent / "notes.txt").write_text("not ours")
+        assert len((await store.dump("robot")).steps) == 3
+
+    run(url, archive, story)
+
+
+MOVER = """
+import asyncio, sys, time
+from specshield.service.storage.archive import Archive
+from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.objects import open_objects
+async def main():
+    store = ArchivingStore(sys.argv[1], 10.0, 3600, Archive(open_objects(sys.argv[2])))
+    print("moving", flush=True)
+    while True:
+        for id in "abc":
+            dump = await store.dump(id)
+            if dump is not None:
+                await store.put_away(id, time.time() + 3600, dump)
+asyncio.run(main())
+"""
+
+
+def test_no_step_is_lost_or_doubled_however_often_a_mover_is_killed(url, tmp_path):
+    place = str(tmp_path / "archive")
+
+    async def story(store):
+        versions = {id: await begin(store, id, 0) for id in "abc"}
+        answered = dict.fromkeys("abc", 0)
+        for kill in range(6):
+            command = [sys.executable, "-c", MOVER, url, place]
+            mover = subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ)
+            await asyncio.to_thread(mover.stdout.readline)
+            for _ in range(10 + kill):
+                for id in "abc":
+                    got = await store.append(id, versions[id], change(answered[id]))
+                    assert isinstance(got, bytes), (id, got)
+                    versions[id], answered[id] = got, answered[id] + 1
+            mover.kill()
+            mover.wait()
+            for id in "abc":
+                dump = await store.dump(id)
+                assert dump.steps == [change(t).step for t in range(answered[id])]
+                assert dump.version == versions[id]
+
+    run(url, Archive(open_objects(place)), story)
+    assert list(Path(place).rglob("*"))
+
+
+def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
+    with (
+        serving(tmp_path, SPECSHIELD_ARCHIVE_AFTER="1") as server,
+        httpx.Client(base_url=server.url, timeout=None) as client,
+    ):
+        client.post("/v1/maps", json=grid_json())
+        begun = {"policy_id": send_policy(client)["id"], "initial_pose": START, "id": "robot"}
+        assert client.post("/v1/sessions", json=begun).status_code == 201
+
+        def step(t: int) -> httpx.Response:
+            body = {"t": t, "poses": ahead(t)[-1:], "logits": LOGITS}
+            return client.post("/v1/sessions/robot/steps", json=body)
+
+        def archived() -> bool:
+            keys = redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket")).keys("*{*robot}:session")
+            return not keys and any(path.is_file() for path in (tmp_path / "archive").rglob("*"))
+
+        answers = [step(t).content for t in range(3)]
+        session = client.get("/v1/sessions/robot").json()
+        trajectory = client.get("/v1/sessions/robot/trajectory").content
+        wait_for(archived, 60.0)
+        assert client.get("/v1/sessions/robot").json() == session
+        assert client.get("/v1/sessions/robot/trajectory").content == trajectory
+        assert [item["id"] for item in client.get("/v1/sessions").json()["items"]] == ["robot"]
+        assert [step(t).content for t in range(3)] == answers
+        assert client.post("/v1/sessions", json=begun).status_code == 409
+        assert step(5).json()["type"] == "history-gap"
+        assert archived()  # none of this brought it back
+
+        assert step(3).status_code == 200
+        assert client.get("/v1/sessions/robot").json()["next_t"] == 4
+        wait_for(archived, 60.0)
+        last = {"t": 4, "poses": ahead(4)[-1:]}
+        closed = client.post("/v1/sessions/robot/close", json=last)
+        assert closed.status_code == 200
+        wait_for(archived, 60.0)
+        assert client.post("/v1/sessions/robot/close", json=last).json() == closed.json()
+        assert client.delete("/v1/sessions/robot").status_code == 204
+        assert client.get("/v1/sessions/robot").status_code == 404
+        assert client.get("/v1/sessions").json()["items"] == []
+        assert not any(path.is_file() for path in (tmp_path / "archive").rglob("*"))

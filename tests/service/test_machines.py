@@ -1,0 +1,89 @@
+"""Servers that come and go behind a balancer, and the stores that several of them share."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import httpx
+import pytest
+
+from specshield.errors import InputError
+from specshield.service.library import files
+from specshield.service.settings import Settings
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.marker import check_files
+from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
+from tests.serving import serving, wait_for
+
+
+@pytest.mark.parametrize("options", [(), ("--workers", "2")], ids=["one process", "two processes"])
+def test_a_server_that_is_told_to_stop_says_so_first_and_finishes_what_it_was_asked(tmp_path, options):
+    with (
+        serving(tmp_path, *options, SPECSHIELD_DRAIN="3") as server,
+        httpx.Client(base_url=server.url) as client,
+    ):
+        assert client.post("/v1/maps", json=grid_json()).status_code == 201
+        policy = send_policy(client)
+        session = client.post("/v1/sessions", json={"policy_id": policy["id"], "initial_pose": START}).json()
+        os.kill(server.process.pid, signal.SIGTERM)
+        told = time.monotonic()
+
+        def stopping() -> bool:
+            ready = client.get("/readyz")
+            return ready.status_code == 503 and ready.json()["type"] == "stopping"
+
+        wait_for(stopping, 3.0)
+        body = {"t": 0, "poses": ahead(0)[-1:], "logits": LOGITS}
+        assert client.post(f"/v1/sessions/{session['id']}/steps", json=body).status_code == 200
+        assert server.process.wait(30.0) == 0
+        assert time.monotonic() - told >= 3.0
+
+
+def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path):
+    embedded = EmbeddedStore(tmp_path)
+    embedded.join()
+    shared, other = str(tmp_path / "shared"), str(tmp_path / "other")
+    with ThreadPoolExecutor(8) as servers:  # that all start for the first time
+        list(servers.map(lambda _: check_files(embedded.url, shared, 10.0), range(8)))
+    check_files(embedded.url, shared, 10.0)
+    with pytest.raises(InputError, match="SPECSHIELD_DATA_URL"):
+        check_files(embedded.url, other, 10.0)
+    for command in ("serve", "worker"):
+        done = subprocess.run(
+            [sys.executable, "-m", "specshield.cli", command],
+            env={**os.environ, "REDIS_URL": embedded.url, "SPECSHIELD_DATA_DIR": other},
+            capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 1
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert "elsewhere than in" in done.stderr
+    embedded.leave()
+
+
+def test_what_one_server_keeps_behind_a_url_another_finds_and_loads_from_its_own_copy(tmp_path):
+    def settings(name: str) -> Settings:
+        nothing = tmp_path / "nothing"
+        return Settings(
+            data_dir=tmp_path / name,
+            data_url=f"memory://{tmp_path.name}",
+            maps_dir=nothing,
+            models_dir=nothing,
+        )
+
+    one, other = settings("one"), settings("other")
+    here, there = (files.kept(each, "policies") / ("a" * 64) for each in (one, other))
+    assert not files.there(there)
+    files.write_folder(here, {"policy.json": b"{}"})
+    assert files.there(there)
+    assert not (there / "card.json").exists()
+    files.write_file(here / "policy.safetensors", b"weights")
+    files.write_file(here / "card.json", b"{}")
+    assert files.there(there)
+    assert (there / "policy.safetensors").read_bytes() == b"weights"
+    files.remove_folder(there)
+    assert not files.there(here)
