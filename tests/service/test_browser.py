@@ -10,7 +10,7 @@ import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
-ATTACKS = """<!doctype html><body><iframe name="sink"></iframe><pre id="told">pending</pre><script>
+ATTACKS = """<!doctype html><body><iframe name="sink"></iframe><img src="/wait"><script>
 const target = "%(target)s", told = {};
 const grid = JSON.stringify(%(grid)s);
 async function attack(name, path, options) {
@@ -48,19 +48,34 @@ function socket() {
   await attack("files", "/v1/maps", {method: "POST", body: files(), mode: "no-cors"});
   await attack("delete", "/v1/sessions/robot", {method: "DELETE"});
   await socket();
-  document.getElementById("told").textContent = JSON.stringify(told);
+  await fetch("/told", {method: "POST", body: JSON.stringify(told)});
 })();
 </script></body>"""
 
 
 @pytest.fixture
 def page(client):
-    """page(target): the address of a page on another port that attacks the target."""
+    """page(target): the port of a page that attacks the target, and what it tells of that afterwards.
+
+    The browser waits until a page is loaded. This one is once it has told.
+    """
     from tests.service.test_bad_input import YAML
     from tests.service.world import grid_json
 
     class Handler(BaseHTTPRequestHandler):
+        def do_POST(self):
+            content = self.rfile.read(int(self.headers["Content-Length"]))
+            self.server.told.update(json.loads(content))
+            self.server.done.set()
+            self.send_response(204)
+            self.end_headers()
+
         def do_GET(self):
+            if self.path == "/wait":
+                self.server.done.wait(300.0)
+                self.send_response(204)
+                self.end_headers()
+                return
             grid = json.dumps({**grid_json(), "info": {**grid_json()["info"], "resolution": 0.77}})
             content = ATTACKS % {
                 "target": self.server.target,
@@ -79,8 +94,8 @@ def page(client):
         threading.Thread(target=server.serve_forever, daemon=True).start()
 
         def serve(target):
-            server.target = target
-            return server.server_address[1]
+            server.target, server.told, server.done = target, {}, threading.Event()
+            return server.server_address[1], server.told
 
         yield serve
         server.shutdown()
@@ -100,13 +115,13 @@ def kept(client, begin):
     assert client.delete("/v1/sessions/robot").status_code == 204
 
 
-def see(url, folder):
-    """The page as the browser has it once its scripts are done."""
+def see(url, folder, *options):
+    """The page as the browser has it once it is loaded."""
     done = subprocess.run(
         [
             CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
             f"--user-data-dir={folder}", "--host-resolver-rules=MAP evil.example 127.0.0.1",
-            "--virtual-time-budget=20000", "--dump-dom", url,
+            *options, "--dump-dom", url,
         ],
         capture_output=True,
         text=True,
@@ -118,9 +133,8 @@ def see(url, folder):
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "evil.example"])
 def test_a_page_of_another_origin_makes_reads_and_deletes_nothing(client, kept, page, tmp_path, host):
     """As evil.example, which is made to point here, the page asks under its own name: DNS rebinding."""
-    port = page(f"http://{host}:{client.base_url.port}")
-    content = see(f"http://{host}:{port}/", tmp_path)
-    told = json.loads(content.partition('<pre id="told">')[2].partition("</pre>")[0])
+    port, told = page(f"http://{host}:{client.base_url.port}")
+    see(f"http://{host}:{port}/", tmp_path)
     assert len(told) == 8, told
     assert set(told.values()) <= {"failed", "opaque"}, told
 
@@ -132,4 +146,5 @@ def test_a_name_that_is_made_to_point_here_is_misdirected(client, tmp_path):
 
 
 def test_the_servers_own_pages_work(client, tmp_path):
-    assert "Send a map" in see(f"http://127.0.0.1:{client.base_url.port}/docs", tmp_path)
+    url = f"http://127.0.0.1:{client.base_url.port}/docs"
+    assert "Send a map" in see(url, tmp_path, "--virtual-time-budget=20000")
