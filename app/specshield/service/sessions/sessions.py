@@ -191,10 +191,10 @@ class Sessions:
         return found
 
     async def using(self, owner: str, policy_id: str) -> str | None:
-        """An owner's session that may still ask this policy, if there is one."""
+        """An owner's session that may still ask this policy, if there is one: archived ones may go on, too."""
         after = None
         while True:
-            found, after = await self._store.page(owner, after, 1000)
+            found, after = await self._store.everything(f"{owner}@", after, 1000)
             for config, state in found:
                 fixed = json.loads(config)
                 if policy_id in fixed["policy_ids"] and not State.of(state).finished:
