@@ -104,9 +104,11 @@ def _has_body(headers: Headers) -> bool:
 
 def _check_type(path: str, declared: str) -> None:
     kind = declared.partition(";")[0].strip().lower()
-    taken = ["application/json", "application/msgpack"]
+    taken = ["application/json"]
     if path.rstrip("/") in UPLOADS:
-        taken[1] = "multipart/form-data"
+        taken.append("multipart/form-data")
+    elif path.endswith("/steps"):
+        taken.append("application/msgpack")
     if kind not in taken and not JSON.fullmatch(kind):
         raise UnsupportedMediaType(
             "the body is not declared as a type that is taken here",

@@ -191,7 +191,7 @@ class Sessions:
         return found
 
     async def using(self, owner: str, policy_id: str) -> str | None:
-        """An owner's session that may still ask this policy, if there is one: archived ones may go on, too."""
+        """An owner's session that may still ask this policy, if there is one, archived ones too."""
         after = None
         while True:
             found, after = await self._store.everything(f"{owner}@", after, 1000)
