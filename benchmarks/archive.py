@@ -49,15 +49,16 @@ def episodes(count: int, seed: int) -> list[Dump]:
     for state in along(case, shield, count, seed):
         if state.t <= len(steps) - 1:  # the next episode
             steps = []
-        decision = episode.decide(shield, state.history, state.logits, carry=state.carry)
+        done = state.logits is None
+        decision = episode.decide(shield, state.history, state.logits, done, carry=state.carry)
         row, last = state.history[-1], steps[-1] if steps else b""
         made = record.make(
-            decision, row, record.digest(last), row.tolist(), state.logits, False, {}, [], False
+            decision, row, record.digest(last), row.tolist(), state.logits, done, {}, [], False
         )
         steps += [b""] * (state.t - len(steps)) + [record.encode(made)]
         ended = State(
             len(state.history), state.t + 1, True, decision.spec_status, time.time() + TTL,
-            record.digest(steps[-1]), finished=True, carry=pack_carry(decision.carry),
+            record.digest(steps[-1]), main_task_done=done, finished=True, carry=pack_carry(decision.carry),
         )  # fmt: skip
         config = json.dumps({"spec": case.spec, "actions": list(case.task.robot.action_names)}).encode()
         dump = Dump(config, ended.packed(), b"", state.history.astype("<f8").tobytes(), list(steps))
