@@ -124,7 +124,7 @@ def test_a_step_takes_at_most_700_bytes_of_the_store_and_hangs_on_the_one_before
         episode = with_shield(session, case, load_learned(case.instruction), start, 1)
         steps = len(episode.round_trip_ms)
         with redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket")) as store:
-            keys = [f"specshield:v2:{{{id}}}:{part}" for part in ("session", "rows", "steps")]
+            keys = [f"specshield:v2:{{@{id}}}:{part}" for part in ("session", "rows", "steps")]
             used = [store.memory_usage(key, samples=0) for key in keys]
             config, rows = store.hget(keys[0], "config"), store.get(keys[1])
             records = store.lrange(keys[2], 0, -1)

@@ -286,7 +286,7 @@ def test_a_server_that_fails_says_no_more_than_that(tmp_path):
     with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
         session = begin(client)
         with redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket")) as connection:
-            connection.hset(f"specshield:v2:{{{session['id']}}}:session", "state", "broken")
+            connection.hset(f"specshield:v2:{{@{session['id']}}}:session", "state", "broken")
         response = client.get(f"/v1/sessions/{session['id']}")
         assert (response.status_code, response.json()["type"]) == (500, "internal-error")
         assert response.headers["content-type"] == "application/problem+json"

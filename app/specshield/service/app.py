@@ -28,6 +28,8 @@ from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe, guarded
 from specshield.service.routes import events, maps, policies, sessions, specs, system
+from specshield.service.routes.steps import StepRoute
+from specshield.service.routes.stream import StreamRoute
 from specshield.service.schemas.base import Problem
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.sessions import Sessions
@@ -83,7 +85,9 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
     for module in (specs, maps, policies, sessions, events, system):
         app.include_router(module.router)
     problems.install(app)
-    app.add_middleware(Bodies, settings=settings)  # the innermost: nothing is read for who may not ask
+    app.add_middleware(StepRoute)  # the innermost
+    app.add_middleware(StreamRoute, max_message=settings.max_body_bytes)
+    app.add_middleware(Bodies, settings=settings)  # nothing is read for who may not ask
     app.add_middleware(Guard, allowed_hosts=settings.hosts)
     app.add_middleware(Observe)  # the outermost
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
@@ -129,6 +133,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     )
     body.clear(settings.data_dir / "incoming")
     app.state.server = server
+    server.streams.close_at_stop()  # which comes when what follows has drained
     drain_at_sigterm(startup, settings.drain)
     running = (
         tend(embedded, worker), prepare(startup, check), mover.run(), watchers.run(), keys.follow(),

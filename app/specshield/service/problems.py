@@ -120,6 +120,12 @@ class ProblemResponse(Response):
         await super().__call__(scope, receive, send)
 
 
+def tell(scope: Scope, error: SpecshieldError) -> None:
+    """A line of the log for what is this server's fault, or its store's."""
+    if status_of(error) >= 500 and not isinstance(error, errors.Starting | errors.Stopping):
+        log.warning("%s %s: %s", scope.get("method", "WEBSOCKET"), scope["path"], error.message)
+
+
 def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = "") -> InputError:
     """One error for everything a schema refused: the first in its own words, all of them in `errors`.
 
@@ -205,8 +211,7 @@ def install(app: FastAPI) -> None:
 
     async def known(request: Request, error: Exception) -> Response:
         assert isinstance(error, SpecshieldError)
-        if status_of(error) >= 500 and not isinstance(error, errors.Starting | errors.Stopping):
-            log.warning("%s %s: %s", request.method, request.url.path, error.message)
+        tell(request.scope, error)
         return response(error)
 
     async def invalid(request: Request, error: Exception) -> Response:

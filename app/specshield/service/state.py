@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
@@ -16,6 +16,7 @@ from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
 from specshield.service.startup import Startup
 from specshield.service.storage.store import Store
+from specshield.service.streams import Streams
 from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
@@ -39,6 +40,7 @@ class Server:
     heavy: Heavy
     keys: Keys
     claims: Claims
+    streams: Streams = field(default_factory=Streams)
 
 
 def _server(request: Request) -> Server:

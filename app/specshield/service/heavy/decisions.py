@@ -8,7 +8,7 @@ from typing import Any
 from specshield.arrays import Floats
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.schemas.sessions import SessionRequest
-from specshield.service.schemas.steps import StepRequest
+from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import sessions, steps
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session
@@ -23,7 +23,7 @@ def _shields(settings: Settings) -> Shields:
 
 
 def step(
-    settings: Settings, session: Session, request: StepRequest
+    settings: Settings, session: Session, request: StepBody
 ) -> tuple[Session, Decision, StepRecord, float]:
     """The session with its new row, the decision, its record, and the seconds that it took."""
     made = steps.timed(_shields(settings), session, request)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Response
 from fastapi.responses import StreamingResponse
 
 from specshield.service import examples
 from specshield.service.access.owners import Caller, Owner, scoped
-from specshield.service.schemas.answers import to_json
+from specshield.service.routes.messages import MSGPACK
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse
 from specshield.service.schemas.steps import (
@@ -97,6 +97,7 @@ async def delete(key: SessionKey, server: ServerState) -> Response:
     responses={
         200: {
             "model": StepResponse,
+            "content": {MSGPACK: {"schema": {"$ref": "#/components/schemas/StepResponse"}}},
             "description": "The decision. `Server-Timing` has total, rollout and store in ms.",
         },
         **problems(
@@ -104,17 +105,22 @@ async def delete(key: SessionKey, server: ServerState) -> Response:
             _409="`history-gap` (with `expected_t`), `history-conflict`, `step-conflict`, `session-finished`",
         ),
     },
+    openapi_extra={
+        "requestBody": {"content": {MSGPACK: {"schema": {"$ref": "#/components/schemas/StepRequest"}}}}
+    },
 )
-async def step(key: SessionKey, body: StepRequest, request: Request, server: ServerState) -> Response:
+async def step(key: SessionKey, body: StepRequest) -> Response:
     """Send where the robot is and what its model proposes; get the closest distribution that keeps the rule.
 
     `poses` ends with x_t and holds any newest part of the history that joins what the server has. A step that
     was decided, sent again with equal x_t, logits, signals and main_task_done, returns the stored answer byte
     for byte, so a lost answer can be asked for again. Nothing is stored on an error.
+
+    Body and answer may be MessagePack too, by `Content-Type` and `Accept: application/msgpack`. The WebSocket
+    `/v1/sessions/{session_id}/stream` takes the same bodies as messages and answers them in order: text
+    frames are JSON, binary frames MessagePack; a problem document is told by its `type` and `status`.
     """
-    timing = request.scope["state"]["timing"]
-    answer = await server.sessions.steps.decide(key, body, timing)
-    return Response(to_json(answer), media_type="application/json")
+    raise AssertionError("routes/steps.py answers this route")
 
 
 @router.post(

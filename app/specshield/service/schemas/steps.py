@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
+import msgspec
 from pydantic import ConfigDict, Field, model_validator
 
 from specshield.service import examples
@@ -38,6 +39,24 @@ class StepRequest(Strict):
         description="Samples at t of the signals that the spec declares; one left out holds its last value.",
     )
     witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
+
+
+LARGEST = 1.7976931348623157e308  # what is beyond, or not a number, is refused
+Finite = Annotated[float, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
+SentPose = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-1e8, le=1e8)]], msgspec.Meta(min_length=3, max_length=3)
+]
+
+
+class StepBody(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """A `StepRequest` as it is read: a fifth of the time. What this does not take, `StepRequest` says why."""
+
+    t: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)]
+    poses: Annotated[list[SentPose], msgspec.Meta(min_length=1, max_length=10_001)]
+    logits: Annotated[list[Finite | None], msgspec.Meta(max_length=256)] | None = None
+    main_task_done: bool = False
+    signals: Annotated[dict[str, Finite], msgspec.Meta(max_length=64)] | None = None
+    witnesses: bool = False
 
 
 class Residual(Answer):

@@ -15,7 +15,7 @@ from specshield.errors import Conflict, InputError, NotFound, SessionFinished, S
 from specshield.service.access.owners import shown
 from specshield.service.library import files
 from specshield.service.schemas.answers import StepAnswer, to_json
-from specshield.service.schemas.steps import StepRequest
+from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import history, record
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
@@ -83,7 +83,7 @@ def describe(config: Mapping[str, Any], state: State) -> dict[str, Any]:
     }
 
 
-def check_step(session: Session, request: StepRequest) -> None:
+def check_step(session: Session, request: StepBody) -> None:
     """Raises what is wrong with asking for a step that was not decided before."""
     state, t, last = session.state, request.t, session.config["max_steps"]
     if state.finished:
@@ -109,7 +109,7 @@ def check_step(session: Session, request: StepRequest) -> None:
         )
 
 
-def replay(session: Session, step: bytes, request: StepRequest) -> StepAnswer:
+def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:
     """The stored answer. Raises StepConflict where it answered another request."""
     kept, row = record.decode(step), session.rows[request.t]
     same = (
@@ -130,7 +130,7 @@ def replay(session: Session, step: bytes, request: StepRequest) -> StepAnswer:
     return record.answer(kept, row, session.config["actions"])
 
 
-def logits_of(request: StepRequest) -> Floats | None:
+def logits_of(request: StepBody) -> Floats | None:
     """[A], -inf for null."""
     if request.logits is None:
         return None

@@ -130,6 +130,7 @@ class Sessions:
         return shown, following
 
     async def delete(self, id: str) -> None:
+        self.steps.forget(id)
         if not await self._store.delete(id):
             raise missing(id)
 

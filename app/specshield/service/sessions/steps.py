@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 
+from specshield.errors import SpecshieldError
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.library import files
 from specshield.service.schemas.answers import StepAnswer
-from specshield.service.schemas.steps import StepRequest
+from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import record
+from specshield.service.sessions.recent import RecentSessions
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import (
     RACES,
@@ -27,16 +33,50 @@ from specshield.service.sessions.session import (
     replay,
 )
 from specshield.service.sessions.shields import Shields
-from specshield.service.sessions.state import pack_carry
+from specshield.service.sessions.state import State, pack_carry
 from specshield.service.storage.store import Change, Store
 from specshield.shield import episode
 from specshield.shield.decision import Decision
 
+ROOM = 64 << 20  # bytes of sessions kept in memory, some 5,000 of them. Chosen by hand.
 LONG = 0.03  # [s] of a processor for one decision, from which on a session's are made in other processes
+SHORT = 0.001  # [s] of CPU: so long may a decision hold the event loop; see `Pace`
+WATCHED = 64  # decisions that `Pace` looks at
+
+
+@dataclass(frozen=True)
+class Decided:
+    """A step decided on `session`, before it is written."""
+
+    session: Session
+    decision: Decision
+    record: StepRecord
+
+
+class Pace:
+    """How long the last decisions with some policies took: those that are short are made on the event loop.
+
+    Handing one to a thread and back costs more CPU than a short decision takes. A decision that is longer
+    would hold up all others, so with policies whose decisions are sometimes long, all go to a thread.
+    """
+
+    def __init__(self) -> None:
+        self._last = deque[float]([math.inf], WATCHED)
+        self._longest = math.inf
+
+    @property
+    def short(self) -> bool:
+        return self._longest <= SHORT
+
+    def add(self, seconds: float) -> None:
+        fallen_out = self._last[0] if len(self._last) == WATCHED else 0.0
+        self._last.append(seconds)
+        self._longest = max(self._longest, seconds) if fallen_out < self._longest else max(self._last)
 
 
 class Steps:
-    """Decisions run in threads (the rollouts release the interpreter), long ones in other processes.
+    """Short decisions are made on the event loop, others in threads (the rollouts release the interpreter),
+    and long ones in other processes.
 
     ttl: how long a session is kept after its last change [s].
     """
@@ -46,61 +86,89 @@ class Steps:
     ) -> None:
         self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
         self._heavy = heavy
+        self._recent, self._paces = RecentSessions(ROOM), files.Recent[Pace](1000)
 
-    async def decide(self, id: str, request: StepRequest, timing: dict[str, float]) -> StepAnswer:
+    async def decide(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
         """The answer. `timing` collects the seconds of rollout and store."""
+        session, step = self._recent.get(id), None
+        if session is not None and request.t < session.state.next_t:
+            session = None  # a replay, or an error: both are the store's to tell
+        current = False  # whether the session is what the store has just shown
         for _ in range(RACES):
-            with _clock(timing, "store"):
-                found = await self._store.load(id, request.t)
-            if found is None:
-                raise missing(id)
-            session = Session.of(found)
-            if found.step is not None:
+            if session is None:
+                with _clock(timing, "store"):
+                    found = await self._store.load(id, request.t)
+                if found is None:
+                    raise missing(id)
+                session, step, current = Session.of(found), found.step, True
+            if step is not None:
                 metrics.replayed()
-                return replay(session, found.step, request)
-            check_step(session, request)
-            session, decision, made = await self._decided(session, request, timing)
-            content = record.encode(made)
-            state = msgspec.structs.replace(
-                session.state,
-                length=len(session.rows),
-                next_t=len(session.rows),
-                spec_status=decision.spec_status,
-                expires_at=time.time() + self._ttl,
-                head=record.digest(content),
-                main_task_done=request.main_task_done,
-                finished=decision.finished,
-                carry=pack_carry(decision.carry),
-            )
-            change = Change(state.packed(), *session.added(), request.t, content)
+                return replay(session, step, request)
+            try:
+                check_step(session, request)
+                decided = await self._decide(session, request, timing)
+            except SpecshieldError:
+                if current:
+                    raise
+                session = None
+                continue
+            change, state = self._change(decided, request)
             with _clock(timing, "store"):
-                kept = isinstance(await self._store.append(id, session.version, change), bytes)
-            if kept:
-                metrics.decided(decision, len(session.rows) - 1 - session.state.length, timing)
-                return record.answer(made, session.rows[-1], session.config["actions"])
+                written = await self._store.append(id, session.version, change)
+            if isinstance(written, bytes):
+                told_later = len(decided.session.rows) - 1 - session.state.length
+                session = replace(decided.session, state=state, version=written)
+                self._recent.put(id, session)
+                metrics.decided(decided.decision, told_later, timing)
+                return record.answer(decided.record, session.rows[-1], session.config["actions"])
+            self._recent.drop(id)
+            if written is None:
+                raise missing(id)
+            session, step, current = Session.of(written), written.step, True
         raise contended(id)
 
-    async def _decided(
-        self, session: Session, request: StepRequest, timing: dict[str, float]
-    ) -> tuple[Session, Decision, StepRecord]:
-        """In a thread, or in another process where such decisions take long."""
-        key = tuple(session.config["policy_ids"])
-        if self._shields.slow(session):
-            *made, seconds = await self._heavy.decide("step", session, request, session=session.id, key=key)
-            timing["rollout"] = timing.get("rollout", 0.0) + seconds
-            return made[0], made[1], made[2]
-        loop = asyncio.get_running_loop()
-        session, decision, record, seconds, cpu = await loop.run_in_executor(
-            self._threads, timed, self._shields, session, request
+    def forget(self, id: str) -> None:
+        """Frees what a session that is gone takes of memory."""
+        self._recent.drop(id)
+
+    def _change(self, decided: Decided, request: StepBody) -> tuple[Change, State]:
+        session, decision, content = decided.session, decided.decision, record.encode(decided.record)
+        state = msgspec.structs.replace(
+            session.state,
+            length=len(session.rows),
+            next_t=len(session.rows),
+            spec_status=decision.spec_status,
+            expires_at=time.time() + self._ttl,
+            head=record.digest(content),
+            main_task_done=request.main_task_done,
+            finished=decision.finished,
+            carry=pack_carry(decision.carry),
         )
+        return Change(state.packed(), *session.added(), request.t, content), state
+
+    async def _decide(self, session: Session, request: StepBody, timing: dict[str, float]) -> Decided:
+        ids = tuple(session.config["policy_ids"])
+        if self._shields.slow(session):
+            made = await self._heavy.decide("step", session, request, session=session.id, key=ids)
+            timing["rollout"] = timing.get("rollout", 0.0) + made[-1]
+            return Decided(*made[:3])
+        pace = self._paces.get((session.config["shaping"], *ids), Pace)
+        if pace.short:
+            *made, seconds, cpu = timed(self._shields, session, request)
+        else:
+            loop = asyncio.get_running_loop()
+            *made, seconds, cpu = await loop.run_in_executor(
+                self._threads, timed, self._shields, session, request
+            )
         timing["rollout"] = timing.get("rollout", 0.0) + seconds
+        pace.add(cpu)
         if cpu > LONG:
             self._shields.note_slow(session)
-        return session, decision, record
+        return Decided(*made)
 
 
 def timed(
-    shields: Shields, session: Session, request: StepRequest
+    shields: Shields, session: Session, request: StepBody
 ) -> tuple[Session, Decision, StepRecord, float, float]:
     """As `decided`, with the seconds that it took, and those of them that this thread computed."""
     begun, computed = time.perf_counter(), time.thread_time()
@@ -108,7 +176,7 @@ def timed(
     return *made, time.perf_counter() - begun, time.thread_time() - computed
 
 
-def decided(shields: Shields, session: Session, request: StepRequest) -> tuple[Session, Decision, StepRecord]:
+def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Session, Decision, StepRecord]:
     shield, signals = shields.of(session), request.signals or {}
     shield.task.check_signals(signals)
     state, logits = session.state, logits_of(request)

@@ -19,12 +19,14 @@ import redis.asyncio as redis
 
 from specshield.errors import SessionExists, StoreError
 from specshield.service.access.owners import between, shown
-from specshield.service.storage.connect import connect
+from specshield.service.storage.connect import connect, is_cluster
+from specshield.service.storage.wire import Script, Wire
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
 AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
 INDEX = "specshield:sessions"
-APPEND = Path(__file__).with_name("append.lua").read_text()
+NO_VERSION = b"-"  # that no session ever has
+APPEND = Script(Path(__file__).with_name("append.lua").read_text())
 DROP = """\
 if redis.call('HGET', KEYS[1], 'version') ~= ARGV[1] then return 0 end
 return redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])"""
@@ -76,13 +78,15 @@ class Store:
     """Every method raises StoreError where the store cannot be reached in time."""
 
     def __init__(self, url: str, timeout: float, ttl: int) -> None:
-        # What is lost on the way is sent again. Twice, an append changes nothing: the second finds the
-        # version gone on.
         self.redis: Any = connect(url, socket_timeout=timeout)
-        self._append, self._drop = self.redis.register_script(APPEND), self.redis.register_script(DROP)
+        self._drop, self._append = self.redis.register_script(DROP), self.redis.register_script(APPEND.text)
+        # A cluster has no one connection: redis-py finds the server that has a session's keys.
+        self._wire = None if is_cluster(url) else Wire(self.redis.connection_pool, timeout)
         self._timeout, self._ttl = timeout, ttl
 
     async def aclose(self) -> None:
+        if self._wire is not None:
+            self._wire.close()
         await self.redis.aclose()
 
     @asynccontextmanager
@@ -92,7 +96,7 @@ class Store:
             with anyio.fail_after(self._timeout):
                 yield
         except (redis.RedisError, OSError) as error:
-            raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+            raise _away(error) from error
 
     async def ping(self) -> None:
         """Whether it takes a write: one whose disk is full still answers reads."""
@@ -103,51 +107,44 @@ class Store:
         """The first version. Raises SessionExists. `config` has to be unlike any other, so that a retry knows
         its own.
         """
+        begun = await self._write(id, b"", change, config)
+        if isinstance(begun, Record) and begun.config == config:  # a try whose answer was lost
+            begun = begun.version
+        if not isinstance(begun, bytes):
+            told = f"there is a session {shown(id)!r} already"
+            raise SessionExists(told, path="id", got=shown(id), expected="an id not in use")
         async with self._reaching():
-            begun = await self._write(id, b"", change, config)
-            if isinstance(begun, Record) and begun.config == config:  # a try whose answer was lost
-                begun = begun.version
-            if isinstance(begun, bytes):
-                await self.redis.zadd(INDEX, {id: 0})
-                return begun
-        raise SessionExists(
-            f"there is a session {shown(id)!r} already", path="id", got=shown(id), expected="an id not in use"
-        )
+            await self.redis.zadd(INDEX, {id: 0})
+        return begun
 
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
         """All of the change, and the new version; or nothing where `version` is no longer the latest: then
-        the session as it is, with what step `change.t` left, or None where it is gone.
+        the session as it is, with what step `change.t` left, or None where it is gone. One round trip.
         """
-        async with self._reaching():
-            return await self._write(id, version, change, b"")
-
-    async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bytes | Record | None:
-        field = "" if change.t is None else change.t
-        args: list[Any] = [
-            version,
-            change.offset,
-            change.rows,
-            field,
-            change.step,
-            change.state,
-            config,
-            self._ttl * 1000,
-        ]
-        written = await self._append(keys=keys(id), args=args)
-        return written if isinstance(written, bytes) else _record(*written)
+        return await self._write(id, version, change, b"")
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """The session, with what step t left; None where there is none. One round trip."""
-        session, rows, steps = keys(id)
-        async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
-            # In this order a write in between is harmless: rows past what the state counts are not looked at,
-            # and a step that is there is the answer, whatever the state says.
-            pipe.hmget(session, "config", "state", "version")
-            pipe.get(rows)
-            if t is not None:
-                pipe.lindex(steps, t)
-            (config, state, version), found, *step = await pipe.execute()
-        return _record(config, state, version, found, step[0] if step else None)
+        found = await self._write(id, NO_VERSION, Change(b"", t=t), b"")
+        assert not isinstance(found, bytes)
+        return found
+
+    async def _write(self, id: str, version: bytes, change: Change, config: bytes) -> bytes | Record | None:
+        """What is lost on the way is sent again. Twice, an append changes nothing: the second finds the
+        version gone on.
+        """
+        field = "" if change.t is None else change.t
+        args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state, config]
+        args.append(self._ttl * 1000)
+        if self._wire is None:
+            async with self._reaching():
+                written = await self._append(keys=keys(id), args=args)
+        else:
+            try:
+                written = await self._wire.run(APPEND, keys(id), args)
+            except (redis.RedisError, OSError) as error:
+                raise _away(error) from error
+        return written if isinstance(written, bytes) else _record(*written)
 
     async def dump(self, id: str) -> Dump | None:
         """All of a session as it is at one moment; None where there is none."""
@@ -272,3 +269,7 @@ def _record(
     config: bytes | None, state: bytes, version: bytes, rows: bytes | None, step: bytes | None
 ) -> Record | None:
     return None if config is None or rows is None else Record(config, state, version, rows, step or None)
+
+
+def _away(error: Exception) -> StoreError:
+    return StoreError(f"the store cannot be reached: {type(error).__name__}")

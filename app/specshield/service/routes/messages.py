@@ -1,0 +1,61 @@
+"""What a step is asked with and answered, in JSON or MessagePack, over HTTP and over a stream."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import msgspec
+from pydantic import ValidationError
+
+from specshield.errors import InputError, SpecshieldError
+from specshield.service import problems
+from specshield.service.schemas.answers import StepAnswer, to_json, to_msgpack
+from specshield.service.schemas.steps import StepBody, StepRequest
+
+MSGPACK = "application/msgpack"
+MOST_FIELDS = 64  # of what is no step: each unknown field costs an error to be made
+
+_json, _msgpack = msgspec.json.Decoder(StepBody), msgspec.msgpack.Decoder(StepBody)
+_any, _pack = msgspec.msgpack.Decoder(), msgspec.msgpack.Encoder()
+
+
+def read_step(body: bytes | str, packed: bool) -> StepBody:
+    """Raises InputError, or the branch of it that the field at fault has. packed: MessagePack, not JSON."""
+    try:
+        return _msgpack.decode(body) if packed and isinstance(body, bytes) else _json.decode(body)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+        return _explained(_parsed(body, packed))
+
+
+def write_answer(answer: StepAnswer, packed: bool) -> bytes:
+    return to_msgpack(answer) if packed else to_json(answer)
+
+
+def write_problem(error: SpecshieldError, packed: bool) -> bytes:
+    document = problems.document(error)
+    return _pack.encode(document) if packed else json.dumps(document).encode()
+
+
+def _parsed(body: bytes | str, packed: bool) -> Any:
+    name = "MessagePack" if packed else "JSON"
+    try:
+        return _any.decode(body) if packed and isinstance(body, bytes) else json.loads(body)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        reason = error.msg if isinstance(error, json.JSONDecodeError) else type(error).__name__
+        raise InputError(
+            f"the body is not {name}: {reason}", expected="a JSON object" if not packed else "a map"
+        ) from None
+
+
+def _explained(value: Any) -> StepBody:
+    """Why `StepBody` did not take it: pydantic names every field that is wrong."""
+    if isinstance(value, dict) and len(value) > MOST_FIELDS:
+        raise InputError(
+            "the body has far more fields than a step", got=len(value), expected="the fields that /docs lists"
+        )
+    try:
+        return StepBody(**StepRequest.model_validate(value).model_dump())
+    except ValidationError as invalid:
+        found = [{**item, "loc": ("body", *item["loc"])} for item in invalid.errors(include_url=False)]
+        raise problems.from_validation(found, value) from None

@@ -1,0 +1,71 @@
+"""POST /v1/sessions/{id}/steps, as plain ASGI: FastAPI's way to a route and back costs more than a decision.
+
+`routes/sessions.py` describes the route. The middlewares stand around this one as around all others.
+"""
+
+from __future__ import annotations
+
+import re
+
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from specshield.errors import SpecshieldError
+from specshield.service import problems
+from specshield.service.access.owners import scoped
+from specshield.service.routes.messages import MSGPACK, read_step, write_answer
+from specshield.service.state import Server
+
+PATH = re.compile(r"/v1/sessions/([A-Za-z0-9][A-Za-z0-9_.-]{0,63})/steps")
+
+
+class _Route:
+    """What the metrics call it."""
+
+    path = "/v1/sessions/{session_id}/steps"
+
+
+class StepRoute:
+    """Answers the steps; the rest goes on to `app`."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        found = (
+            PATH.fullmatch(scope["path"]) if scope["type"] == "http" and scope["method"] == "POST" else None
+        )
+        if found is None:
+            await self.app(scope, receive, send)
+            return
+        scope["route"], scope["path_params"] = _Route, {"session_id": found[1]}
+        headers = dict(scope["headers"])
+        body = await _body(receive)
+        if body is None:  # the caller has gone
+            return
+        try:
+            packed = headers.get(b"content-type", b"").startswith(MSGPACK.encode())
+            request = read_step(body, packed)
+            server: Server = scope["app"].state.server
+            state = scope["state"]
+            key = scoped(state["owner"], found[1])
+            answer = await server.sessions.steps.decide(key, request, state["timing"])
+        except SpecshieldError as error:
+            problems.tell(scope, error)
+            await problems.response(error)(scope, receive, send)
+            return
+        packed = MSGPACK.encode() in headers.get(b"accept", b"")
+        content = write_answer(answer, packed)
+        await Response(content, media_type=MSGPACK if packed else "application/json")(scope, receive, send)
+
+
+async def _body(receive: Receive) -> bytes | None:
+    """All of the body; None where it does not come to its end."""
+    parts = []
+    while True:
+        message = await receive()
+        if message["type"] != "http.request":
+            return None
+        parts.append(message.get("body", b""))
+        if not message.get("more_body", False):
+            return b"".join(parts)

@@ -1,0 +1,115 @@
+"""The WebSocket /v1/sessions/{id}/stream: steps as messages, answered in order.
+
+A text frame is a step in JSON, a binary frame one in MessagePack. The answer comes in the same form, and so
+does a problem document, which is told by its `type` and `status`. A session has one step at a time, so a
+caller's further messages wait in the connection, which holds a few and then takes no more from that caller.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import secrets
+import time
+from typing import Any
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from specshield.errors import BodyTooLarge, ServerError, SpecshieldError
+from specshield.service import metrics, problems
+from specshield.service.access.owners import scoped
+from specshield.service.routes.messages import read_step, write_answer, write_problem
+from specshield.service.state import Server
+from specshield.service.watch import logs
+
+PATH = re.compile(r"/v1/sessions/([A-Za-z0-9][A-Za-z0-9_.-]{0,63})/stream")
+ROUTE = "/v1/sessions/{session_id}/stream"
+GOING_AWAY = 1001  # RFC 6455: the server goes down
+log = logging.getLogger("specshield")
+
+
+class StreamRoute:
+    """Answers the streams; the rest goes on to `app`."""
+
+    def __init__(self, app: ASGIApp, max_message: int) -> None:
+        self.app, self._max_message = app, max_message
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        found = PATH.fullmatch(scope["path"]) if scope["type"] == "websocket" else None
+        if found is None:
+            await self.app(scope, receive, send)
+            return
+        scope.setdefault("state", {})["request_id"] = secrets.token_hex(8)
+        scope["path_params"] = {"session_id": found[1]}
+        logs.request.set(scope)
+        server: Server = scope["app"].state.server
+        await receive()  # the handshake
+        key = scoped(scope["state"]["owner"], found[1])
+        try:
+            await server.sessions.read(key)
+        except SpecshieldError as error:
+            problems.tell(scope, error)
+            await problems.response(error)(scope, receive, send)
+            return
+        stream = _Stream(server, key, scope, send, self._max_message)
+        server.streams.open.add(stream)
+        try:
+            await send({"type": "websocket.accept"})
+            await stream.serve(receive)
+        finally:
+            server.streams.open.discard(stream)
+
+
+class _Stream:
+    def __init__(self, server: Server, key: str, scope: Scope, send: Send, max_message: int) -> None:
+        self._server, self._key, self._scope, self._send = server, key, scope, send
+        self._authorization = dict(scope["headers"]).get(b"authorization", b"")
+        self._max_message = max_message
+        self._busy = self._stopping = False
+        self._closing: asyncio.Task[None] | None = None
+
+    async def serve(self, receive: Receive) -> None:
+        """Until the caller leaves, or `stop`."""
+        while (message := await receive())["type"] == "websocket.receive":
+            self._busy = True
+            text, content = message.get("text"), message.get("bytes") or b""
+            packed = text is None
+            began = time.perf_counter()
+            status, answer = await self._answer(content if text is None else text, packed)
+            metrics.answered("STEP", ROUTE, status, time.perf_counter() - began)
+            said: dict[str, Any] = {"bytes": answer} if packed else {"text": answer.decode()}
+            await self._send({"type": "websocket.send", **said})
+            self._busy = False
+            if self._stopping:
+                await self._close()
+                return
+
+    def stop(self) -> None:
+        """After the step that is being decided, if one is."""
+        self._stopping = True
+        if not self._busy:
+            self._closing = asyncio.get_running_loop().create_task(self._close())
+
+    async def _close(self) -> None:
+        await self._send({"type": "websocket.close", "code": GOING_AWAY, "reason": "the server stops"})
+
+    async def _answer(self, content: bytes | str, packed: bool) -> tuple[int, bytes]:
+        """The status that it has over HTTP, and the message."""
+        error: SpecshieldError
+        try:
+            if len(content) > self._max_message:
+                raise BodyTooLarge("the message is too large", expected=f"at most {self._max_message} bytes")
+            api_key = await self._server.keys.check(self._authorization)  # it may have been revoked
+            self._scope["state"]["rates"].take(api_key, True)
+            request = read_step(content, packed)
+            answer = await self._server.sessions.steps.decide(self._key, request, {})
+            return 200, write_answer(answer, packed)
+        except SpecshieldError as known:
+            error = known
+            problems.tell(self._scope, error)
+        except Exception:
+            log.exception("a step of a stream failed")
+            error = ServerError("the server failed on this step; its log says more")
+        metrics.refused(error.type)
+        return problems.status_of(error), write_problem(error, packed)

@@ -1,0 +1,186 @@
+"""Steps in MessagePack and over a WebSocket, asked of a real server by a real client."""
+
+import asyncio
+import json
+import signal
+
+import httpx
+import msgpack
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from websockets.asyncio.client import connect as aconnect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from specshield.errors import InputError
+from specshield.service.routes.messages import read_step
+from specshield.service.schemas.steps import StepRequest
+from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
+from tests.serving import serving
+
+PACKED = {"Content-Type": "application/msgpack", "Accept": "application/msgpack"}
+
+
+def body(t, /, **fields):
+    return {"t": t, "poses": ahead(t)[-1:], "logits": LOGITS, **fields}
+
+
+def stream_of(server, session):
+    return f"ws{server.url.removeprefix('http')}/v1/sessions/{session['id']}/stream"
+
+
+def test_a_step_in_messagepack_has_the_same_values(client, begin, step):
+    session = begin()
+    path = f"/v1/sessions/{session['id']}/steps"
+    answer = client.post(path, content=msgpack.packb(body(0)), headers=PACKED)
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "application/msgpack")
+    assert set(answer.headers) >= {"server-timing", "x-request-id"}
+    again = step(session, 0, [START])
+    assert again.headers["content-type"] == "application/json"
+    assert list(msgpack.unpackb(answer.content).items()) == list(again.json().items())
+    assert client.post(path, content=msgpack.packb(body(0)), headers=PACKED).content == answer.content
+
+
+@pytest.mark.parametrize(
+    ("content", "type", "path"),
+    [
+        (msgpack.packb(body(0, logits=[float("nan"), 0.0, 0.0, 0.0, 0.0])), "invalid-logits", "logits[0]"),
+        (msgpack.packb(body(0, logits=[float("inf"), 0.0, 0.0, 0.0, 0.0])), "invalid-logits", "logits[0]"),
+        (msgpack.packb(body(0, speed=1)), "invalid-input", "speed"),
+        (msgpack.packb(body(0, t=0.0)), "invalid-input", "t"),
+        (msgpack.packb([1, 2]), "invalid-input", ...),
+        (msgpack.packb({f"f{i}": i for i in range(60_000)}), "invalid-input", ...),
+        (b"\xc1", "invalid-input", ...),
+        (b"", "invalid-input", ...),
+    ],
+)
+def test_messagepack_that_is_no_step(client, begin, content, type, path):
+    session = begin()
+    found = client.post(f"/v1/sessions/{session['id']}/steps", content=content, headers=PACKED)
+    assert (found.status_code, found.json()["type"]) == (422, type), found.text
+    assert found.headers["content-type"] == "application/problem+json"
+    assert path is ... or found.json()["path"] == path
+    assert len(found.content) < 20_000
+
+
+def test_a_stream_answers_in_order_in_the_form_it_was_asked(server, client, begin, step):
+    session, twin = begin(seed=1), begin(seed=1)
+    with connect(stream_of(server, session)) as stream:
+        for t in range(4):  # all sent before any answer is read
+            stream.send(json.dumps(body(t)) if t % 2 else msgpack.packb(body(t)))
+        for t in range(4):
+            message = stream.recv()
+            answer = json.loads(message) if t % 2 else msgpack.unpackb(message)
+            assert answer == step(twin, t, ahead(t)[-1:]).json()
+        stream.send(msgpack.packb(body(9)))
+        gap = msgpack.unpackb(stream.recv())
+        assert (gap["status"], gap["type"], gap["expected_t"]) == (409, "history-gap", 4)
+        stream.send("{")
+        assert json.loads(stream.recv())["type"] == "invalid-input"
+        stream.send(json.dumps(body(4)))  # goes on after errors
+        assert json.loads(stream.recv())["t"] == 4
+        client.delete(f"/v1/sessions/{session['id']}")
+        stream.send(json.dumps(body(5)))
+        assert json.loads(stream.recv())["status"] == 404
+
+
+def test_a_handshake_is_refused_over_http(server):
+    for url, status in (
+        (stream_of(server, {"id": "nothing"}), 404),
+        (stream_of(server, {"id": "no:id"}), 403),
+    ):
+        with pytest.raises(InvalidStatus) as refused:
+            connect(url)
+        assert refused.value.response.status_code == status
+
+
+def test_a_message_over_the_limit_ends_the_stream_and_no_other(server, begin):
+    session, other = begin(), begin()
+    with connect(stream_of(server, session)) as large, connect(stream_of(server, other)) as stream:
+        large.send(b" " * (2 << 20))
+        with pytest.raises(ConnectionClosed) as closed:
+            large.recv()
+        assert closed.value.rcvd.code == 1009
+        stream.send(json.dumps(body(0)))
+        assert json.loads(stream.recv())["t"] == 0
+
+
+def test_a_caller_who_does_not_read_holds_up_nobody(server, begin):
+    session, other = begin(), begin()
+
+    async def scene():
+        async with (
+            aconnect(stream_of(server, session), max_queue=1) as deaf,
+            aconnect(stream_of(server, other)) as stream,
+        ):
+            deaf.transport.pause_reading()
+
+            async def flood():
+                while True:
+                    await deaf.send(json.dumps(body(0, witnesses=True)))
+
+            flooding = asyncio.create_task(flood())
+            for t in range(30):
+                await stream.send(json.dumps(body(t)))
+                assert json.loads(await stream.recv())["t"] == t
+            flooding.cancel()
+            deaf.transport.abort()
+
+    asyncio.run(scene())
+
+
+def test_a_server_that_stops_says_so_to_its_streams(tmp_path):
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+        client.post("/v1/maps", json=grid_json())
+        asked = {"policy_id": send_policy(client)["id"], "initial_pose": START}
+        session = client.post("/v1/sessions", json=asked).json()
+        with connect(stream_of(server, session)) as stream:
+            stream.send(json.dumps(body(0)))
+            assert json.loads(stream.recv())["t"] == 0
+            server.process.send_signal(signal.SIGTERM)
+            with pytest.raises(ConnectionClosed) as closed:
+                stream.recv()
+            assert closed.value.rcvd.code == 1001
+
+
+SCALARS = (
+    st.none() | st.booleans() | st.integers(-5, 10) | st.floats() | st.sampled_from([1e8, 1.1e8, "1", 2**70])
+)
+VALUES = (
+    st.lists(SCALARS, max_size=4) | st.lists(st.lists(SCALARS, min_size=2, max_size=4), max_size=3) | SCALARS
+)
+FIELDS = ("t", "poses", "logits", "main_task_done", "signals", "witnesses", "speed")
+VALID = {"t": 1, "poses": [[1, 1.5, 0.0]], "logits": [0.5, None, 2], "signals": {"battery": 5}}
+
+
+@settings(deadline=None, max_examples=500)
+@given(
+    st.dictionaries(
+        st.sampled_from(FIELDS), VALUES | st.dictionaries(st.sampled_from("ab"), SCALARS), max_size=2
+    )
+)
+def test_what_is_read_fast_is_what_the_schema_takes(fields):
+    sent = {**VALID, **fields}
+    try:
+        expected = StepRequest.model_validate(sent).model_dump()
+    except ValidationError:
+        expected = None
+    packed = msgpack_of(sent)
+    for content in (json.dumps(sent).encode(), packed):
+        if content is None:
+            continue
+        try:
+            found = read_step(content, content is packed)
+        except InputError:
+            assert expected is None
+        else:
+            assert {name: getattr(found, name) for name in expected} == expected
+
+
+def msgpack_of(value):
+    try:
+        return msgpack.packb(value)
+    except OverflowError:
+        return None
