@@ -11,14 +11,13 @@ The robot starts in the lower left corner looking east; A is the cell ahead of i
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
 import pytest
 
 from specshield.errors import InputError, LogitsError, PolicyError, PoseError, SampleError
-from specshield.shield.episode import Carry, Config, close, decide, make_shield, start
+from specshield.shield.episode import Config, close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
 from specshield.stl import robustness
 from tests.oracles.cells import END, FORWARD, LEFT, MOTIONS, RIGHT, WAIT, Cells, Exhaustive, Scripted, waits
@@ -388,7 +387,7 @@ def test_the_tail_of_the_witness_certifies_where_the_policy_does_not():
     assert first.j_values[:4] == (1.0, 0.0, 0.0, 1.0)
     nonsense = shield_of(policy=Scripted(REACH, lambda t, m: [LEFT] * 9, LEFT))
     history = [START, first.next_poses[WAIT]]
-    carry = Carry.from_json(json.loads(json.dumps(first.carry.to_json())))
+    carry = first.carry
     kept = decide(nonsense, history, EVEN, carry=carry)
     # `forward` certifies itself: A is reached by it. The tail of wait's witness is the same.
     assert (kept.mode, kept.completion_action) == ("shaped", FORWARD)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from specshield.errors import InfeasibleStart
-from specshield.shield.episode import Carry, decide, make_shield, start
+from specshield.shield.episode import decide, make_shield, start
 from specshield.stl import robustness
 from tests.oracles.cells import END, MOTIONS, ROBOT, Cells, Exhaustive, Scripted, waits
 
@@ -87,7 +87,7 @@ def episode(cells, shield, pose, random, forget=False):
         if decision.finished:
             break
         history.append(decision.next_poses[action])
-        carry = None if forget else Carry.from_json(decision.carry.to_json())
+        carry = None if forget else decision.carry
     while len(history) <= cells.task.horizon:
         history.append(history[-1])
     return history, decisions

@@ -1,6 +1,5 @@
 """Look-ahead shaping in a session's decisions: the same guarantee, another preference."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,8 @@ import pytest
 from specshield.lookahead import lookahead
 from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.environment import free_poses
-from specshield.shield.decision import Carry, Config
+from specshield.service.sessions.state import pack_carry
+from specshield.shield.decision import Config
 from specshield.shield.episode import close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
 from specshield.sim.cases import load_case, shipped
@@ -40,7 +40,7 @@ def episode(case, shield, seed, each=lambda decision, logits: None):
         decision = decide(shield, history, logits, over, carry=carry)
         each(decision, logits)
         paid += decision.kl or 0.0
-        carry = Carry.from_json(json.loads(json.dumps(decision.carry.to_json())))
+        carry = pack_carry(decision.carry).unpacked()
         over = over or bool(case.task.robot.terminal[decision.action])
         if len(history) <= case.task.horizon:
             robot.execute(
@@ -88,12 +88,10 @@ def test_a_decision_made_again_is_the_same(world):
         if t == 6:  # as in another process
             lookahead._prepare.cache_clear()
             other = replace(ahead, preference=prepare(shield.task, shield.proposers))
-        again = decide(
-            other, history, logits, carry=None if carry is None else Carry.from_json(carry.to_json())
-        )
+        again = decide(other, history, logits, carry=None if carry is None else pack_carry(carry).unpacked())
         assert np.array_equal(decision.distribution, again.distribution)
         assert decision.action == again.action
-        assert decision.carry.to_json() == again.carry.to_json()
+        assert pack_carry(decision.carry) == pack_carry(again.carry)
         carry = decision.carry
         robot.execute(decision.action)
     assert carry.memory is not None

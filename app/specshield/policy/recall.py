@@ -4,11 +4,15 @@ something broke.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay_by
+from specshield.rule.residual import again, joined, left_over
+from specshield.stl import Formula
 
 
 @kernel
@@ -68,3 +72,17 @@ def forgive(rules: Rules, t: int, status: Int8s) -> None:
         if status[k] == BROKEN:
             again = rules.kind[k] == ALWAYS and rules.b[k] > t
             status[k] = PENDING if again else SETTLED
+
+
+def residuals(formula: Formula, prefix: Mapping[str, Floats], t: int) -> Iterator[Formula]:
+    """What can be kept after a prefix that violates the formula, the most demanding choice first.
+
+    prefix {name: [t + 1]}. The first choice drops the broken conjuncts and enforces a broken G again from
+    step t + 1 on. The second leaves those G out, for a robot that is still inside what they forbid. A choice
+    without any conjunct is not yielded.
+    """
+    kept, broken = left_over(formula, prefix, t)
+    if broken:
+        yield joined([*kept, *again(broken, t + 1)])
+    if kept:
+        yield joined(kept)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -10,20 +10,6 @@ from specshield.arrays import Floats
 from specshield.rule.view import look, view_of
 from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts, robustness_bounds
 from specshield.task import Task
-
-
-def residuals(formula: Formula, prefix: Mapping[str, Floats], t: int) -> Iterator[Formula]:
-    """What can be kept after a prefix that violates the formula, the most demanding choice first.
-
-    prefix {name: [t + 1]}. The first choice drops the broken conjuncts and enforces a broken G again from
-    step t + 1 on. The second leaves those G out, for a robot that is still inside what they forbid. A choice
-    without any conjunct is not yielded.
-    """
-    kept, broken = left_over(formula, prefix, t)
-    if broken:
-        yield joined([*kept, *again(broken, t + 1)])
-    if kept:
-        yield joined(kept)
 
 
 def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[list[Formula], list[Always]]:

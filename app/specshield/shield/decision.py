@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from base64 import b64decode, b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
-
-import numpy as np
+from typing import Literal
 
 from specshield.arrays import Floats
 from specshield.errors import InputError, PolicyError
@@ -134,18 +131,6 @@ class Carry:
     next_poses: Floats
     witnesses: tuple[bytes | None, ...]
     memory: bytes | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        witnesses = [None if w is None else w.hex() for w in self.witnesses]
-        value = {"t": self.t, "next_poses": self.next_poses.tolist(), "witnesses": witnesses}
-        return value | ({} if self.memory is None else {"memory": b64encode(self.memory).decode()})
-
-    @staticmethod
-    def from_json(value: Mapping[str, Any]) -> Carry:
-        witnesses = tuple(None if w is None else bytes.fromhex(w) for w in value["witnesses"])
-        poses = np.array(value["next_poses"], dtype=np.float64).reshape(-1, 3)
-        memory = b64decode(value["memory"]) if "memory" in value else None
-        return Carry(value["t"], poses, witnesses, memory)
 
 
 @dataclass(frozen=True)

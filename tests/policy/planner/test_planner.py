@@ -14,7 +14,7 @@ from specshield.policy.methods import load_policy
 from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import Carry, decide, make_shield, start
+from specshield.shield.episode import decide, make_shield, start
 from specshield.stl import robustness
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -135,7 +135,7 @@ def test_once_feasible_always_feasible(cells):
                 done = True
                 action = END if decision.completion_action is None else decision.completion_action
             history.append(decision.next_poses[action])
-            carry = Carry.from_json(decision.carry.to_json())
+            carry = decision.carry
         signals = see([event] * 8) if cells.signals else {}
         assert cells.kept(history)
         assert robustness(cells.task.formula, cells.task.samples(np.array(history), signals)) > 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from specshield.rule.residual import residuals
+from specshield.policy.recall import residuals
 from specshield.stl import parse
 
 
