@@ -122,12 +122,3 @@ def test_bad_specs_name_the_field(given, error, path):
         task_of(**{"formula": "F[0,3] A", **given})
     assert path is None or caught.value.path == path
     assert caught.value.expected
-
-
-def test_signals_that_are_sent_are_checked():
-    task = task_of()
-    task.check_signals({"load": 3.0})
-    for signals in ({"weight": 1.0}, {"load": math.inf}, {"load": math.nan}):
-        with pytest.raises(SampleError) as caught:
-            task.check_signals(signals)
-        assert caught.value.path == f"signals.{next(iter(signals))}"

@@ -96,19 +96,6 @@ class Task:
         held[: len(sent)] = sent
         return held
 
-    def check_signals(self, signals: Mapping[str, float]) -> None:
-        """Raises SampleError for a signal that the task does not declare or a value that is not finite."""
-        for name, value in signals.items():
-            if name not in self.signals:
-                raise SampleError(
-                    f"unknown signal {name!r}", path=f"signals.{name}", got=name,
-                    expected=f"one of {sorted(self.signals)}, as the spec declares them",
-                )  # fmt: skip
-            if not -LARGEST <= value <= LARGEST:
-                raise SampleError(
-                    "a signal is out of range", path=f"signals.{name}", got=str(value), expected=SIGNAL
-                )
-
 
 def make_task(
     grid: OccupancyGrid,

@@ -26,6 +26,7 @@ from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import (
     RACES,
     Session,
+    check_signals,
     check_step,
     contended,
     logits_of,
@@ -178,7 +179,7 @@ def timed(
 
 def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Session, Decision, StepRecord]:
     shield, signals = shields.of(session), request.signals or {}
-    shield.task.check_signals(signals)
+    check_signals(shield.task, signals)
     state, logits = session.state, logits_of(request)
     session = session.extended(request.t, np.array(request.poses, np.float64), signals)
     carry = None if state.carry is None else state.carry.unpacked()
