@@ -6,7 +6,7 @@ BIN := .venv/bin
 # A clone shares no compiled kernels with another, and keeps its own between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
 
-.PHONY: install demo run test wheel-check lint lines bench results openapi clean
+.PHONY: install demo run test wheel-check lint lines bench reliability results openapi clean
 
 install: .venv/.dev
 
@@ -57,6 +57,17 @@ lines: .venv/bin/python
 
 bench: .venv-bench/.done
 	.venv-bench/bin/python -m benchmarks $(ARGS)
+
+# docs/reliability.md; hours, best on a machine that nobody else uses. What is in out/reliability is not run again.
+RELIABILITY = $(BIN)/python -m benchmarks.reliability
+reliability: .venv-bench/.done
+	-$(RELIABILITY) faults --resume
+	-$(RELIABILITY) isolation --resume
+	-test -f out/reliability/load.json || $(RELIABILITY) load
+	-test -f out/reliability/contract.json || $(RELIABILITY) contract
+	-$(RELIABILITY) elsewhere --resume
+	-$(RELIABILITY) fuzz
+	$(RELIABILITY) report
 
 # docs/results*.md; hours. What is in RESULTS already is not done again. To try every line in minutes:
 # make results ARGS='--runs 2' RESULTS=/tmp/try PAGES=/tmp/try-pages

@@ -65,6 +65,14 @@ TAGS = [
     {"name": "system", "description": "Life, readiness, metrics."},
 ]
 
+LINKS = {  # which answers name a thing, by what parameter, and the operations on that thing
+    ("/v1/maps", "201"): ("map_id", ("maps_read", "maps_image")),
+    ("/v1/policies", "202"): ("policy_id", ("policies_read",)),
+    ("/v1/sessions", "201"): (
+        "session_id", ("sessions_read", "sessions_step", "sessions_close", "sessions_trajectory"),
+    ),
+}  # fmt: skip
+
 
 def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None = None) -> FastAPI:
     """The application. Nothing is opened before it starts.
@@ -210,5 +218,10 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
                     said["_415"] = "The body is not declared as a type that is taken here."
                 added = problem_documents(**said)
                 operation["responses"] |= {str(status): told for status, told in added.items()}
+        for (path, status), (parameter, operations) in LINKS.items():
+            schema["paths"][path]["post"]["responses"][status]["links"] = {
+                name: {"operationId": name, "parameters": {parameter: "$response.body#/id"}}
+                for name in operations
+            }
         app.openapi_schema = schema
     return app.openapi_schema

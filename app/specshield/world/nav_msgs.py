@@ -63,11 +63,12 @@ FORMAT = MapFormat(
     {
         "info": {
             "type": "object",
+            "required": ["resolution", "width", "height", "origin"],
             "description": "`resolution` [m], `width`, `height` [cells], `origin`: {position, orientation}.",
         },
         "data": {
             "type": "array",
-            "items": {"type": "integer"},
+            "items": {"type": "integer", "minimum": UNKNOWN, "maximum": 100},
             "description": "Row-major from the lowest y: -1 unknown, 0..100 occupancy [%].",
         },
     },

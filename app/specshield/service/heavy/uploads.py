@@ -184,7 +184,7 @@ def _bytes(content: Content) -> bytes:
 def _object(content: bytes) -> dict[str, Any]:
     try:
         members = msgspec.json.decode(content)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"the body is not JSON: {error}", expected="a JSON object") from None
     if not isinstance(members, dict):
         raise InputError("the body is not a JSON object", path="body", expected="a JSON object")

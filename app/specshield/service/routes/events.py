@@ -51,13 +51,20 @@ class EventStream(Response):
         await self._stream.aclose()  # type: ignore[attr-defined]
 
 
+EVENT = {  # of each in the stream
+    "type": "object",
+    "required": ["data"],
+    "properties": {"id": {"type": "string"}, "event": {"type": "string"}, "data": {"type": "string"}},
+}
+
+
 @router.get(
     "/{session_id}/events",
     response_class=Response,
     summary="Watch a session",
     responses={
         200: {
-            "content": {EVENTS: {"schema": {"type": "string"}}},
+            "content": {EVENTS: {"schema": EVENT}},
             "description": "Server-sent events: `id` is t, `data` the answer to that step, as JSON. The last "
             "one is `event: end`. Comments keep the connection alive.",
         },

@@ -67,6 +67,7 @@ Formula = Annotated[
     Field(
         min_length=1,
         max_length=10_000,
+        json_schema_extra={"format": "stl"},  # the grammar is more than a pattern can say
         description="Signal temporal logic: `F[0,60] (Charger1 or Charger2) and G[0,150] not Forbidden`. "
         "A region's name holds where the robot's origin is in it, `touches(R)` where any part of the "
         "footprint is, `inside(R)` where all of it is.",

@@ -95,7 +95,9 @@ class Store:
         try:
             with anyio.fail_after(self._timeout):
                 yield
-        except (redis.RedisError, OSError) as error:
+        except (redis.RedisError, OSError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and "handler is closed" not in str(error):
+                raise  # that one is uvloop's word for a connection that the other side has closed
             raise _away(error) from error
 
     async def ping(self) -> None:

@@ -1,0 +1,1 @@
+"""Faults, again and again, while robots drive. Each row is a function of a `kills.Scene`."""
