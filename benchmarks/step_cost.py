@@ -4,7 +4,8 @@
 
 Robots of case 1 drive as they are told (`next_poses[execute]`), each one step after another. For HTTP with
 JSON, HTTP with MessagePack and the WebSocket with MessagePack: CPU time of server and store a step [us, user
-and system, of the processes], p50 and p99 as the robots wait [ms]. The bare route validates the same body by
+and system, of the processes], p50 and p99 as the robots wait [ms], bytes sent and received with their heads.
+With `--ways session` a step is to begin a session and to close it. The bare route validates the same body by
 the same pydantic schema, and answers the JSON of a step, under the same uvicorn. Both are asked by the same
 client in another process. CPU time is what to compare: others may use the machine.
 """
@@ -39,6 +40,7 @@ class Connection:
 
     def __init__(self, port: int, packed: bool = False) -> None:
         self._port, self._packed = port, packed
+        self.sent, self.got = 0, 0  # bytes
 
     async def open(self) -> None:
         self._reader, self._writer = await asyncio.open_connection("127.0.0.1", self._port)
@@ -51,9 +53,11 @@ class Connection:
             f"Accept: {kind}\r\nContent-Length: {len(content)}\r\n\r\n"
         )
         self._writer.write(head.encode() + content)
-        lines = (await self._reader.readuntil(b"\r\n\r\n")).lower().split(b"\r\n")
+        top = await self._reader.readuntil(b"\r\n\r\n")
+        lines = top.lower().split(b"\r\n")
         length = next(int(line[15:]) for line in lines if line.startswith(b"content-length:"))
         answer = await self._reader.readexactly(length)
+        self.sent, self.got = self.sent + len(head) + len(content), self.got + len(top) + length
         if lines[0].split()[1] not in (b"200", b"201"):
             raise RuntimeError(answer.decode())
         found: dict[str, Any] = msgpack.unpackb(answer) if self._packed else json.loads(answer)
@@ -72,23 +76,34 @@ async def robot(
         pose = pose if act is None else answer["next_poses"][act]
 
 
-async def drive(url: str, bare: int, way: str, robots: int, steps: int, seed: int) -> list[float]:
-    """Every robot's waits [s]. way: `bare`, `json`, `msgpack` or `stream`. bare: that route's port."""
+async def drive(
+    url: str, bare: int, way: str, robots: int, steps: int, seed: int
+) -> tuple[list[float], tuple[int, int]]:
+    """Every robot's waits [s], and the bytes that all sent and got. way: `bare`, `json`, `msgpack`, `stream`
+    or `session`. bare: that route's port.
+    """
     port, waits, sockets = int(url.rpartition(":")[2]), list[float](), []
     asks: list[Ask] = []
+    connections: list[Any] = []
     for i in range(robots):
         made = Connection(port)
         await made.open()
+        if way == "session":
+            connections.append(made)
+            asks.append(lambda body, c=made, s=seed + i: _session(c, s))
+            continue
         start = {"policy_id": CASE, "initial_pose": [4.5, 5.0, HEADING], "seed": seed + i}
         id = (await made.post("/v1/sessions", start))["id"]
         path = f"/v1/sessions/{id}/steps"
         if way == "stream":
             address = f"ws://127.0.0.1:{port}/v1/sessions/{id}/stream"
             sockets.append(await websockets.connect(address, compression=None, ping_interval=None))
-            asks.append(lambda body, s=sockets[-1]: _over(s, body))
+            connections.append(Connection(port))  # which counts alone
+            asks.append(lambda body, s=sockets[-1], c=connections[-1]: _over(s, c, body))
             continue
         connection = Connection(bare if way == "bare" else port, way == "msgpack")
         await connection.open()
+        connections.append(connection)
         asks.append(lambda body, c=connection, p=path: c.post(p, body))
     await asyncio.gather(
         *(
@@ -98,12 +113,23 @@ async def drive(url: str, bare: int, way: str, robots: int, steps: int, seed: in
     )
     for each in sockets:
         await each.close()
-    return waits
+    return waits, (sum(each.sent for each in connections), sum(each.got for each in connections))
 
 
-async def _over(stream: Any, body: dict[str, Any]) -> dict[str, Any]:
-    await stream.send(msgpack.packb(body))
-    found: dict[str, Any] = msgpack.unpackb(await stream.recv())
+async def _session(connection: Connection, seed: int) -> dict[str, Any]:
+    start = {"policy_id": CASE, "initial_pose": [4.5, 5.0, HEADING], "seed": seed}
+    id = (await connection.post("/v1/sessions", start))["id"]
+    await connection.post(f"/v1/sessions/{id}/close", {})
+    return {"action": None}
+
+
+async def _over(stream: Any, count: Connection, body: dict[str, Any]) -> dict[str, Any]:
+    sent = msgpack.packb(body)
+    await stream.send(sent)
+    got = await stream.recv()
+    # The head of a frame of 126 to 65,535 bytes: 4 bytes, and 4 of a mask from the client (RFC 6455, 5.2).
+    count.sent, count.got = count.sent + len(sent) + 8, count.got + len(got) + 4
+    found: dict[str, Any] = msgpack.unpackb(got)
     if "status" in found:
         raise RuntimeError(found)
     return found
@@ -161,8 +187,9 @@ def measure(robots: list[int], steps: int, seed: int, ways: list[str]) -> list[d
                 for way in ways:
                     pids = [bare.pid] if way == "bare" else family(server)
                     before, sessions = cpu(pids), count * steps
-                    waits = asyncio.run(drive(url, port, way, count, steps, seed))
+                    waits, (sent, got) = asyncio.run(drive(url, port, way, count, steps, seed))
                     row = {"robots": count, "way": way, "us": 1e6 * (cpu(pids) - before) / sessions}
+                    row |= {"sent": sent / sessions, "got": got / sessions}
                     row |= {f"p{q}": 1e3 * float(np.percentile(waits, q)) for q in (50, 99)}
                     rows.append(row)
         finally:
@@ -194,14 +221,17 @@ def main() -> None:
     if options.serve_bare:
         serve_bare(options.serve_bare)
         return
-    print(f"{'robots':>6} {'way':>8} {'CPU us':>8} {'x bare':>7} {'p50 ms':>8} {'x bare':>7} {'p99 ms':>8}")
+    print(
+        f"{'robots':>6} {'way':>8} {'CPU us':>8} {'x bare':>7} {'p50 ms':>8} {'x bare':>7} {'p99 ms':>8}"
+        f" {'sent B':>7} {'got B':>7}"
+    )
     bare: dict[str, Any] = {}
     for row in measure(options.robots, options.steps, options.seed, options.ways):
         bare = row if row["way"] == "bare" else bare
         ratio, wait = (row[name] / bare[name] if bare else float("nan") for name in ("us", "p50"))
         print(
             f"{row['robots']:6} {row['way']:>8} {row['us']:8.0f} {ratio:7.2f} {row['p50']:8.2f} {wait:7.2f}"
-            f" {row['p99']:8.2f}"
+            f" {row['p99']:8.2f} {row['sent']:7.0f} {row['got']:7.0f}"
         )
 
 

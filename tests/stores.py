@@ -30,19 +30,39 @@ def running(
         process.wait()
 
 
+@dataclass
+class Cluster:
+    """Three masters that share the slots in order, and a replica of the first."""
+
+    url: str
+    first: subprocess.Popen[bytes]
+    nodes: list[redis.Redis]
+
+    def fail(self) -> None:
+        """Kills the first master once its replica has all that it has, and waits for the replica."""
+        _kill(self.first, self.nodes[0], self.nodes[3])
+        wait_for(self.promoted, 60.0)
+
+    def promoted(self) -> bool:
+        """Whether the replica has become a master, and all slots are served."""
+        serving = b"cluster_state:ok" in self.nodes[3].execute_command("CLUSTER", "INFO")
+        return serving and self.nodes[3].role()[0] == b"master"
+
+
 @contextmanager
-def cluster(folder: Path) -> Iterator[list[int]]:
-    """A cluster of three masters; their ports."""
-    ports = [free_port() for _ in range(3)]
+def cluster(folder: Path) -> Iterator[Cluster]:
+    ports = [free_port() for _ in range(4)]
     with ExitStack() as stack:
+        processes = []
         for port in ports:
             bus = free_port()
-            options = ("--port", str(port), "--cluster-enabled", "yes", "--cluster-port", str(bus), *DURABLE)
-            stack.enter_context(running(folder / str(port), *options))
+            options = ("--port", str(port), "--cluster-enabled", "yes", "--cluster-port", str(bus))
+            options += ("--cluster-node-timeout", "2000", "--repl-diskless-sync-delay", "0", *DURABLE)
+            processes.append(stack.enter_context(running(folder / str(port), *options)))
         nodes = [stack.enter_context(redis.Redis(port=port)) for port in ports]
         wait_for(lambda: all(_answers(node) for node in nodes), 20.0)
         share = 16384 // 3 + 1
-        for i, node in enumerate(nodes):
+        for i, node in enumerate(nodes[:3]):
             last = min((i + 1) * share, 16384) - 1
             node.execute_command("CLUSTER", "ADDSLOTSRANGE", i * share, last)
             node.execute_command("CLUSTER", "SET-CONFIG-EPOCH", i + 1)
@@ -53,7 +73,12 @@ def cluster(folder: Path) -> Iterator[list[int]]:
             lambda: all(b"cluster_state:ok" in node.execute_command("CLUSTER", "INFO") for node in nodes),
             20.0,
         )
-        yield ports
+        first = nodes[0].execute_command("CLUSTER", "MYID").decode()
+        nodes[3].execute_command("CLUSTER", "REPLICATE", first)
+        wait_for(lambda: nodes[3].info("replication")["master_link_status"] == "up", 20.0)
+        wait_for(lambda: all(node.execute_command("CLUSTER", "REPLICAS", first) for node in nodes), 20.0)
+        hosts = ",".join(f"127.0.0.1:{port}" for port in ports[:3])
+        yield Cluster(f"redis+cluster://{hosts}", processes[0], nodes)
 
 
 @dataclass
@@ -61,20 +86,28 @@ class Watched:
     """A server with a replica, and the sentinel that makes the replica the server when the first is gone."""
 
     url: str
-    master: subprocess.Popen[bytes]
+    first: subprocess.Popen[bytes]
+    server: redis.Redis
+    replica: redis.Redis
     sentinel: redis.Redis
-    ports: tuple[int, int]
+
+    def fail(self) -> None:
+        """Kills the server once its replica has all that it has, and waits for the replica."""
+        _kill(self.first, self.server, self.replica)
+        wait_for(self.promoted, 60.0)
 
     def promoted(self) -> bool:
         """Whether the sentinel names the one that was the replica."""
-        return int(self.sentinel.sentinel_get_master_addr_by_name("shield")[1]) == self.ports[1]
+        named = int(self.sentinel.sentinel_get_master_addr_by_name("shield")[1])
+        serves: bool = self.replica.role()[0] == b"master"
+        return serves and named == self.replica.connection_pool.connection_kwargs["port"]
 
 
 @contextmanager
 def watched(folder: Path) -> Iterator[Watched]:
     first, second, port = free_port(), free_port(), free_port()
     with ExitStack() as stack:
-        master = stack.enter_context(running(folder / "first", "--port", str(first), *DURABLE))
+        process = stack.enter_context(running(folder / "first", "--port", str(first), *DURABLE))
         follows = ("--replicaof", f"127.0.0.1 {first}", "--repl-diskless-sync-delay", "0")
         stack.enter_context(running(folder / "second", "--port", str(second), *follows, *DURABLE))
         replica = stack.enter_context(redis.Redis(port=second))
@@ -86,8 +119,10 @@ def watched(folder: Path) -> Iterator[Watched]:
         )
         stack.enter_context(running(folder, str(told), "--sentinel"))
         sentinel = stack.enter_context(redis.Redis(port=port))
+        server = stack.enter_context(redis.Redis(port=first))
         wait_for(lambda: _answers(sentinel) and sentinel.sentinel_slaves("shield"), 20.0)
-        yield Watched(f"redis+sentinel://127.0.0.1:{port}/shield", master, sentinel, (first, second))
+        url = f"redis+sentinel://127.0.0.1:{port}/shield"
+        yield Watched(url, process, server, replica, sentinel)
 
 
 @contextmanager
@@ -110,6 +145,13 @@ def behind_tls(folder: Path) -> Iterator[str]:
         node = redis.Redis.from_url(url)
         wait_for(lambda: _answers(node), 20.0)
         yield url
+
+
+def _kill(process: subprocess.Popen[bytes], server: redis.Redis, replica: redis.Redis) -> None:
+    written = server.info("replication")["master_repl_offset"]
+    wait_for(lambda: replica.info("replication")["slave_repl_offset"] >= written, 20.0)
+    process.kill()
+    process.wait()
 
 
 def _answers(node: redis.Redis) -> bool:

@@ -18,17 +18,19 @@ END = "end"
 
 
 def read(
-    url: str, session: str, after: int | None = None, most: int = 10_000, last: int | None = None
+    url: str, session: str, after: int | None = None, most: int = 10_000, last: int | None = None, **more: Any
 ) -> list[Any]:
     """(id, data as text) of each event until the stream ends; `END` as the id of the last one."""
     found: list[Any] = []
     with contextlib.suppress(httpx.RemoteProtocolError):  # a server that was stopped
-        _read(found, f"{url}/v1/sessions/{session}/events", after, most, last)
+        _read(found, f"{url}/v1/sessions/{session}/events", after, most, last, **more)
     return found
 
 
-def _read(found: list[Any], path: str, after: int | None, most: int, last: int | None) -> None:
-    headers = {} if last is None else {"Last-Event-ID": str(last)}
+def _read(
+    found: list[Any], path: str, after: int | None, most: int, last: int | None, headers: Any = None
+) -> None:
+    headers = {**(headers or {}), **({} if last is None else {"Last-Event-ID": str(last)})}
     params = {} if after is None else {"after": after}
     with httpx.stream("GET", path, params=params, headers=headers, timeout=None) as response:
         if response.status_code == 204:

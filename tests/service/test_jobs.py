@@ -66,7 +66,9 @@ def reach(client, policy, status, seconds=600.0):
 
 
 def children(pid):
-    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    """Those of all its threads: a process belongs to the thread that started it."""
+    threads = list(Path(f"/proc/{pid}/task").iterdir())
+    listed = [child for thread in threads for child in (thread / "children").read_text().split()]
     return [(int(child), Path(f"/proc/{child}/cmdline").read_bytes()) for child in listed]
 
 
@@ -152,6 +154,22 @@ def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, cli
     wait_for(lambda: read(client, policy)["status"] == "failed", 60.0)
     assert "worker is gone" in read(client, policy)["error"]
     reach(client, ask(client, seed=4), "ready")
+
+
+def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait(server, client):
+    running, waiting = (ask(client, options=LONG, seed=seed) for seed in (7, 8))
+    reach(client, running, "training")
+    stopped = learner_of(server)
+    ((run, _),) = children(stopped)
+    os.kill(stopped, signal.SIGTERM)
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (stopped, run)), 60.0)
+    assert read(client, running)["status"] in ("queued", "training")  # not failed: the next worker has it
+    reach(client, running, "training")
+    wait_for(lambda: read(client, running)["eta_s"], 600.0)  # known once the next worker has gone on
+    assert read(client, running)["status"] == "training"
+    assert read(client, waiting)["status"] == "queued"
+    for policy in (running, waiting):
+        client.delete(f"/v1/policies/{policy['id']}")
 
 
 def test_nothing_trains_on_without_its_server(tmp_path):

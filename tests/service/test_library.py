@@ -162,7 +162,8 @@ def test_of_a_deletion_and_a_creation_one_wins(keyed):
 @pytest.fixture
 def claims(keyed):
     settings = Settings(data_dir=keyed.data_dir, store_timeout=30.0)
-    return Claims(Jobs(f"unix://{keyed.data_dir}/store/socket", settings).redis, settings)
+    jobs = Jobs(f"unix://{keyed.data_dir}/store/socket", settings)
+    return Claims(lambda: jobs.redis, settings)
 
 
 def test_nobody_begins_to_use_what_is_being_deleted(claims, monkeypatch):

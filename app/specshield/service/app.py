@@ -115,7 +115,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     store = ArchivingStore(url, settings.store_timeout, settings.session_ttl, archive)
     check = partial(check_files, url, settings.files_at, settings.store_timeout)
     mover, jobs = Mover(store, settings), Jobs(url, settings)
-    claims = Claims(jobs.redis, settings)
+    claims = Claims(lambda: jobs.redis, settings)
     library = Maps(settings, claims)
     known = Policies(settings, library, claims)
     worker = TrainingWorker(settings) if wants_worker(settings) else None

@@ -19,10 +19,9 @@ from collections.abc import Awaitable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, TypeVar
 
-import redis
-
 from specshield.errors import InputError, LimitReached, NotFound, StoreError, Unauthorized
 from specshield.service.library.files import now
+from specshield.service.storage.connect import FAILURES
 
 T = TypeVar("T")
 KEYS = "specshield:keys"
@@ -146,5 +145,5 @@ def digest_of(key: bytes) -> str:
 async def _reached(answer: Awaitable[T]) -> T:
     try:
         return await answer
-    except (redis.RedisError, OSError) as error:
+    except FAILURES as error:
         raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error

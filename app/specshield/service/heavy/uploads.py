@@ -59,7 +59,8 @@ def _maps(settings: Settings) -> Maps:
 @cache
 def _claims(settings: Settings) -> Claims:
     url = settings.redis_url or EmbeddedStore(settings.data_dir).url
-    return Claims(Jobs(url, settings).redis, settings)
+    jobs = Jobs(url, settings)
+    return Claims(lambda: jobs.redis, settings)
 
 
 def add_map(settings: Settings, content_type: str, content: Content, key: Key) -> dict[str, Any]:

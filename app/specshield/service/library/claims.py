@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import redis
 
 from specshield.errors import Conflict, InsufficientStorage, LimitReached, NotFound, StoreError
 from specshield.service.access.keys import Key
 from specshield.service.library import files
 from specshield.service.settings import Settings
+from specshield.service.storage.connect import FAILURES
 
 SCRIPT = Path(__file__).with_name("claims.lua").read_text()
 PATIENCE = 5.0  # [s] to wait for a deletion of the same id; one takes milliseconds. Chosen by hand
@@ -30,10 +30,19 @@ WAIT = 0.02  # [s] between two looks at it
 class Claims:
     """kind: "maps" or "policies". Every method raises StoreError where the store cannot be reached."""
 
-    def __init__(self, store: Any, settings: Settings) -> None:
-        """store: a blocking connection of redis."""
-        self._store, self._script = store, store.register_script(SCRIPT)
-        self._settings = settings
+    def __init__(self, connected: Callable[[], Any], settings: Settings) -> None:
+        """connected: gives a blocking connection of redis. It is first asked when a claim is: the store may
+        be away before.
+        """
+        self._connected, self._settings = connected, settings
+
+    @property
+    def _store(self) -> Any:
+        return self._connected()
+
+    @cached_property
+    def _script(self) -> Any:
+        return self._store.register_script(SCRIPT)
 
     def ids(self, kind: str, owner: str) -> list[str]:
         return sorted(id.decode() for id in _reached(lambda: self._store.hkeys(_owned(kind, owner))))
@@ -165,5 +174,5 @@ def _uses(map_id: str, owner: str) -> str:
 def _reached(action: Any) -> Any:
     try:
         return action()
-    except (redis.RedisError, OSError) as error:
+    except FAILURES as error:
         raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error

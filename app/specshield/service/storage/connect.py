@@ -20,6 +20,7 @@ import redis.asyncio.cluster
 import redis.asyncio.retry
 import redis.asyncio.sentinel
 import redis.cluster
+import redis.exceptions
 import redis.retry
 import redis.sentinel
 from redis.backoff import ExponentialBackoff
@@ -27,6 +28,9 @@ from redis.backoff import ExponentialBackoff
 FORMS = (
     "redis://127.0.0.1:6379/0, rediss://..., unix:///path, redis+sentinel://h1,h2/service, redis+cluster://h1"
 )
+# What a client raises where the store cannot be reached, or not make sense of; redis-py keeps the trouble
+# of a cluster whose nodes are all away apart from its other errors.
+FAILURES = (redis.RedisError, redis.exceptions.RedisClusterException, OSError)
 CONNECTIONS = 64  # of one server process to a single server; those who want more wait
 TRIES = 3  # after the first; all within the caller's time limit. Chosen by hand.
 JOBS = "{specshield}:rq"  # what rq's keys begin with in a cluster, so that one server of it has them all

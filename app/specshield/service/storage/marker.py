@@ -9,10 +9,8 @@ from __future__ import annotations
 import secrets
 import time
 
-import redis
-
 from specshield.errors import InputError, StoreError
-from specshield.service.storage.connect import connect
+from specshield.service.storage.connect import FAILURES, connect
 from specshield.service.storage.objects import open_objects
 
 FILE = "store-id"
@@ -36,7 +34,7 @@ def check_files(url: str, place: str, timeout: float) -> None:
             theirs = store.get(KEY)
         finally:
             store.close()
-    except (redis.RedisError, OSError) as error:
+    except FAILURES as error:
         raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
     if first and mine is None:
         files.write(FILE, made)

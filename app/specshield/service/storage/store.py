@@ -15,11 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import anyio
-import redis.asyncio as redis
 
 from specshield.errors import SessionExists, StoreError
 from specshield.service.access.owners import between, shown
-from specshield.service.storage.connect import connect, is_cluster
+from specshield.service.storage.connect import FAILURES, connect, is_cluster
 from specshield.service.storage.wire import Script, Wire
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
@@ -95,7 +94,7 @@ class Store:
         try:
             with anyio.fail_after(self._timeout):
                 yield
-        except (redis.RedisError, OSError, RuntimeError) as error:
+        except (*FAILURES, RuntimeError) as error:
             if isinstance(error, RuntimeError) and "handler is closed" not in str(error):
                 raise  # that one is uvloop's word for a connection that the other side has closed
             raise _away(error) from error
@@ -144,7 +143,7 @@ class Store:
         else:
             try:
                 written = await self._wire.run(APPEND, keys(id), args)
-            except (redis.RedisError, OSError) as error:
+            except FAILURES as error:
                 raise _away(error) from error
         return written if isinstance(written, bytes) else _record(*written)
 
@@ -230,9 +229,12 @@ class Store:
         return [None if state is None else News(state, rows, steps) for state, steps, rows in three]
 
     async def held_bytes(self) -> int:
-        """The memory that the store takes."""
+        """The memory that the store takes: in a cluster all its masters, their replicas not counted."""
         async with self._reaching():
-            return int((await self.redis.info("memory"))["used_memory"])
+            if self._wire is not None:
+                return int((await self.redis.info("memory"))["used_memory"])
+            nodes = await self.redis.info("memory", target_nodes="primaries")
+            return sum(int(node["used_memory"]) for node in nodes.values())
 
     async def _that_fit(self, ids: list[bytes], room: int) -> tuple[list[bytes], int]:
         """The first ids whose configs come to about `room` bytes, at least one, and what is left of it."""

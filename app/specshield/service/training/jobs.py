@@ -12,14 +12,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import redis
 from rq import Queue
 from rq.serializers import JSONSerializer
 
 from specshield.errors import StoreError
 from specshield.policy.methods import METHODS
 from specshield.service.settings import Settings
-from specshield.service.storage.connect import connect
+from specshield.service.storage.connect import FAILURES, connect
 from specshield.service.watch import logs
 
 ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
@@ -161,7 +160,7 @@ class Jobs:
     def _try(self, action: Any) -> Any:
         try:
             return action()
-        except (redis.RedisError, OSError) as error:
+        except FAILURES as error:
             raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
 
 

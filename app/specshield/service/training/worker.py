@@ -201,7 +201,7 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: thr
     from specshield.service.library.maps import Maps
     from specshield.service.library.policies import Policies
 
-    claims = Claims(jobs.redis, settings)
+    claims = Claims(lambda: jobs.redis, settings)
     policies = Policies(settings, Maps(settings, claims), claims)
     about = policies.record(id).about
 

@@ -1,0 +1,185 @@
+"""The service on stores that others run: a cluster, one behind TLS, one that sentinels watch."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from redis.crc import key_slot
+
+from tests.service.test_events import END, read
+from tests.service.world import ROBOT, SPEC, grid_json, send_policy
+from tests.serving import RunningServer, serving, wait_for
+from tests.stores import behind_tls, cluster, watched
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("redis-server") is None, reason="redis-server is not installed: stores of one's own need it"
+)
+POSE = [4.5, 5.0, 0.0]
+FIRST = 16384 // 3  # slots of the cluster's first master, whose replica takes over
+STEPS = 12
+
+
+@contextmanager
+def on_store(folder: Any, url: str, **settings: str) -> Iterator[RunningServer]:
+    """A server with a worker. What ends moves to the archive a second later."""
+    environment = {"REDIS_URL": url, "SPECSHIELD_WORKER": "true", "SPECSHIELD_ARCHIVE_AFTER": "1", **settings}
+    with serving(folder / "data", **environment) as server:
+        yield server
+
+
+def key_of(name: str, folder: Any, url: str) -> str:
+    """`specshield keys create`."""
+    environment = {**os.environ, "REDIS_URL": url, "SPECSHIELD_DATA_DIR": str(folder / "data")}
+    command = [sys.executable, "-m", "specshield.cli", "keys", "create", name]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def caller(server: RunningServer, key: str) -> httpx.Client:
+    return httpx.Client(base_url=server.url, timeout=None, headers={"Authorization": f"Bearer {key}"})
+
+
+class Episode:
+    """A robot of case 1 that drives as it is told, and keeps every answer."""
+
+    def __init__(self, client: httpx.Client, id: str) -> None:
+        self.client, self.id, self.path = client, id, f"/v1/sessions/{id}"
+        self.pose, self.random = POSE, np.random.default_rng(7)
+        self.sent: list[tuple[dict[str, Any], bytes]] = []
+        body = {"policy_id": "case1", "initial_pose": POSE, "seed": 7, "id": id}
+        begun = client.post("/v1/sessions", json=body)
+        assert begun.status_code == 201, begun.text
+
+    def drive(self, steps: int) -> None:
+        for t in range(len(self.sent), len(self.sent) + steps):
+            body = {"t": t, "poses": [self.pose], "logits": self.random.normal(size=20).tolist()}
+            answer = self.ask(body)
+            self.sent.append((body, answer))
+            told = json.loads(answer)
+            act = told["action"] if told["action"] != 4 else told["completion_action"]
+            self.pose = self.pose if act is None else told["next_poses"][act]
+
+    def ask(self, body: dict[str, Any]) -> bytes:
+        """The same step again while the store is away, as a robot asks."""
+        deadline = time.monotonic() + 60.0
+        while (response := self.client.post(f"{self.path}/steps", json=body)).status_code == 503:
+            assert time.monotonic() < deadline, response.text
+            time.sleep(0.1)
+        assert response.status_code == 200, response.text
+        return response.content
+
+    def is_kept(self) -> None:
+        """Every answer is there, and comes again byte for byte."""
+        session = self.client.get(self.path)
+        assert session.json()["next_t"] == len(self.sent), session.text
+        for body, answer in self.sent:
+            assert self.ask(body) == answer
+
+    def told(self, server: RunningServer) -> list[Any]:
+        key = self.client.headers["Authorization"]
+        return read(server.url, self.id, after=-1, headers={"Authorization": key})
+
+    def in_archive(self, server: RunningServer) -> bool:
+        return any(
+            self.id in str(path) for path in (server.data_dir / "archive").rglob("*") if path.is_file()
+        )
+
+
+def a_whole_life(server: RunningServer, folder: Any, url: str, fail: Any = None) -> None:
+    """Keys, an episode, an upload, a policy made by a worker; `fail` in between."""
+    alice, bob = (caller(server, key_of(name, folder, url)) for name in ("alice", "bob"))
+    ids = (f"robot-{i}" for i in range(10_000))  # one whose keys, and alice's index, the first master has
+    episode = Episode(alice, next(id for id in ids if key_slot(f"alice@{id}".encode()) < FIRST))
+    episode.drive(STEPS // 2)
+    policies = a_library(alice, bob)
+    if fail is not None:
+        fail()
+    episode.is_kept()
+    episode.drive(STEPS - STEPS // 2)
+    assert bob.get(episode.path).status_code == 404
+    assert [each["id"] for each in alice.get("/v1/sessions").json()["items"]] == [episode.id]
+    closed = alice.post(f"{episode.path}/close", json={})
+    assert closed.status_code == 200, closed.text
+    wait_for(lambda: episode.in_archive(server), 60.0)
+    episode.is_kept()
+    assert [each["id"] for each in alice.get("/v1/sessions").json()["items"]] == [episode.id]
+    told = episode.told(server)
+    assert [data.encode() for _, data in told[:-1]] == [answer for _, answer in episode.sent]
+    assert told[-1][0] == END
+    items = alice.get(f"{episode.path}/trajectory").json()["items"]
+    assert [item["t"] for item in items if item["decision"]] == [*range(STEPS)]
+    assert alice.delete(episode.path).status_code == 204
+    assert alice.get(episode.path).status_code == 404
+    for policy in policies:  # what was made before the failure goes, and is forgotten
+        assert alice.delete(f"/v1/policies/{policy['id']}").status_code == 204
+    assert alice.delete(f"/v1/maps/{policies[0]['map_id']}").status_code == 204
+    assert "specshield_store_up 1.0" in alice.get("/metrics").text
+
+
+def a_library(alice: httpx.Client, bob: httpx.Client) -> list[dict[str, Any]]:
+    """A policy that alice sends, and one that a worker makes for her."""
+    map_id = alice.post("/v1/maps", json=grid_json()).json()["id"]
+    assert bob.get(f"/v1/maps/{map_id}").status_code == 404
+    sent = send_policy(alice)
+    body = {"map_id": map_id, "robot": ROBOT, "spec": SPEC, "method": "reachability"}
+    deadline = time.monotonic() + 60.0
+    while (asked := alice.post("/v1/policies", json=body)).status_code == 503:  # no worker yet
+        assert time.monotonic() < deadline, asked.text
+        time.sleep(0.2)
+    assert asked.status_code == 202, asked.text
+    made = asked.json()
+
+    def status() -> str:
+        return str(alice.get(f"/v1/policies/{made['id']}").json()["status"])
+
+    wait_for(lambda: status() in ("ready", "failed"), 300.0)
+    assert status() == "ready", alice.get(f"/v1/policies/{made['id']}").text
+    assert alice.delete(f"/v1/maps/{map_id}").status_code == 409
+    return [sent, made]
+
+
+def test_a_life_on_a_cluster_one_of_whose_masters_is_killed(tmp_path):
+    with cluster(tmp_path / "store") as nodes, on_store(tmp_path, nodes.url) as server:
+        a_whole_life(server, tmp_path, nodes.url, nodes.fail)
+
+
+def test_a_life_under_sentinels_that_name_another_server(tmp_path):
+    with watched(tmp_path / "store") as servers, on_store(tmp_path, servers.url) as server:
+        a_whole_life(server, tmp_path, servers.url, servers.fail)
+
+
+def test_a_life_behind_tls(tmp_path):
+    with behind_tls(tmp_path / "store") as url, on_store(tmp_path, url) as server:
+        a_whole_life(server, tmp_path, url)
+
+
+def test_a_cluster_that_is_away_is_said_to_be(tmp_path):
+    away = "redis+cluster://127.0.0.1:1"
+    with (
+        serving(tmp_path, ready=False, REDIS_URL=away, SPECSHIELD_STORE_TIMEOUT="0.5") as server,
+        httpx.Client(base_url=server.url, timeout=30.0) as client,
+    ):
+
+        def said() -> Any:
+            assert server.process.poll() is None, server.log.read_text()
+            try:
+                return client.get("/readyz").json()["type"]
+            except httpx.TransportError:
+                return None
+
+        wait_for(lambda: said() == "store-unavailable", 300.0)
+        for path in ("/v1/sessions", "/v1/sessions/x", "/v1/maps", "/v1/policies"):
+            response = client.get(path)
+            assert (response.status_code, response.json()["type"]) == (503, "store-unavailable"), path
+        assert "Traceback" not in server.log.read_text()
