@@ -3,8 +3,9 @@
     python -m benchmarks.step_cost --robots 1 16 64 --steps 100 --seed 0
 
 Robots of case 1 drive as they are told (`next_poses[execute]`), each one step after another. For HTTP with
-JSON, HTTP with MessagePack and the WebSocket with MessagePack: CPU time of server and store a step [us, user
-and system, of the processes], p50 and p99 as the robots wait [ms], bytes sent and received with their heads.
+JSON, HTTP with MessagePack and the WebSocket with MessagePack: CPU time of server and store a step, and of
+the store alone [us, user and system, of the processes], p50 and p99 as the robots wait [ms], bytes sent and
+received with their heads.
 With `--ways session` a step is to begin a session and to close it. The bare route validates the same body by
 the same pydantic schema, and answers the JSON of a step, under the same uvicorn. Both are asked by the same
 client in another process. CPU time is what to compare: others may use the machine.
@@ -186,9 +187,11 @@ def measure(robots: list[int], steps: int, seed: int, ways: list[str]) -> list[d
             for count in robots:
                 for way in ways:
                     pids = [bare.pid] if way == "bare" else family(server)
-                    before, sessions = cpu(pids), count * steps
+                    store = [pid for pid in pids if "valkey" in _command(pid).split(" ")[0]]
+                    before, stored, sessions = cpu(pids), cpu(store), count * steps
                     waits, (sent, got) = asyncio.run(drive(url, port, way, count, steps, seed))
                     row = {"robots": count, "way": way, "us": 1e6 * (cpu(pids) - before) / sessions}
+                    row |= {"store": 1e6 * (cpu(store) - stored) / sessions}
                     row |= {"sent": sent / sessions, "got": got / sessions}
                     row |= {f"p{q}": 1e3 * float(np.percentile(waits, q)) for q in (50, 99)}
                     rows.append(row)
@@ -222,16 +225,16 @@ def main() -> None:
         serve_bare(options.serve_bare)
         return
     print(
-        f"{'robots':>6} {'way':>8} {'CPU us':>8} {'x bare':>7} {'p50 ms':>8} {'x bare':>7} {'p99 ms':>8}"
-        f" {'sent B':>7} {'got B':>7}"
+        f"{'robots':>6} {'way':>8} {'CPU us':>8} {'store':>6} {'x bare':>7} {'p50 ms':>8} {'x bare':>7}"
+        f" {'p99 ms':>8} {'sent B':>7} {'got B':>7}"
     )
     bare: dict[str, Any] = {}
     for row in measure(options.robots, options.steps, options.seed, options.ways):
         bare = row if row["way"] == "bare" else bare
         ratio, wait = (row[name] / bare[name] if bare else float("nan") for name in ("us", "p50"))
         print(
-            f"{row['robots']:6} {row['way']:>8} {row['us']:8.0f} {ratio:7.2f} {row['p50']:8.2f} {wait:7.2f}"
-            f" {row['p99']:8.2f} {row['sent']:7.0f} {row['got']:7.0f}"
+            f"{row['robots']:6} {row['way']:>8} {row['us']:8.0f} {row['store']:6.0f} {ratio:7.2f}"
+            f" {row['p50']:8.2f} {wait:7.2f} {row['p99']:8.2f} {row['sent']:7.0f} {row['got']:7.0f}"
         )
 
 
