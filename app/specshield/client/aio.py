@@ -7,6 +7,7 @@ import contextlib
 import math
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from dataclasses import replace
 from types import TracebackType
 from typing import (
     TYPE_CHECKING,
@@ -25,7 +26,7 @@ import httpx
 
 from specshield.client import bounded, calls
 from specshield.client.away import OnFailure
-from specshield.client.core import Flow, Wait, looks_like, page_of
+from specshield.client.core import Feed, Flow, More, Wait, looks_like, page_of
 from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.stream import AsyncStreams, packed
@@ -101,6 +102,9 @@ class AsyncShieldClient:
                 if isinstance(command, Request):
                     command = flow.send(await self._perform(command, ends))
                     continue
+                if isinstance(command, More):
+                    command = flow.send(await self._more(command))
+                    continue
                 if isinstance(command, Wait):
                     await asyncio.sleep(max(0.0, min(command.seconds, ends - time.monotonic())))
                 else:
@@ -127,14 +131,31 @@ class AsyncShieldClient:
         return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     async def _exchanged(self, exchange: Exchange) -> Reply | None:
-        async with self._http.stream(**exchange.arguments(self._timeout)) as response:
+        async with contextlib.AsyncExitStack() as opened:
+            response = await opened.enter_async_context(
+                self._http.stream(**exchange.arguments(self._timeout))
+            )
             exchange.begin(response)
-            async for chunk in response.aiter_bytes():
-                exchange.take(chunk)
+            listens = exchange.request.listens and response.status_code == 200
+            if not listens:
+                async for chunk in response.aiter_bytes():
+                    exchange.take(chunk)
             reply = exchange.reply(response)
             if reply is None:
                 await hang_up(response)
+            elif listens:
+                reply = replace(reply, feed=Feed(response.aiter_bytes(), opened.pop_all().aclose))
             return reply
+
+    async def _more(self, more: More) -> Reply:
+        bounded.ENDS.set(more.ends)
+        try:
+            piece: bytes = await asyncio.wait_for(anext(more.feed.pieces, b""), more.ends - time.monotonic())
+        except (asyncio.TimeoutError, TimeoutError, httpx.RequestError):
+            piece = b""
+        if not piece:
+            await more.feed.close()
+        return more.got(piece)
 
 
 async def hang_up(response: httpx.Response) -> None:
@@ -247,6 +268,16 @@ class AsyncSession(SessionState, Generic[D]):
     save_record = awaiting_step(SessionState._save_record)
     close = awaiting_step(SessionState._end)
 
+    async def events(self, after: int | None = None) -> AsyncIterator[Decision]:
+        """As `Session.events`."""
+        events = self._events(after)
+        try:
+            while (decision := await self._run(events.following())) is not None:
+                yield decision
+        finally:
+            if events.feed is not None:
+                await events.feed.close()
+
 
 class AsyncSpecs(Resource):
     validate = awaiting(calls.validate)
@@ -259,6 +290,7 @@ class AsyncMaps(Resource):
     occupancy_grid = awaiting(calls.occupancy_grid_map)
     get = awaiting(calls.get_map)
     image = awaiting(calls.map_image)
+    delete = awaiting(calls.delete_map)
     list = pages(Map, "maps")
 
 

@@ -163,7 +163,7 @@ class Transport(httpx.HTTPTransport):
         _check(self)
         proxy: dict[str, Any] = _proxy(url)
         pool = httpcore.HTTPProxy if proxy else httpcore.ConnectionPool
-        self._pool = pool(**proxy, ssl_context=httpx.create_ssl_context(), network_backend=Network())
+        self._pool = pool(**proxy, **_pool(Network()))
 
 
 class AsyncTransport(httpx.AsyncHTTPTransport):
@@ -172,7 +172,13 @@ class AsyncTransport(httpx.AsyncHTTPTransport):
         _check(self)
         proxy: dict[str, Any] = _proxy(url)
         pool = httpcore.AsyncHTTPProxy if proxy else httpcore.AsyncConnectionPool
-        self._pool = pool(**proxy, ssl_context=httpx.create_ssl_context(), network_backend=AsyncNetwork())
+        self._pool = pool(**proxy, **_pool(AsyncNetwork()))
+
+
+def _pool(network: Network | AsyncNetwork) -> dict[str, Any]:
+    """As many connections as are asked for: a step never waits until somebody stops watching."""
+    context = httpx.create_ssl_context()
+    return {"ssl_context": context, "network_backend": network, "max_connections": None}
 
 
 def _check(transport: httpx.HTTPTransport | httpx.AsyncHTTPTransport) -> None:

@@ -99,6 +99,11 @@ def get_map(id: str) -> Flow[Map]:
     return build(Map, (yield from call(get("maps", id))))
 
 
+def delete_map(id: str) -> Flow[None]:
+    """Remove a map. InUse while a policy is for it."""
+    return (yield from erase(Request("DELETE", path("maps", id))))
+
+
 def map_image(id: str) -> Flow[bytes]:
     """The map as PNG: white is free, black occupied."""
     delivery = yield from deliver(get("maps", id, "image.png", slow=True))

@@ -1,7 +1,8 @@
 """How a call of the SDK is made without I/O: a generator yields what to send and how long to wait.
 
 A shell (sync.py, aio.py) performs a `Request` and sends its `Reply` or `Failure` in; it sleeps for a
-`Wait`; the generator's return value is the call's. So requests, parsing and retries exist once.
+`Wait`; it reads `More` of an answer that is read while it comes (events.py). The generator's return value is
+the call's. So requests, parsing and retries exist once.
 
 Retries: a lost answer, 502, 503 or 504 is followed by the same bytes again, at most `tries` times,
 after 0.05 s, 0.1 s, 0.2 s, ..., and no try starts later than four timeouts after the first, nor after the
@@ -45,7 +46,28 @@ class Within:
         return began + ((PATIENCE + 1) * timeout if self.seconds is None else self.seconds)
 
 
-Flow = Generator[Request | Wait | Within, Reply | Failure, T]
+@dataclass(frozen=True)
+class Feed:
+    """An answer that is read while it comes. pieces: an iterator of the shell's. close: leaves it."""
+
+    pieces: Any
+    close: Callable[[], Any]
+
+
+@dataclass(frozen=True)
+class More:
+    """The next piece of a feed, as the content of a Reply, by `ends` on the clock of time.monotonic(). It is
+    empty where the feed has ended, was lost or brought nothing in time; the feed is closed then.
+    """
+
+    feed: Feed
+    ends: float
+
+    def got(self, piece: bytes) -> Reply:
+        return Reply(200, {}, piece, 0.0, 0.0)
+
+
+Flow = Generator[Request | Wait | Within | More, Reply | Failure, T]
 
 
 @dataclass(frozen=True)

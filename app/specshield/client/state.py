@@ -9,6 +9,7 @@ from typing import Any
 
 from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
 from specshield.client.core import Flow, Within, call, deliver
+from specshield.client.events import Events
 from specshield.client.models import (
     Decision,
     LocalDecision,
@@ -199,6 +200,13 @@ class SessionState:
         self.closed = self.finished = True
         self.spec_status = verdict.spec_status
         return verdict
+
+    def _events(self, after: int | None) -> Events:
+        def decided(answer: Mapping[str, Any]) -> Decision:
+            # Once the rule is settled, a session that is finished is one whose main task is over.
+            return _decision(answer, self.info.terminal_actions, bool(answer.get("finished")), {})
+
+        return Events(self.id, self.t - 1 if after is None else after, decided)
 
     def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
         """The states x_0..x_t that the server has, and its answers."""

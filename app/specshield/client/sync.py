@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from types import TracebackType
 from typing import (
     TYPE_CHECKING,
@@ -24,7 +25,7 @@ import httpx
 
 from specshield.client import bounded, calls
 from specshield.client.away import OnFailure
-from specshield.client.core import Flow, Wait, looks_like, page_of
+from specshield.client.core import Feed, Flow, More, Wait, looks_like, page_of
 from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
@@ -108,6 +109,9 @@ class ShieldClient:
                 if isinstance(command, Request):
                     command = flow.send(self._perform(command, ends))
                     continue
+                if isinstance(command, More):
+                    command = flow.send(self._more(command))
+                    continue
                 if isinstance(command, Wait):
                     time.sleep(max(0.0, min(command.seconds, ends - time.monotonic())))
                 else:
@@ -126,18 +130,34 @@ class ShieldClient:
             return self._streams.perform(exchange, message)
         token = bounded.ENDS.set(exchange.ends)
         try:
-            with self._http.stream(**exchange.arguments(self._timeout)) as response:
+            with contextlib.ExitStack() as opened:
+                response = opened.enter_context(self._http.stream(**exchange.arguments(self._timeout)))
                 exchange.begin(response)
-                for chunk in response.iter_bytes():
+                listens = request.listens and response.status_code == 200
+                for chunk in () if listens else response.iter_bytes():
                     exchange.take(chunk)
                 reply = exchange.reply(response)
                 if reply is None:
                     hang_up(response)
+                elif listens:
+                    return replace(reply, feed=Feed(response.iter_bytes(), opened.pop_all().close))
         except httpx.RequestError as error:
             return exchange.failure(error)
         finally:
             bounded.ENDS.reset(token)
         return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
+
+    def _more(self, more: More) -> Reply:
+        token = bounded.ENDS.set(more.ends)
+        try:
+            piece: bytes = next(more.feed.pieces, b"")
+        except httpx.RequestError:
+            piece = b""
+        finally:
+            bounded.ENDS.reset(token)
+        if not piece:
+            more.feed.close()
+        return more.got(piece)
 
 
 def hang_up(response: httpx.Response) -> None:
@@ -246,6 +266,22 @@ class Session(SessionState, Generic[D]):
     save_record = blocking_step(SessionState._save_record)
     close = blocking_step(SessionState._end)
 
+    def events(self, after: int | None = None) -> Iterator[Decision]:
+        """The decisions after step `after` as they are made, by whoever asks for them; -1: from the first.
+
+        By default those after the last step that this session knows of. Each is what `step` gave, without its
+        `timings`. Waits for the next one, as long as the server answers; ends with the session. A connection
+        that is lost is made again, without a gap and without doubles; where that fails for some 13 s, the
+        error is raised, and `events(decision.t)` goes on later.
+        """
+        events = self._events(after)
+        try:
+            while (decision := self._run(events.following())) is not None:
+                yield decision
+        finally:
+            if events.feed is not None:
+                events.feed.close()
+
 
 class Specs(Resource):
     validate = blocking(calls.validate)
@@ -258,6 +294,7 @@ class Maps(Resource):
     occupancy_grid = blocking(calls.occupancy_grid_map)
     get = blocking(calls.get_map)
     image = blocking(calls.map_image)
+    delete = blocking(calls.delete_map)
     list = pages(Map, "maps")
 
 

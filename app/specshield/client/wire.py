@@ -47,7 +47,7 @@ class Request:
     """One request. `slow`: the server prepares something; `tries`: how often it may be sent at most.
 
     `t`: the step that the answer has to be about; an answer about another one is none (see `stale`).
-    `message`: the body of a step, as a stream packs it.
+    `message`: the body of a step, as a stream packs it. `listens`: a good answer is read while it comes.
     """
 
     method: str
@@ -59,6 +59,7 @@ class Request:
     tries: int = TRIES
     t: int | None = None
     message: Mapping[str, Any] | None = None
+    listens: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Reply:
     timeout: float
     left: float = math.inf
     parsed: Any = None  # what came as a message is not JSON, and has been read already
+    feed: Any = None  # core.Feed of an answer that is read while it comes
 
     @cached_property
     def document(self) -> Any:

@@ -34,7 +34,7 @@ class Guard:
         path, server = scope["path"], scope["app"].state.server
         if guarded(path):
             key = await server.keys.check(headers.get(b"authorization", b""))
-            self._rates.take(key, path.endswith("/steps"))
+            self._rates.take(key, path.endswith(("/steps", "/stream")))
             scope["state"].update(key=key, owner=key.name, rates=self._rates)
         starting = server.startup.problem() if path.startswith("/v1/") else None
         if starting is not None and not isinstance(starting, Stopping):

@@ -1,0 +1,97 @@
+"""The decisions of a session as they are made, by whoever asks for them: server-sent events (docs/watch.md).
+
+Read without I/O, as calls are (core.py). A connection that ends without `event: end`, breaks, or brings no
+whole line for SILENCE seconds is given up, and the next one goes on after the last decision that was read.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from specshield.client.core import Feed, Flow, More, Wait, deliver
+from specshield.client.models import Decision
+from specshield.client.stream import LONGEST
+from specshield.client.wire import TRIES, Failure, Request, check, path
+from specshield.errors import ServerError
+
+SILENCE = 30.0  # s without a whole line; two of the server's heartbeats
+PAUSE = 1.0  # s before a lost connection is made again; the server asks for as much
+RESUMING = 9  # tries to make it again: 13 s where connections are refused
+
+
+class Events:
+    """What follows step `after` of a session. feed: the connection that is open, for the shell to close.
+
+    decided: the decision of an answer, by the contract's names.
+    """
+
+    def __init__(self, id: str, after: int, decided: Callable[[Mapping[str, Any]], Decision]) -> None:
+        self._path, self._after, self._decided = path("sessions", id, "events"), after, decided
+        self._tries, self._over, self._found = TRIES, False, deque[Decision]()
+        self._rest, self._event = bytearray(), dict[bytes, bytes]()
+        self.feed: Feed | None = None
+
+    def following(self) -> Flow[Decision | None]:
+        """The next decision; None where the session is over."""
+        ends = time.monotonic() + SILENCE
+        while not self._found and not self._over:
+            if self.feed is None:
+                yield from self._connect()
+                ends = time.monotonic() + SILENCE
+                continue
+            piece = yield More(self.feed, ends)
+            if isinstance(piece, Failure) or not piece.content:
+                self.feed = None
+                yield Wait(PAUSE)
+            elif lines := self._lines(piece.content):
+                ends = time.monotonic() + SILENCE
+                for line in lines:
+                    self._take(line.rstrip(b"\r"))
+        return self._found.popleft() if self._found else None
+
+    def _connect(self) -> Flow[None]:
+        params = {"after": str(self._after)}
+        request = Request("GET", self._path, params=params, slow=True, tries=self._tries, listens=True)
+        reply = (yield from deliver(request)).reply
+        check(reply)
+        self._over, self.feed, self._tries = reply.status == 204, reply.feed, RESUMING
+        self._rest.clear()
+        self._event.clear()
+        if not self._over and not reply.headers.get("content-type", "").startswith("text/event-stream"):
+            raise ServerError(
+                "the answer is not a stream of events; is this a specshield server?", status=reply.status
+            )
+
+    def _lines(self, piece: bytes) -> list[bytes]:
+        """The lines that are whole now. Raises ServerError for one that is too long."""
+        self._rest += piece
+        *whole, rest = bytes(self._rest).split(b"\n") if b"\n" in piece else [b""]
+        if max(map(len, whole), default=len(self._rest)) > LONGEST or len(rest) > LONGEST:
+            raise ServerError(f"a line of the stream of events has more than {LONGEST} bytes")
+        self._rest = bytearray(rest) if whole else self._rest
+        return whole
+
+    def _take(self, line: bytes) -> None:
+        name, _, value = line.partition(b":")
+        if name in (b"event", b"data"):
+            self._event[name] = value.removeprefix(b" ")
+        if line:
+            return
+        kind, data = self._event.get(b"event", b"message"), self._event.get(b"data")
+        self._event.clear()
+        self._over = self._over or kind == b"end"
+        if data is None or kind != b"message" or self._over:
+            return
+        try:
+            decision = self._decided(json.loads(data))
+        except (ValueError, RecursionError, AttributeError) as error:
+            raise ServerError(
+                f"the server told an event that this client does not understand: {error}"
+            ) from error
+        if decision.t > self._after:
+            self._found.append(decision)
+            self._after = decision.t

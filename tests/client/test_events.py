@@ -1,0 +1,119 @@
+"""The events of a session, from a network that breaks off, drips and never ends, through both shells."""
+
+import asyncio
+import contextlib
+import itertools
+import json
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+from client_script import SESSION
+from test_deadline import decided
+
+from specshield import errors
+from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient, events
+from specshield.client.models import build
+
+INFO = build(SessionInfo, SESSION)
+END = b'event: end\ndata: {"next_t": 9, "spec_status": "satisfied", "finished": true}\n\n'
+
+
+def told(*steps):
+    return b"".join(b"id: %d\ndata: %s\n\n" % (t, json.dumps(decided(t)).encode()) for t in steps)
+
+
+@pytest.fixture(params=["sync", "async"])
+def watch(request, monkeypatch):
+    """watch(*answers, most=None): the decisions that are read, and the queries of the requests made.
+
+    An answer is the bytes of a stream, a status, or an endless iterator of pieces.
+    """
+    monkeypatch.setattr(events, "PAUSE", 0.01)
+
+    def run(*answers, most=99, kind="text/event-stream"):
+        script, asked, over = list(answers), [], threading.Event()
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self):
+                asked.append(self.path.partition("?")[2])
+                answer = script.pop(0)
+                self.send_response(answer if isinstance(answer, int) else 200)
+                self.send_header("Content-Type", kind)
+                self.end_headers()
+                if isinstance(answer, bytes):
+                    self.wfile.write(answer)
+                elif not isinstance(answer, int):
+                    with contextlib.suppress(OSError):
+                        for piece in answer:
+                            self.wfile.write(piece)
+                            if over.wait(0.01):
+                                return
+
+            def log_message(self, *_):
+                pass
+
+        def blocking(url):
+            with ShieldClient(url, timeout=10.0) as client:
+                found = Session(client._run, INFO).events(-1)
+                return [decision.t for decision in itertools.islice(found, most)]
+
+        async def awaited(url):
+            async with AsyncShieldClient(url, timeout=10.0) as client:
+                found = []
+                async for decision in AsyncSession(client._run, INFO).events(-1):
+                    found.append(decision.t)
+                    if len(found) == most:
+                        break
+                return found
+
+        with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            url = f"http://127.0.0.1:{server.server_port}"
+            try:
+                return blocking(url) if request.param == "sync" else asyncio.run(awaited(url)), asked
+            finally:
+                over.set()
+                server.shutdown()
+
+    return run
+
+
+def test_a_stream_that_breaks_off_goes_on_where_it_was(watch):
+    whole = b"retry: 1000\n\n" + told(0) + b": alive\n\n" + told(1)
+    found, asked = watch(whole[:-9], b"", told(1, 2), told(4) + END)
+    assert found == [0, 1, 2, 4]
+    assert asked == ["after=-1", "after=0", "after=0", "after=2"]
+
+
+def test_where_nothing_follows_it_ends_at_once(watch):
+    assert watch(204) == ([], ["after=-1"])
+
+
+def test_a_reader_may_leave_in_between(watch):
+    assert watch(iter(lambda: told(0), None), most=1)[0] == [0]
+
+
+def test_what_brings_no_whole_line_is_given_up(watch, monkeypatch):
+    monkeypatch.setattr(events, "SILENCE", 0.3)
+    found, asked = watch(iter(lambda: b"data: ", None), told(3) + END)
+    assert (found, len(asked)) == ([3], 2)
+
+
+@pytest.mark.parametrize(
+    "stream", [iter(lambda: b"data: " * 1000, None), b"data: [1]\n\n", b"data: {\n\n", b'data: {"t": 0}\n\n']
+)
+def test_what_is_no_stream_of_events_is_an_error(watch, stream, monkeypatch):
+    monkeypatch.setattr(events, "LONGEST", 50_000)
+    with pytest.raises(errors.ServerError):
+        watch(stream)
+
+
+def test_a_page_is_no_stream(watch):
+    with pytest.raises(errors.ServerError, match="specshield server"):
+        watch(b"<html>", kind="text/html")
+
+
+def test_a_session_that_is_gone_is_not_found(watch):
+    with pytest.raises(errors.NotFound):
+        watch(told(0), 404)
