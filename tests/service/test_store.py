@@ -230,7 +230,7 @@ def test_a_store_of_ones_own_and_sessions_that_expire(tmp_path):
                 path = f"/v1/sessions/{session['id']}"
                 wait_for(lambda: client.get(path).status_code == 404, 60.0)
                 assert client.get("/v1/sessions").json() == {"items": [], "next": None}
-                assert connection.keys("specshield:*") == []
+                assert connection.keys(f"specshield:*{session['id']}*") == []
                 assert begin(client)["next_t"] == 0  # there is room again
     finally:
         own.leave()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -40,9 +39,10 @@ from specshield.shield import episode
 from specshield.shield.decision import Decision
 
 ROOM = 64 << 20  # bytes of sessions kept in memory, some 5,000 of them. Chosen by hand.
-LONG = 0.03  # [s] of a processor for one decision, from which on a session's are made in other processes
-SHORT = 0.001  # [s] of CPU: so long may a decision hold the event loop; see `Pace`
-WATCHED = 64  # decisions that `Pace` looks at
+WATCHED = 32  # decisions with the same policies that `Pace` looks at. Chosen by hand.
+SHORT = 0.005  # [s]; so long a decision may hold the event loop, as anything else of a request
+LONG = 0.03  # [s] of a processor for one decision
+SEVERAL = 3  # one or two may be long because kernels are loaded, or others use the processor
 
 
 @dataclass(frozen=True)
@@ -55,24 +55,29 @@ class Decided:
 
 
 class Pace:
-    """How long the last decisions with some policies took: those that are short are made on the event loop.
+    """How long decisions with some policies take.
 
-    Handing one to a thread and back costs more CPU than a short decision takes. A decision that is longer
-    would hold up all others, so with policies whose decisions are sometimes long, all go to a thread.
+    Where several of the last were longer than SHORT, or there were not enough to tell, the next is made in a
+    thread, else on the event loop; after several LONG ones, in another process. Handing a decision to a
+    thread and back costs about as much as most of them take.
     """
 
     def __init__(self) -> None:
-        self._last = deque[float]([math.inf], WATCHED)
-        self._longest = math.inf
+        self._over = deque[bool]([True] * SEVERAL, WATCHED)
+        self._long = 0
 
     @property
     def short(self) -> bool:
-        return self._longest <= SHORT
+        return len(self._over) == WATCHED and sum(self._over) < SEVERAL
 
-    def add(self, seconds: float) -> None:
-        fallen_out = self._last[0] if len(self._last) == WATCHED else 0.0
-        self._last.append(seconds)
-        self._longest = max(self._longest, seconds) if fallen_out < self._longest else max(self._last)
+    @property
+    def long(self) -> bool:
+        return self._long >= SEVERAL
+
+    def add(self, seconds: float, computed: float = 0.0) -> None:
+        """computed: those seconds that the processor was at it, as far as that was measured."""
+        self._over.append(seconds > SHORT)
+        self._long += computed > LONG
 
 
 class Steps:
@@ -154,16 +159,18 @@ class Steps:
             timing["rollout"] = timing.get("rollout", 0.0) + made[-1]
             return Decided(*made[:3])
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
-        if pace.short:
-            *made, seconds, cpu = timed(self._shields, session, request)
+        if pace.short:  # asking for the thread's own time would cost a tenth of the step
+            begun, cpu = time.perf_counter(), 0.0
+            made = decided(self._shields, session, request)
+            seconds = time.perf_counter() - begun
         else:
             loop = asyncio.get_running_loop()
             *made, seconds, cpu = await loop.run_in_executor(
                 self._threads, timed, self._shields, session, request
             )
         timing["rollout"] = timing.get("rollout", 0.0) + seconds
-        pace.add(cpu)
-        if cpu > LONG:
+        pace.add(seconds, cpu)
+        if pace.long:
             self._shields.note_slow(session)
         return Decided(*made)
 
