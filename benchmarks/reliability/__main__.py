@@ -39,7 +39,7 @@ def main() -> int:
     isolation.add_argument("--only", default="", help="only these attacks, separated by commas")
     isolation.add_argument("--resume", action="store_true", help="skip attacks whose figures are there")
     contract = parts.add_parser("contract", help="schemathesis")
-    contract.add_argument("--examples", type=int, default=150, help="cases of each operation")
+    contract.add_argument("--examples", type=int, default=100, help="cases of each operation")
     contract.add_argument("--seed", type=int, default=1)
     elsewhere = parts.add_parser("elsewhere", help="other measurements of benchmarks/ that the page shows")
     elsewhere.add_argument("--only", default="", help="only these modules, separated by commas")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import random
 
+import msgspec
 import schemathesis
 from hypothesis import strategies as st
 
@@ -34,3 +36,18 @@ def refusals_are_told(context, response, case) -> None:
     if positive and told["type"] == "invalid-input":
         said = str(told.get("expected")) + told["detail"]
         assert not any(words in said for words in NOT_FITTING), f"the schema allows what is refused: {told}"
+
+
+@schemathesis.serializer("application/msgpack")
+def packed(context, value) -> bytes:
+    """Integers that MessagePack cannot hold are sent as floats."""
+    return msgspec.msgpack.encode(json.loads(json.dumps(value), parse_int=_whole))
+
+
+def _whole(text: str) -> int | float:
+    return int(text) if -(2**63) <= int(text) < 2**64 else float(text)
+
+
+@schemathesis.deserializer("application/msgpack")
+def unpacked(context, response):
+    return msgspec.msgpack.decode(response.content)

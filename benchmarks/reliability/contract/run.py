@@ -88,7 +88,7 @@ def counted(folder: Path, said: str) -> dict[str, Any]:
     for report in folder.glob("*.ndjson"):
         for line in report.open(errors="replace"):
             answers.update(re.findall(r'"status_code":\s*(\d{3})', line))
-    for title, count in re.findall(r"^  ❌ (.+): (\d+)$", said, re.MULTILINE):
+    for title, count in re.findall(r"^  [❌🚫] (.+): (\d+)$", said, re.MULTILINE):
         failures[title] += int(count)
     cases = re.search(r"([\d,]+) generated", said)
     return {
