@@ -47,6 +47,8 @@ class Mover:
                     await self.move()
             except SpecshieldError as error:
                 log.warning("nothing moves to the archive now: %s", error)
+            except Exception:  # the next turn may fare better; without the mover the store would only grow
+                log.exception("nothing moves to the archive now")
             await asyncio.sleep(every)
 
     async def move(self) -> int:

@@ -95,9 +95,13 @@ class _Link(asyncio.Protocol):
     async def send(self, command: tuple[Any, ...], deadline: float) -> Any:
         if self.closed:
             raise redis.ConnectionError("the connection is closed")
+        try:
+            self._transport.write(hiredis.pack_command(command))
+        except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
+            self.close()
+            raise redis.ConnectionError(str(error)) from error
         answer: asyncio.Future[Any] = self._loop.create_future()
         self._waiting.append((answer, deadline))
-        self._transport.write(hiredis.pack_command(command))
         if self._watch is None:
             self._watch = self._loop.call_at(deadline, self._late)
         return await answer
