@@ -92,11 +92,13 @@ def test_a_map_that_nobody_uses_is_deleted(server):
         ShieldClient(server.url, timeout=60.0) as client,
         httpx.Client(base_url=server.url, timeout=60.0) as raw,
     ):
-        map = raw.post("/v1/maps", json=grid_json()).json()["id"]
-        policy = send_policy(raw)["id"]
+        used = raw.post("/v1/maps", json=grid_json()).json()["id"]
+        send_policy(raw)
         with pytest.raises(errors.InUse):
-            client.maps.delete(map)
-        client.policies.delete(policy)
+            client.maps.delete(used)
+        other = grid_json()
+        other["data"][0] = 0 if other["data"][0] else 100
+        map = raw.post("/v1/maps", json=other).json()["id"]
         client.maps.delete(map)
         with pytest.raises(errors.NotFound):
             client.maps.get(map)

@@ -183,8 +183,7 @@ def test_nothing_trains_on_without_its_server(tmp_path):
         wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (worker, learner, run)), 60.0)
     with serving(tmp_path) as server:  # no worker this time
         found = httpx.get(f"{server.url}/v1/policies/{policy['id']}").json()
-        assert found["status"] == "failed"
-        assert "ask for it again" in found["error"]
+        assert found["status"] == "queued"  # the worker, told to stop, handed it back
 
 
 def test_a_worker_waits_for_work_longer_than_the_store_may_take_to_answer(tmp_path):

@@ -38,4 +38,4 @@ def test_a_case_may_be_called_by_its_number():
 def test_an_unknown_case_is_told_with_those_there_are():
     with pytest.raises(errors.NotFound) as caught:
         load_case("case9")
-    assert caught.value.expected == "one of case1, case2"
+    assert caught.value.expected == "one of case1, case2, case2b"

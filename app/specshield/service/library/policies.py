@@ -176,8 +176,9 @@ class Policies:
                 "card"
             ) from None
         record = self.described(about, task)
+        card = {**card, "spec": record.about.spec}
         id = sent_id(record.id, card, weights)
-        card = {**card, "id": id, "spec": record.about.spec}  # never the sender's id
+        card["id"] = id  # never the sender's
         load_policy(weights, card, task)
         return self._add(
             replace(record, id=id, card=card),
