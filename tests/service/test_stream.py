@@ -102,7 +102,8 @@ def test_a_message_over_the_limit_ends_the_stream_and_no_other(server, begin):
         large.send(b" " * (2 << 20))
         with pytest.raises(ConnectionClosed) as closed:
             large.recv()
-        assert closed.value.rcvd.code == 1009
+        # What the server no longer reads of the message may reset the connection before its word arrives.
+        assert closed.value.rcvd is None or closed.value.rcvd.code == 1009
         stream.send(json.dumps(body(0)))
         assert json.loads(stream.recv())["t"] == 0
 
