@@ -79,6 +79,10 @@ def test_a_session_is_created_under_an_id_of_our_own():
         "evaluation": "feasibility",
         "shaping": "projection",
         "allow_infeasible": False,
+        "uncertainty": "learned",
+        "learn_map": True,
+        "map_memory": None,
+        "threshold_over": "step",
     }
     assert info.policy_ids == ("p",)
     _, (again,), _ = drive(

@@ -290,6 +290,7 @@ def test_the_public_names():
         "AsyncSession",
         "AsyncShieldClient",
         "Decision",
+        "Explanation",
         "LocalDecision",
         "Map",
         "Policy",

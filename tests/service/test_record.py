@@ -15,7 +15,7 @@ from specshield.client import ShieldClient
 from specshield.policy.dqn.environment import free_poses
 from specshield.service.schemas.answers import to_json, to_msgpack
 from specshield.service.sessions import record
-from specshield.shield.decision import Carry, Decision
+from specshield.shield.decision import Carry, Decision, Explanation
 from specshield.sim.cases import load_case
 from specshield.sim.episodes import with_shield
 from specshield.sim.learned.model import load_learned
@@ -66,6 +66,15 @@ def decisions(draw):
         witness=draw(st.sampled_from([None, actions()])),
         witnesses=holes([actions() for _ in range(count)]) if every else (),
         warnings=draw(st.sampled_from([(), ("a policy's motions could not be used", "é")])),
+        margin=draw(number),
+        slack=draw(st.integers(0, 1000)),
+        threshold_left=draw(number),
+        map_revision=draw(st.integers(0, 1000)),
+        explanations=holes(
+            [Explanation("F[0,9] A", draw(number), draw(st.none() | st.integers(1, 9)))] * count
+        )
+        if (explain := draw(st.booleans()))
+        else (),
         carry=Carry(0, np.zeros((1, 3)), (None,)),
     )
     short = random.normal(size=count).astype(np.float32).astype(float)
@@ -75,10 +84,11 @@ def decisions(draw):
     pose = row[:3].tolist() if draw(st.booleans()) else [draw(number) for _ in range(3)]
     signals = {"battery": 7.0} if draw(st.booleans()) else {}
     asked = (pose, logits, draw(st.booleans()), signals, ["battery", "fuel"], every)
-    return decision, row, asked
+    points = [draw(st.none() | st.just(random.normal(size=(n, 2)))) for n in (0, 3)]
+    return decision, row, asked, (*points, explain)
 
 
-def expected(decision, every):
+def expected(decision, every, explain):
     """The answer's members, straight from the decision."""
     residual = decision.residual
     shown = {name: getattr(decision, name) for name in decision.__dataclass_fields__ if name != "carry"}
@@ -89,28 +99,38 @@ def expected(decision, every):
     }
     if not every:
         del shown["witnesses"]
+    if not explain:
+        del shown["explanations"]
     return msgspec.to_builtins(shown, enc_hook=lambda array: array.tolist())
 
 
 @settings(deadline=None)
 @given(decisions())
 def test_a_record_reads_back_to_the_last_bit_and_answers_in_the_same_bytes(made):
-    decision, row, (pose, logits, done, signals, declared, every) = made
+    decision, row, (pose, logits, done, signals, declared, every), (occupied, free, explain) = made
     names = [f"a{i}" for i in range(len(decision.distribution))]
-    kept = record.make(decision, row, b"before", pose, logits, done, signals, declared, every)
+    kept = record.make(
+        decision, row, b"before", pose, logits, done, signals, declared, every, occupied, free, explain
+    )
     content = record.encode(kept)
     again = record.decode(content)
     assert record.encode(again) == content
     first, replayed = record.answer(kept, row, names), record.answer(again, row, names)
     assert to_json(first) == to_json(replayed)
     assert to_msgpack(first) == to_msgpack(replayed)
-    whole = msgspec.json.encode(expected(decision, every))  # every value, in the order of the contract
+    whole = msgspec.json.encode(
+        expected(decision, every, explain)
+    )  # every value, in the order of the contract
     assert to_json(first) == whole
     assert msgspec.json.encode(msgspec.msgpack.decode(to_msgpack(first))) == whole
     assert again.pose_sent(row).tobytes() == np.array(pose).tobytes()
     assert (again.logits_sent() is None) == (logits is None)
     assert logits is None or again.logits_sent().tobytes() == logits.tobytes()
     assert again.signals_sent(row, declared) == signals
+    for kind, points in (("occupied", occupied), ("free", free)):
+        kept_points = again.points_sent(kind)
+        assert (kept_points is None) == (points is None)
+        assert points is None or kept_points.tolist() == points.tolist()
     assert (again.main_task_done, again.all_witnesses, again.before) == (done, every, b"before")
 
 

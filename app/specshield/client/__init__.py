@@ -14,6 +14,7 @@ Errors are those of `specshield.errors`. Needs httpx and nothing else.
 from specshield.client.aio import AsyncSession, AsyncShieldClient
 from specshield.client.models import (
     Decision,
+    Explanation,
     LocalDecision,
     Map,
     Policy,
@@ -29,6 +30,7 @@ __all__ = [
     "AsyncSession",
     "AsyncShieldClient",
     "Decision",
+    "Explanation",
     "LocalDecision",
     "Map",
     "Policy",

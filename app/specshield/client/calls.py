@@ -210,6 +210,10 @@ def create_session(
     shaping: str = "projection",
     max_steps: int | None = None,
     allow_infeasible: bool = False,
+    uncertainty: Literal["learned", "none"] | Mapping[str, float] = "learned",
+    learn_map: bool = True,
+    map_memory: int | None = None,
+    threshold_over: Literal["step", "episode"] = "step",
     on_failure: OnFailure = "raise",
 ) -> Flow[SessionInfo]:
     """Begin at `initial_pose`, which is x_0: the first step's pose has to agree with it to 1e-6.
@@ -219,6 +223,12 @@ def create_session(
     `slack` are the robustness [m] and the steps to keep in hand. `shaping` is "projection" or one of the
     preferences that the server's /docs lists.
     Raises InfeasibleStart where no action has a satisfying future, unless `allow_infeasible`.
+
+    `uncertainty`: "learned" has margin and slack follow from how the robot moves; {"translation": m,
+    "rotation": rad, "slip": probability} says what is known of it before the first step; "none" takes the
+    world for exact. `learn_map`: a motion that stops short marks what it ran into. `map_memory`: the steps
+    after which a point sent as `occupied` is forgotten, None: never. `threshold_over`: whether `threshold`
+    holds at each "step" or over the whole "episode".
 
     `on_failure` says what a step is when the service cannot answer it in time. "raise": its error. "witness":
     a `LocalDecision` that follows the certified continuation received last; it says to stop where there is
@@ -238,6 +248,10 @@ def create_session(
         "evaluation": evaluation,
         "shaping": shaping,
         "allow_infeasible": allow_infeasible,
+        "uncertainty": uncertainty if isinstance(uncertainty, str) else dict(uncertainty),
+        "learn_map": learn_map,
+        "map_memory": map_memory,
+        "threshold_over": threshold_over,
     }
     body.update({"policy_id": policy_id} if policy_ids is None else {"policy_ids": list(policy_ids)})
     body.update({} if max_steps is None else {"max_steps": max_steps})

@@ -89,6 +89,10 @@ class Beginning(TypedDict, total=False):
     shaping: str
     max_steps: int | None
     allow_infeasible: bool
+    uncertainty: Literal["learned", "none"] | Mapping[str, float]
+    learn_map: bool
+    map_memory: int | None
+    threshold_over: Literal["step", "episode"]
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,17 @@ class Residual:
 
     translation: float
     rotation: float
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why an action is forbidden: the part of the rule that its best future does not keep, its robustness
+    there [m], and by how many steps that future comes too late (None where time is not what is missing).
+    """
+
+    conjunct: str
+    robustness: float | None
+    late_by: int | None
 
 
 @dataclass(frozen=True)
@@ -129,6 +144,11 @@ class Decision:
     timings: Mapping[str, float]  # [ms], from the Server-Timing header
     witnesses: tuple[tuple[int, ...] | None, ...] | None = None
     warnings: tuple[str, ...] = ()  # what did not go as it should, such as a policy that was not used
+    margin: float = 0.0  # [m] the robustness above 0 that J asked for
+    slack: int = 0  # [steps] that J asked to keep in hand
+    threshold_left: float = 1.0  # of the next step
+    map_revision: int = 0  # how often the session's own map has changed
+    explanations: tuple[Explanation | None, ...] | None = None  # of each forbidden action, if asked for
     source: Literal["service"] = "service"
 
 

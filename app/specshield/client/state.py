@@ -12,6 +12,7 @@ from specshield.client.core import Flow, Within, call, deliver
 from specshield.client.events import Events
 from specshield.client.models import (
     Decision,
+    Explanation,
     LocalDecision,
     Page,
     Pose,
@@ -26,12 +27,14 @@ from specshield.client.wire import (
     TRIES,
     Logits,
     Numbers,
+    Points,
     Reply,
     check,
     deadline_value,
     get,
     json_object,
     logit_values,
+    point_values,
     pose_values,
     post,
     signal_values,
@@ -90,6 +93,9 @@ class SessionState:
         main_task_done: bool | None = None,
         signals: Mapping[str, float] | None = None,
         witnesses: bool = False,
+        occupied: Points | None = None,
+        free: Points | None = None,
+        explain: bool = False,
         deadline: float | None = None,
     ) -> Flow[Decision | LocalDecision]:
         """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
@@ -98,6 +104,8 @@ class SessionState:
         terminal action. A caller that draws from `decision.distribution` itself says True or False.
         `logits` may be None once it is true. `deadline` [s] is a hard limit on the whole call, retries
         included, whatever the server does; without one it is five timeouts of the client.
+        `occupied` and `free` are points (x, y) at which the robot's sensors see an obstacle or free floor
+        now, in the map frame; `explain` has the decision say of each forbidden action what it would break.
         Raises whatever went wrong and stays at t: call again with the same pose and logits, or `record`
         the pose and move on. With `on_failure` "witness" or "stop" it raises only what the caller got wrong;
         where the service cannot answer, a `LocalDecision` says what to do. A `main_task_done` of True said
@@ -113,6 +121,11 @@ class SessionState:
         }
         if signals is not None:
             body["signals"] = signal_values(signals)
+        for name, points in (("occupied", occupied), ("free", free)):
+            if points is not None:
+                body[name] = point_values(points, name)
+        if explain:
+            body["explain"] = True
         own = main_task_done is None
         if self.on_failure == "raise":
             return (yield from self._ask(x_t, body, own, TRIES))
@@ -255,11 +268,14 @@ class SessionState:
 def _decision(
     body: Mapping[str, Any], terminal: tuple[int, ...], over: bool, timings: Mapping[str, float]
 ) -> Decision:
-    residual = body.get("residual")
+    residual, told = body.get("residual"), body.get("explanations")
     return build(
         Decision,
         body,
         residual=None if residual is None else build(Residual, residual),
+        explanations=None
+        if told is None
+        else tuple(None if why is None else build(Explanation, why) for why in told),
         timings=timings,
         execute=_execute(body, terminal, over),
         source="service",

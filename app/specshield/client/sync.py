@@ -30,7 +30,7 @@ from specshield.client.models import Decision, LocalDecision, Map, Policy, Sessi
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Logits, Numbers, Reply, Request
+from specshield.client.wire import TRIES, Failure, Logits, Numbers, Points, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
 if TYPE_CHECKING:
@@ -258,6 +258,9 @@ class Session(SessionState, Generic[D]):
             main_task_done: bool | None = None,
             signals: Mapping[str, float] | None = None,
             witnesses: bool = False,
+            occupied: Points | None = None,
+            free: Points | None = None,
+            explain: bool = False,
             deadline: float | None = None,
         ) -> D: ...
     else:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 from urllib.parse import quote
 
 from specshield.client.models import Pose
@@ -30,6 +30,7 @@ from specshield.errors import (
 )
 
 
+@runtime_checkable
 class Array(Protocol):
     """Any array (numpy, torch, array.array), known by its `tolist`."""
 
@@ -38,6 +39,7 @@ class Array(Protocol):
 
 Numbers = Iterable[float] | Array
 Logits = Iterable[float | None] | Array
+Points = Iterable[Numbers] | Array
 TRIES = 5
 Content = bytes | str | os.PathLike[str]
 
@@ -172,6 +174,19 @@ def pose_values(pose: Numbers, where: str = "pose") -> Pose:
     if len(values) != 3 or not all(map(math.isfinite, values)):
         raise PoseError("a pose is three finite numbers", path=where, got=values, expected="[x, y, theta]")
     return values[0], values[1], values[2]
+
+
+def point_values(points: Points, where: str) -> list[list[float]]:
+    """Points (x, y) in metres, map frame. InputError unless each is two finite numbers."""
+    found = []
+    for i, point in enumerate(points.tolist() if isinstance(points, Array) else points):
+        values = _floats(point, InputError, f"{where}[{i}]", "two finite numbers x, y")
+        if len(values) != 2 or not all(map(math.isfinite, values)):
+            raise InputError(
+                "a point is two finite numbers", path=f"{where}[{i}]", got=values, expected="[x, y]"
+            )
+        found.append(values)
+    return found
 
 
 def logit_values(logits: Logits) -> list[float | None]:

@@ -16,12 +16,13 @@ from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions import chain, history, record
 from specshield.service.sessions.chain import Chain
+from specshield.service.sessions.config import settings_of
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import columns
 from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
 from specshield.shield import episode
-from specshield.shield.decision import Carry, Config, Shield, make_shield
+from specshield.shield.decision import Carry, Shield, make_shield
 
 
 def verify(file: Path, settings: Settings) -> int:
@@ -91,9 +92,17 @@ def _again(
         raise InputError(f"step {t} is of {len(kept.rows)} actions", t=t)
     if not history.agree(kept.pose_sent(rows[-1]), rows[-1, :3]).all():
         raise InputError(f"the pose sent at step {t} is not the one stored", t=t)
-    logits = kept.logits_sent()
+    logits, points = kept.logits_sent(), (kept.points_sent("occupied"), kept.points_sent("free"))
     decision = episode.decide(
-        shield, rows[:, :3], logits, kept.main_task_done, columns(rows, names), carry, kept.all_witnesses
+        shield,
+        rows[:, :3],
+        logits,
+        kept.main_task_done,
+        columns(rows, names),
+        carry,
+        kept.all_witnesses,
+        *points,
+        kept.explain,
     )
     made = record.make(
         decision,
@@ -105,6 +114,8 @@ def _again(
         kept.signals_sent(rows[-1], names),
         names,
         kept.all_witnesses,
+        *points,
+        kept.explain,
     )
     return made, pack_carry(decision.carry).unpacked()
 
@@ -121,10 +132,7 @@ def _shield(found: Chain, settings: Settings) -> Shield:
             settings = settings.model_copy(update={"data_dir": Path(folder)})
         policies = Policies(settings, Maps(settings))
         proposers = [policies.policy(policies.record(id)) for id in config.policy_ids]
-    kept = Config(
-        config.threshold, config.margin, config.slack, config.evaluation, config.max_steps, config.seed
-    )
-    shield = replace(make_shield(proposers), config=kept)
+    shield = replace(make_shield(proposers), config=settings_of(msgspec.structs.asdict(config)))
     task = shield.task
     if [*task.robot.action_names] != config.actions or str(task.formula) != config.spec.formula:
         raise InputError("the policy at hand is for another task", expected=config.spec.formula)

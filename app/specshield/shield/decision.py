@@ -13,11 +13,13 @@ from specshield.robot.dynamics import Body, make_body
 from specshield.rule.view import View, view_of
 from specshield.shield.preference import Preference
 from specshield.shield.proposal import Proposer
+from specshield.shield.uncertainty import Uncertainty
 from specshield.stl import Verdict
 from specshield.task import Task
 
 Mode = Literal["prior", "shaped", "completion", "fallback", "violated"]
 Reason = Literal["infeasible", "zero_prior_mass", "margin_unattainable"]
+ThresholdOver = Literal["step", "episode"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,11 @@ class Config:
     > margin [m]. slack: J asks for each F of the conjunction this many steps early. Where the margin or the
     slack cannot be had, J asks for as much of it as can be. max_steps: None is max(600, T + 1). seed: of the
     drawn actions.
+
+    uncertainty: None takes f for exact, as the paper does; else margin and slack follow from what is known
+    and learned of the robot, and those given are the least that is kept. threshold_over: whether delta holds
+    at each `step` or over the whole `episode`. learn_map: whether a motion that stops short marks what it
+    ran into. map_memory: for how many steps an `occupied` point stays [steps]; None: for ever.
     """
 
     threshold: float = 1.0
@@ -36,6 +43,10 @@ class Config:
     evaluation: str = "feasibility"
     max_steps: int | None = None
     seed: int = 0
+    uncertainty: Uncertainty | None = None
+    threshold_over: ThresholdOver = "step"
+    learn_map: bool = False
+    map_memory: int | None = None
 
     def __post_init__(self) -> None:
         if self.evaluation not in ("feasibility", "robustness"):
@@ -58,6 +69,18 @@ class Config:
         if self.slack < 0:
             raise InputError(
                 "the slack is out of range", path="slack", got=self.slack, expected="0 or more steps"
+            )
+        if self.threshold_over == "episode" and not binary:
+            raise InputError(
+                "a threshold over the episode is a probability, and evaluation 'robustness' has metres",
+                path="threshold_over", got="episode", expected="'step', or evaluation 'feasibility'",
+            )  # fmt: skip
+        if self.map_memory is not None and self.map_memory < 1:
+            raise InputError(
+                "the map's memory is out of range",
+                path="map_memory",
+                got=self.map_memory,
+                expected="1 or more steps, or null for ever",
             )
 
 
@@ -124,13 +147,32 @@ class Carry:
     """What one decision hands to the next: each motion's next pose and its certified continuation.
 
     next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it; None: not certified.
-    memory: of the session's preference.
+    memory: of the session's preference. residuals: what is known of the robot by now (uncertainty.py).
+    threshold_left: what is left of a threshold over the episode. learned: what the session's map has that the
+    policy's has not (world/learned.py). action: the one that was drawn, which the caller may have executed.
     """
 
     t: int
     next_poses: Floats
     witnesses: tuple[bytes | None, ...]
     memory: bytes | None = None
+    residuals: bytes | None = None
+    threshold_left: float | None = None
+    learned: bytes | None = None
+    action: int | None = None
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why an action is forbidden.
+
+    conjunct: the part of the formula that its best future does not keep. robustness: of that part on it [m].
+    late_by: by how many steps the future comes too late, None where time is not what is missing.
+    """
+
+    conjunct: str
+    robustness: float
+    late_by: int | None
 
 
 @dataclass(frozen=True)
@@ -143,6 +185,10 @@ class Decision:
     next_poses [A, 3]. residual: (m, rad) between x_t and the nearest pose the last decision foresaw, None
     where there was none. witness: the action indices that follow `action`; witnesses: the same for every
     action. warnings: what did not go as it should, such as a policy that was not used.
+
+    margin [m], slack [steps]: what J asked for at this step. threshold_left: delta of the next step.
+    map_revision: how often the session's map has changed. explanations: one an action, None where it is
+    allowed; empty where they were not asked for.
     """
 
     t: int
@@ -164,4 +210,9 @@ class Decision:
     witness: tuple[int, ...] | None
     witnesses: tuple[tuple[int, ...] | None, ...]
     warnings: tuple[str, ...]
+    margin: float
+    slack: int
+    threshold_left: float
+    map_revision: int
+    explanations: tuple[Explanation | None, ...]
     carry: Carry

@@ -90,12 +90,17 @@ def decide(
     signals: Signals | None = None,
     carry: Carry | None = None,
     witnesses: bool = False,
+    occupied: ArrayLike | None = None,
+    free: ArrayLike | None = None,
+    explain: bool = False,
 ) -> Decision:
     """One decision of Algorithm 1, at t = len(history) - 1.
 
     history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main
     task is over; signals {name: [t + 1]}; carry: what the decision at t - 1 handed on; witnesses: give every
-    action's. Raises LogitsError for logits that are missing, NaN, +inf, all -inf or of the wrong number.
+    action's; occupied, free [n, 2]: what the robot's sensors see of the map now; explain: say why each action
+    that is forbidden is. Raises LogitsError for logits that are missing, NaN, +inf, all -inf or of the wrong
+    number.
     """
     task, robot = shield.task, shield.task.robot
     poses = _history(history)
@@ -148,7 +153,12 @@ def decide(
         if witnesses
         else (),
         warnings=() if judged is None else judged.tried.warnings,
-        carry=Carry(t, nexts, certified, memory),
+        margin=shield.config.margin,
+        slack=shield.config.slack,
+        threshold_left=shield.config.threshold,
+        map_revision=0,
+        explanations=(),
+        carry=Carry(t, nexts, certified, memory, action=action),
     )
 
 

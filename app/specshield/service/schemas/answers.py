@@ -10,6 +10,12 @@ class Residual(msgspec.Struct, frozen=True):
     rotation: float
 
 
+class Explanation(msgspec.Struct, frozen=True):
+    conjunct: str
+    robustness: float | None
+    late_by: int | None
+
+
 class StepAnswer(msgspec.Struct, frozen=True, kw_only=True):
     """The members in the order in which they are written; what they mean is said in `StepResponse`."""
 
@@ -32,6 +38,11 @@ class StepAnswer(msgspec.Struct, frozen=True, kw_only=True):
     witness: list[int] | None
     witnesses: tuple[list[int] | None, ...] | msgspec.UnsetType = msgspec.UNSET
     warnings: tuple[str, ...]
+    margin: float
+    slack: int
+    threshold_left: float
+    map_revision: int
+    explanations: tuple[Explanation | None, ...] | msgspec.UnsetType = msgspec.UNSET
 
 
 _json, _msgpack = msgspec.json.Encoder(), msgspec.msgpack.Encoder()

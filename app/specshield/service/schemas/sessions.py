@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 from pydantic import ConfigDict, Field, JsonValue, model_validator
@@ -9,6 +10,7 @@ from pydantic import ConfigDict, Field, JsonValue, model_validator
 from specshield.lookahead.preferences import PREFERENCES, PROJECTION
 from specshield.service import examples
 from specshield.service.schemas.base import Answer, Id, Name, Pose, SpecStatus, Strict
+from specshield.shield.uncertainty import MOST_TRANSLATION
 
 
 def _describe_shaping(schema: dict[str, Any]) -> None:
@@ -17,6 +19,21 @@ def _describe_shaping(schema: dict[str, Any]) -> None:
     told = [f"`{name}`: {kind.about}" for name, kind in PREFERENCES.usable()]
     none = f"`{PROJECTION}`: the closest distribution that keeps the rule."
     schema["description"] = " ".join(["What the answer prefers within the rule.", none, *told])
+
+
+class KnownUncertainty(Strict):
+    """What is known of the robot before its first step."""
+
+    translation: float = Field(
+        ge=0.0,
+        le=MOST_TRANSLATION,
+        description="Standard deviation of where a motion leads, along each axis [m].",
+    )
+    rotation: float = Field(ge=0.0, le=math.pi, description="The same of its heading [rad].")
+    slip: float = Field(0.0, ge=0.0, le=1.0, description="Probability that a motion is not executed at all.")
+
+
+Uncertain = Literal["learned", "none"] | KnownUncertainty
 
 
 class SessionRequest(Strict):
@@ -60,6 +77,25 @@ class SessionRequest(Strict):
         None, ge=1, description="The session ends there [steps]. Default: max(600, T + 1)."
     )
     allow_infeasible: bool = Field(False, description="Start even where no action has a satisfying future.")
+    uncertainty: Uncertain = Field(
+        "learned",
+        description="`learned`: margin and slack of every decision follow from how the robot has moved so "
+        "far. They begin cautious and let go as the world proves exact; a `margin` or `slack` given is the "
+        "least that is kept. An object says what is known before the first step. `none`: the world is as "
+        "told, as in the paper.",
+    )
+    learn_map: bool = Field(
+        True, description="A motion that stops short of what was foreseen marks what it ran into."
+    )
+    map_memory: int | None = Field(
+        None,
+        ge=1,
+        le=1_000_000,
+        description="An `occupied` point is forgotten after so many steps; null: never.",
+    )
+    threshold_over: Literal["step", "episode"] = Field(
+        "step", description="Whether `threshold` holds at each step, or for the episode as a whole."
+    )
 
     @model_validator(mode="after")
     def _one_way_to_name_policies(self) -> SessionRequest:
@@ -88,6 +124,14 @@ class SessionResponse(Answer):
     slack: int = Field(description="Steps kept in hand.")
     evaluation: str = Field(description="`feasibility` or `robustness`.")
     shaping: str = Field(description="`projection`, or the name of a preference.")
+    uncertainty: Uncertain = Field(
+        "none", description="What is taken of how exactly the robot moves: `learned`, `none`, or as given."
+    )
+    learn_map: bool = Field(False, description="Whether motions that stop short mark what they ran into.")
+    map_memory: int | None = Field(
+        None, description="Steps after which an `occupied` point is forgotten; null: never."
+    )
+    threshold_over: str = Field("step", description="`step` or `episode`.")
     max_steps: int = Field(description="The last step there can be.")
     next_t: int = Field(description="The step expected next.")
     feasible: bool = Field(description="Whether some action from x_0 had a satisfying future.")

@@ -8,8 +8,10 @@ import msgspec
 from pydantic import ConfigDict, Field, model_validator
 
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Pose, SpecStatus, Strict
+from specshield.service.schemas.base import Answer, Point, Pose, SpecStatus, Strict
 from specshield.service.schemas.sessions import SessionResponse
+
+MOST_POINTS = 2000  # of each kind, in one step
 
 
 class StepRequest(Strict):
@@ -39,6 +41,19 @@ class StepRequest(Strict):
         description="Samples at t of the signals that the spec declares; one left out holds its last value.",
     )
     witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
+    occupied: list[Point] | None = Field(
+        None,
+        max_length=MOST_POINTS,
+        fail_fast=True,
+        description="Points at which the robot's sensors see an obstacle now, map frame. They count at once.",
+    )
+    free: list[Point] | None = Field(
+        None,
+        max_length=MOST_POINTS,
+        fail_fast=True,
+        description="Points at which the robot's sensors see free floor now, map frame.",
+    )
+    explain: bool = Field(False, description="Say of each forbidden action what it would break.")
 
 
 LARGEST = 1.7976931348623157e308  # what is beyond, or not a number, is refused
@@ -46,6 +61,12 @@ Finite = Annotated[float, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
 SentPose = Annotated[
     list[Annotated[float, msgspec.Meta(ge=-1e8, le=1e8)]], msgspec.Meta(min_length=3, max_length=3)
 ]
+
+
+SentPoint = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-1e8, le=1e8)]], msgspec.Meta(min_length=2, max_length=2)
+]
+SentPoints = Annotated[list[SentPoint], msgspec.Meta(max_length=MOST_POINTS)]
 
 
 class StepBody(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -57,11 +78,22 @@ class StepBody(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     main_task_done: bool = False
     signals: Annotated[dict[str, Finite], msgspec.Meta(max_length=64)] | None = None
     witnesses: bool = False
+    occupied: SentPoints | None = None
+    free: SentPoints | None = None
+    explain: bool = False
 
 
 class Residual(Answer):
     translation: float = Field(description="In metres.")
     rotation: float = Field(description="In radians.")
+
+
+class Explanation(Answer):
+    conjunct: str = Field(description="The part of the formula that the action's best future does not keep.")
+    robustness: float | None = Field(description="Of that part on it; null: it has none.")
+    late_by: int | None = Field(
+        description="By how many steps that future comes too late; null where time is not what is missing."
+    )
 
 
 class StepResponse(Answer):
@@ -101,6 +133,17 @@ class StepResponse(Answer):
     witness: list[int] | None = Field(description="Action indices that follow `action` to the horizon.")
     witnesses: list[list[int] | None] | None = Field(
         None, description="The same for each action, if asked for."
+    )
+    margin: float = Field(description="The robustness above 0 that J asked for at this step [m].")
+    slack: int = Field(description="The steps in hand that J asked for at this step.")
+    threshold_left: float = Field(
+        description="The threshold of the next step; it changes where `threshold_over` is `episode`."
+    )
+    map_revision: int = Field(
+        description="How often the session's own map has changed; 0: it is the policy's."
+    )
+    explanations: list[Explanation | None] | None = Field(
+        None, description="Why each action is forbidden, if asked for; null for one that is allowed."
     )
 
 

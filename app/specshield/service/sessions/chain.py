@@ -55,6 +55,10 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     evaluation: str
     max_steps: int
     shaping: str
+    uncertainty: Literal["learned", "none"] | dict[str, float] = "none"
+    threshold_over: Literal["step", "episode"] = "step"
+    learn_map: bool = False
+    map_memory: int | None = None
 
 
 @dataclass(frozen=True)

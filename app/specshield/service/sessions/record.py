@@ -13,16 +13,18 @@ afterwards without its being seen.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.service.schemas.answers import Residual, StepAnswer
+from specshield.service.schemas.answers import Explanation, Residual, StepAnswer
 from specshield.shield.decision import Decision
 
-FORMAT = 1
+FORMAT = 2
 COLUMNS = 5  # of an action's row in the table: J, rho, x, y, theta
 
 
@@ -34,6 +36,8 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     Asked: pose, x_t as it was sent, three float64, None where it is the stored one to the bit. logits: as
     `_pack_logits` has them. signals: which of the declared names (in alphabetical order) were sent, bit i
     for name i; their values are in the row. all_witnesses: whether one was asked for each action.
+
+    occupied, free: the points that were sent, two float64 each. explain: whether explanations were asked for.
 
     Answered: distribution, as `_sparse` has it. rows: for each action, which distinct row of the table is
     its own. table: each distinct row's J, rho and next pose (x, y, theta), as indices into `pool`, in one
@@ -66,6 +70,19 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     witness: bytes | None
     witnesses: tuple[bytes | None, ...]
     warnings: tuple[str, ...]
+    margin: float
+    slack: int
+    threshold_left: float
+    map_revision: int
+    occupied: bytes | None
+    free: bytes | None
+    explain: bool
+    explanations: tuple[Explanation | None, ...]
+
+    def points_sent(self, kind: str) -> Floats | None:
+        """[n, 2]: the `occupied` or `free` points that were sent; None where none were."""
+        content = getattr(self, kind)
+        return None if content is None else np.frombuffer(content, "<f8").reshape(-1, 2)
 
     def logits_sent(self) -> Floats | None:
         """[A], -inf where the logit was null; None where none were sent."""
@@ -117,6 +134,9 @@ def make(
     signals: Mapping[str, float],
     names: Sequence[str],
     all_witnesses: bool,
+    occupied: Floats | None = None,
+    free: Floats | None = None,
+    explain: bool = False,
 ) -> StepRecord:
     """The record of `decision`, made at the stored `row` for a caller who sent what follows.
 
@@ -152,13 +172,26 @@ def make(
         witness=None if decision.witness is None else bytes(decision.witness),
         witnesses=tuple(None if w is None else bytes(w) for w in decision.witnesses),
         warnings=decision.warnings,
+        margin=decision.margin,
+        slack=decision.slack,
+        threshold_left=decision.threshold_left,
+        map_revision=decision.map_revision,
+        occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
+        free=None if free is None else free.astype("<f8").tobytes(),
+        explain=explain,
+        explanations=tuple(
+            None if why is None else Explanation(why.conjunct, _finite(why.robustness), why.late_by)
+            for why in decision.explanations
+        ),
     )
 
 
 def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
     """What the caller was answered. row: the stored one of this step; names: of the actions."""
     table = _unpack_table(record, row)
-    asked: dict[str, tuple[list[int] | None, ...]] = {}
+    asked: dict[str, Any] = {}
+    if record.explain:
+        asked["explanations"] = record.explanations
     if record.all_witnesses:
         asked["witnesses"] = tuple(None if w is None else list(w) for w in record.witnesses)
     return StepAnswer(
@@ -180,8 +213,16 @@ def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
         in_collision=record.in_collision,
         witness=None if record.witness is None else list(record.witness),
         warnings=record.warnings,
+        margin=record.margin,
+        slack=record.slack,
+        threshold_left=record.threshold_left,
+        map_revision=record.map_revision,
         **asked,
     )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _known(row: Floats) -> Floats:

@@ -21,7 +21,6 @@ from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
 from specshield.task import LARGEST, SIGNAL, Task
 
-CONFIG = ("seed", "threshold", "margin", "slack", "evaluation", "max_steps")  # what a `Shield` is set by
 RACES = 10  # writes lost to others before a caller is told so
 
 
@@ -118,10 +117,13 @@ def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:
         and (request.signals or {}) == kept.signals_sent(row, session.signal_names)
         and request.main_task_done == kept.main_task_done
         and _equal(logits_of(request), kept.logits_sent())
+        and _equal(points_of(request.occupied), kept.points_sent("occupied"))
+        and _equal(points_of(request.free), kept.points_sent("free"))
     )
     if not same:
         raise StepConflict(
-            f"step {request.t} was decided for another x_t, logits, signals or main_task_done",
+            f"step {request.t} was decided for another x_t, logits, signals, main_task_done, occupied or "
+            "free",
             path="t",
             got=request.t,
             expected=f"the same request again, or step {session.state.next_t}",
@@ -136,6 +138,11 @@ def logits_of(request: StepBody) -> Floats | None:
     if request.logits is None:
         return None
     return np.array([-np.inf if value is None else value for value in request.logits], np.float64)
+
+
+def points_of(sent: Sequence[Sequence[float]] | None) -> Floats | None:
+    """[n, 2]: the points of a request; None where none were sent."""
+    return None if sent is None else np.array(sent, np.float64).reshape(-1, 2)
 
 
 def _equal(a: Floats | None, b: Floats | None) -> bool:

@@ -29,8 +29,8 @@ from specshield.service.library.policies import Description, Policies
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import CloseRequest
 from specshield.service.sessions import chain, record
+from specshield.service.sessions.config import asked_for, stored
 from specshield.service.sessions.session import (
-    CONFIG,
     RACES,
     Session,
     columns,
@@ -111,7 +111,7 @@ class Sessions:
             expected = f"at most {self._settings.max_steps}"
             raise InputError("too many steps", path="max_steps", got=request.max_steps, expected=expected)
         check_shaping(request.shaping)
-        config = Config(**{name: getattr(request, name) for name in CONFIG})
+        config = asked_for(request)
         if request.shaping != PROJECTION:
             check_preferring(config)
         return config
@@ -268,7 +268,7 @@ def begin(
         "horizon": task.horizon,
         "actions": list(task.robot.action_names),
         "terminal_actions": np.flatnonzero(task.robot.terminal).tolist(),
-        **{name: getattr(settings, name) for name in CONFIG},
+        **stored(settings, request),
         "shaping": request.shaping,
         "max_steps": shield.max_steps,
         "created_at": files.now(),

@@ -12,7 +12,8 @@ from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.service.library import files
 from specshield.service.library.policies import Policies
 from specshield.service.schemas.sessions import SessionRequest
-from specshield.service.sessions.session import CONFIG, Session
+from specshield.service.sessions.config import settings_of
+from specshield.service.sessions.session import Session
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 
@@ -57,8 +58,7 @@ class Shields:
 
     def of(self, session: Session) -> Shield:
         """The session's shield, with its preference if that is at hand."""
-        config = Config(**{name: session.config[name] for name in CONFIG if name in session.config})
-        shield = self.get(session.config["policy_ids"], config)
+        shield = self.get(session.config["policy_ids"], settings_of(session.config))
         if session.config["shaping"] == PROJECTION:
             return shield
         return replace(shield, preference=self._preference_at_hand(shield, session))

@@ -42,14 +42,36 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
     next_poses: bytes
     witnesses: tuple[bytes | None, ...]
     memory: bytes | None
+    residuals: bytes | None = None
+    threshold_left: float | None = None
+    learned: bytes | None = None
+    action: int | None = None
 
     def unpacked(self) -> Carry:
         poses = np.frombuffer(self.next_poses, "<f8").reshape(-1, 3)
-        return Carry(self.t, poses, self.witnesses, self.memory)
+        return Carry(
+            self.t,
+            poses,
+            self.witnesses,
+            self.memory,
+            self.residuals,
+            self.threshold_left,
+            self.learned,
+            self.action,
+        )
 
 
 def pack_carry(carry: Carry) -> PackedCarry:
-    return PackedCarry(carry.t, carry.next_poses.astype("<f8").tobytes(), carry.witnesses, carry.memory)
+    return PackedCarry(
+        carry.t,
+        carry.next_poses.astype("<f8").tobytes(),
+        carry.witnesses,
+        carry.memory,
+        carry.residuals,
+        carry.threshold_left,
+        carry.learned,
+        carry.action,
+    )
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -30,6 +30,7 @@ from specshield.service.sessions.session import (
     contended,
     logits_of,
     missing,
+    points_of,
     replay,
 )
 from specshield.service.sessions.shields import Shields
@@ -190,8 +191,18 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
     state, logits = session.state, logits_of(request)
     session = session.extended(request.t, np.array(request.poses, np.float64), signals)
     carry = None if state.carry is None else state.carry.unpacked()
+    occupied, free = points_of(request.occupied), points_of(request.free)
     decision = episode.decide(
-        shield, session.poses, logits, request.main_task_done, session.signals, carry, request.witnesses
+        shield,
+        session.poses,
+        logits,
+        request.main_task_done,
+        session.signals,
+        carry,
+        request.witnesses,
+        occupied,
+        free,
+        request.explain,
     )
     made = record.make(
         decision,
@@ -203,6 +214,9 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
         signals,
         session.signal_names,
         request.witnesses,
+        occupied,
+        free,
+        request.explain,
     )
     return session, decision, made
 

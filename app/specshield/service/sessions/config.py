@@ -1,0 +1,51 @@
+"""A session's settings, as its stored config holds them and as a shield takes them (pure)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from specshield.service.schemas.sessions import KnownUncertainty, SessionRequest, Uncertain
+from specshield.shield.decision import Config
+from specshield.shield.uncertainty import Uncertainty
+
+# The settings that are stored by the names that `Config` has for them.
+ALIKE = (
+    "seed",
+    "threshold",
+    "margin",
+    "slack",
+    "evaluation",
+    "max_steps",
+    "threshold_over",
+    "learn_map",
+    "map_memory",
+)
+
+
+def settings_of(config: Mapping[str, Any]) -> Config:
+    """Of a stored config. One from before a setting existed has the paper's default for it."""
+    alike = {name: config[name] for name in ALIKE if name in config}
+    return Config(**alike, uncertainty=_uncertainty(config.get("uncertainty", "none")))
+
+
+def asked_for(request: SessionRequest) -> Config:
+    """What a request asks for. Raises InputError for settings that cannot be had."""
+    alike = {name: getattr(request, name) for name in ALIKE}
+    return Config(**alike, uncertainty=_uncertainty(_told(request.uncertainty)))
+
+
+def stored(settings: Config, request: SessionRequest) -> dict[str, Any]:
+    """The settings as the config holds them."""
+    alike = {name: getattr(settings, name) for name in ALIKE}
+    return {**alike, "uncertainty": _told(request.uncertainty)}
+
+
+def _told(uncertainty: Uncertain) -> str | dict[str, float]:
+    return uncertainty.model_dump() if isinstance(uncertainty, KnownUncertainty) else uncertainty
+
+
+def _uncertainty(told: str | Mapping[str, float]) -> Uncertainty | None:
+    if isinstance(told, str):
+        return Uncertainty() if told == "learned" else None
+    return Uncertainty(**told)
