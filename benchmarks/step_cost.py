@@ -174,7 +174,19 @@ def example() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def measure(robots: list[int], steps: int, seed: int, ways: list[str]) -> list[dict[str, Any]]:
+def _run(
+    url: str, port: int, way: str, count: int, steps: int, seed: int, pids: list[int]
+) -> dict[str, float]:
+    """What a step costs these processes while `count` robots drive."""
+    store = [pid for pid in pids if "valkey" in _command(pid).split(" ")[0]]
+    before, stored, sessions = cpu(pids), cpu(store), count * steps
+    waits, (sent, got) = asyncio.run(drive(url, port, way, count, steps, seed))
+    row = {"us": 1e6 * (cpu(pids) - before) / sessions, "store": 1e6 * (cpu(store) - stored) / sessions}
+    row |= {"sent": sent / sessions, "got": got / sessions}
+    return row | {f"p{q}": 1e3 * float(np.percentile(waits, q)) for q in (50, 99)}
+
+
+def measure(robots: list[int], steps: int, rounds: int, seed: int, ways: list[str]) -> list[dict[str, Any]]:
     rows = []
     port = _free_port()
     arguments = [sys.executable, "-m", "benchmarks.step_cost", "--serve-bare", str(port)]
@@ -185,16 +197,14 @@ def measure(robots: list[int], steps: int, seed: int, ways: list[str]) -> list[d
             asyncio.run(drive(url, port, "bare", 2, 20, seed))  # both warm
             asyncio.run(drive(url, port, "json", 2, 20, seed))
             for count in robots:
-                for way in ways:
-                    pids = [bare.pid] if way == "bare" else family(server)
-                    store = [pid for pid in pids if "valkey" in _command(pid).split(" ")[0]]
-                    before, stored, sessions = cpu(pids), cpu(store), count * steps
-                    waits, (sent, got) = asyncio.run(drive(url, port, way, count, steps, seed))
-                    row = {"robots": count, "way": way, "us": 1e6 * (cpu(pids) - before) / sessions}
-                    row |= {"store": 1e6 * (cpu(store) - stored) / sessions}
-                    row |= {"sent": sent / sessions, "got": got / sessions}
-                    row |= {f"p{q}": 1e3 * float(np.percentile(waits, q)) for q in (50, 99)}
-                    rows.append(row)
+                runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}
+                for k in range(rounds):  # in turn, since the machine's pace changes
+                    for way in ways:
+                        pids = [bare.pid] if way == "bare" else family(server)
+                        runs[way].append(_run(url, port, way, count, steps, seed + k, pids))
+                for way, found in runs.items():
+                    mean = {name: sum(run[name] for run in found) / rounds for name in found[0]}
+                    rows.append({"robots": count, "way": way, **mean})
         finally:
             bare.terminate()
     return rows
@@ -217,6 +227,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=[1, 16, 64])
     parser.add_argument("--steps", type=int, default=100, help="of each robot")
+    parser.add_argument("--rounds", type=int, default=5, help="of all ways in turn; their mean is shown")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ways", nargs="+", default=["bare", "json", "msgpack", "stream"])
     parser.add_argument("--serve-bare", type=int, help=argparse.SUPPRESS)
@@ -229,7 +240,7 @@ def main() -> None:
         f" {'p99 ms':>8} {'sent B':>7} {'got B':>7}"
     )
     bare: dict[str, Any] = {}
-    for row in measure(options.robots, options.steps, options.seed, options.ways):
+    for row in measure(options.robots, options.steps, options.rounds, options.seed, options.ways):
         bare = row if row["way"] == "bare" else bare
         ratio, wait = (row[name] / bare[name] if bare else float("nan") for name in ("us", "p50"))
         print(

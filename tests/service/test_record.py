@@ -115,7 +115,7 @@ def test_a_record_reads_back_to_the_last_bit_and_answers_in_the_same_bytes(made)
     content = record.encode(kept)
     again = record.decode(content)
     assert record.encode(again) == content
-    first, replayed = record.answer(kept, row, names), record.answer(again, row, names)
+    first, replayed = record.told(decision, every, explain), record.answer(again, row, names)
     assert to_json(first) == to_json(replayed)
     assert to_msgpack(first) == to_msgpack(replayed)
     whole = msgspec.json.encode(

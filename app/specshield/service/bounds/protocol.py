@@ -9,11 +9,13 @@ from __future__ import annotations
 import asyncio
 import resource
 from functools import cache
+from typing import cast
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from specshield.errors import Busy, HeadersTooLarge, RequestTimeout, SpecshieldError
 from specshield.service import metrics, problems
+from specshield.service.bounds.corked import Corked
 from specshield.service.settings import Settings
 
 KEPT_FILES = 256  # descriptors for the store, files and child processes
@@ -51,6 +53,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._in_head = self._upgraded = False
         self._late: asyncio.TimerHandle | None = None
         super().connection_made(transport)
+        self.transport = cast(asyncio.Transport, Corked(transport, self.loop))
         if len(self.connections) > most_connections():
             oldest = next(iter(self.waiting), None)
             if oldest is None:

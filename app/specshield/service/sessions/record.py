@@ -179,10 +179,48 @@ def make(
         occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
         free=None if free is None else free.astype("<f8").tobytes(),
         explain=explain,
-        explanations=tuple(
-            None if why is None else Explanation(why.conjunct, _finite(why.robustness), why.late_by)
-            for why in decision.explanations
-        ),
+        explanations=_explained(decision),
+    )
+
+
+def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
+    """What the caller is answered: to the byte as `answer` has it of the record, in a third of the time."""
+    asked: dict[str, Any] = {}
+    if explain:
+        asked["explanations"] = _explained(decision)
+    if all_witnesses:
+        asked["witnesses"] = tuple(None if w is None else list(w) for w in decision.witnesses)
+    return StepAnswer(
+        t=decision.t,
+        mode=decision.mode,
+        distribution=decision.distribution.tolist(),
+        j_values=list(decision.j_values),
+        robustness=list(decision.robustness),
+        action=decision.action,
+        action_name=decision.action_name,
+        completion_action=decision.completion_action,
+        spec_status=decision.spec_status,
+        feasible_mass=decision.feasible_mass,
+        kl=decision.kl,
+        reason=decision.reason,
+        finished=decision.finished,
+        next_poses=decision.next_poses.tolist(),
+        residual=None if decision.residual is None else Residual(*decision.residual),
+        in_collision=decision.in_collision,
+        witness=None if decision.witness is None else list(decision.witness),
+        warnings=decision.warnings,
+        margin=decision.margin,
+        slack=decision.slack,
+        threshold_left=decision.threshold_left,
+        map_revision=decision.map_revision,
+        **asked,
+    )
+
+
+def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
+    return tuple(
+        None if why is None else Explanation(why.conjunct, _finite(why.robustness), why.late_by)
+        for why in decision.explanations
     )
 
 

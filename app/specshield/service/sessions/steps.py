@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -40,10 +39,10 @@ from specshield.shield import episode
 from specshield.shield.decision import Decision
 
 ROOM = 64 << 20  # bytes of sessions kept in memory, some 5,000 of them. Chosen by hand.
-WATCHED = 32  # decisions with the same policies that `Pace` looks at. Chosen by hand.
+WATCHED = 32  # decisions in threads after a long one. Chosen by hand.
 SHORT = 0.005  # [s]; so long a decision may hold the event loop, as anything else of a request
 LONG = 0.03  # [s] of a processor for one decision
-SEVERAL = 3  # one or two may be long because kernels are loaded, or others use the processor
+SEVERAL = 4  # decisions; one or two may be long because kernels are loaded
 
 
 @dataclass(frozen=True)
@@ -58,26 +57,35 @@ class Decided:
 class Pace:
     """How long decisions with some policies take.
 
-    Where several of the last were longer than SHORT, or there were not enough to tell, the next is made in a
-    thread, else on the event loop; after several LONG ones, in another process. Handing a decision to a
-    thread and back costs about as much as most of them take.
+    They are made on the event loop, since handing one to a thread and back costs about as much as most of
+    them take. The first few, and the few that follow two close together that took longer than SHORT, are made
+    in a thread, where the processor's time is measured: the clock alone does not tell a long decision from a
+    busy machine.
+    After one that computed longer than SHORT the next WATCHED are made there; after several of LONG, all of
+    them in another process.
     """
 
     def __init__(self) -> None:
-        self._over = deque[bool]([True] * SEVERAL, WATCHED)
+        self._unsure = SEVERAL  # how many are still to be measured
+        self._since_late = WATCHED  # decisions on the event loop since one that took longer than SHORT
         self._long = 0
 
     @property
     def short(self) -> bool:
-        return len(self._over) == WATCHED and sum(self._over) < SEVERAL
+        return self._unsure == 0
 
     @property
     def long(self) -> bool:
         return self._long >= SEVERAL
 
-    def add(self, seconds: float, computed: float = 0.0) -> None:
-        """computed: those seconds that the processor was at it, as far as that was measured."""
-        self._over.append(seconds > SHORT)
+    def add(self, seconds: float, computed: float | None) -> None:
+        """computed: the seconds of a processor, None where they were not measured."""
+        if computed is None:
+            late = seconds > SHORT
+            self._unsure = SEVERAL if late and self._since_late < SEVERAL else 0
+            self._since_late = 0 if late else self._since_late + 1
+            return
+        self._unsure = WATCHED if computed > SHORT else max(self._unsure - 1, 0)
         self._long += computed > LONG
 
 
@@ -127,7 +135,7 @@ class Steps:
                 session = replace(decided.session, state=state, version=written)
                 self._recent.put(id, session)
                 metrics.decided(decided.decision, told_later, timing)
-                return record.answer(decided.record, session.rows[-1], session.config["actions"])
+                return record.told(decided.decision, request.witnesses, request.explain)
             self._recent.drop(id)
             if written is None:
                 raise missing(id)
@@ -161,7 +169,7 @@ class Steps:
             return Decided(*made[:3])
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
         if pace.short:  # asking for the thread's own time would cost a tenth of the step
-            begun, cpu = time.perf_counter(), 0.0
+            begun, cpu = time.perf_counter(), None
             made = decided(self._shields, session, request)
             seconds = time.perf_counter() - begun
         else:
