@@ -216,3 +216,27 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
     bodies = close(state, None, problem(409, "history-gap", expected_t=0), VERDICT)[1]
     assert [sent_poses(body) for body in bodies] == [(2, [1, 2]), (2, [0, 1, 2])]
     assert close(session(None, next_t=5), None, VERDICT)[1] == [{}]
+
+
+@pytest.mark.parametrize(
+    ("why", "line"),
+    [
+        ([-0.3, 4], "F[50,100] Region2 could no longer be kept, by 4 steps"),
+        ([-0.3, 1], "F[50,100] Region2 could no longer be kept, by 1 step"),
+        ([-0.3, None], "F[50,100] Region2 could no longer be kept: its robustness would be -0.3"),
+        ([None, None], "F[50,100] Region2 could no longer be kept"),
+        ([0.05, 2], "F[50,100] Region2 could still be kept, but not with the margin and the slack asked for"),
+    ],
+)
+def test_a_decision_says_why_an_action_is_forbidden(why, line):
+    told = {"conjunct": "F[50,100] Region2", "robustness": why[0], "late_by": why[1]}
+    decision, _ = step(session(), 0, decided(0, M, explanations=[None, told, None]))
+    assert decision.why("b") == decision.why(B) == f"b is forbidden: {line}"
+    assert decision.why("m") == "m is not forbidden"
+    with pytest.raises(errors.InputError, match="no such action"):
+        decision.why("x")
+
+
+def test_a_step_that_was_not_asked_to_explain_says_so():
+    decision, _ = step(session(), 0, decided(0, M))
+    assert "explain=True" in decision.why("b")

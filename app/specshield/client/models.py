@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, Literal, TypedDict, TypeVar
 
-from specshield.errors import ServerError, SpecshieldError
+from specshield.errors import InputError, ServerError, SpecshieldError
 
 T = TypeVar("T")
 Pose = tuple[float, float, float]
@@ -113,6 +113,14 @@ class Explanation:
     robustness: float | None
     late_by: int | None
 
+    def __str__(self) -> str:
+        if self.robustness is not None and self.robustness > 0.0:
+            return f"{self.conjunct} could still be kept, but not with the margin and the slack asked for"
+        told = f"{self.conjunct} could no longer be kept"
+        if self.late_by is not None:
+            return f"{told}, by {self.late_by} step{'s' if self.late_by != 1 else ''}"
+        return told if self.robustness is None else f"{told}: its robustness would be {self.robustness:.3g}"
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -149,7 +157,28 @@ class Decision:
     threshold_left: float = 1.0  # of the next step
     map_revision: int = 0  # how often the session's own map has changed
     explanations: tuple[Explanation | None, ...] | None = None  # of each forbidden action, if asked for
+    action_names: tuple[str, ...] = field(default=(), repr=False)
     source: Literal["service"] = "service"
+
+    def why(self, action: int | str) -> str:
+        """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden:
+        F[50,100] Region2 could no longer be kept, by 4 steps". The step has to have asked: explain=True.
+
+        Raises InputError for an action that there is not.
+        """
+        count = len(self.j_values)
+        i = self.action_names.index(action) if action in self.action_names else action
+        if not isinstance(i, int) or not 0 <= i < count:
+            names = ", ".join(self.action_names)
+            raise InputError(
+                "there is no such action", path="action", got=action,
+                expected=f"an index from 0 to {count - 1}, or one of {names}",
+            )  # fmt: skip
+        name = self.action_names[i] if self.action_names else f"action {i}"
+        if self.explanations is None:
+            return f"{name}: the step was not asked to explain (explain=True)"
+        told = self.explanations[i]
+        return f"{name} is not forbidden" if told is None else f"{name} is forbidden: {told}"
 
 
 @dataclass(frozen=True)

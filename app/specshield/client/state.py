@@ -176,7 +176,7 @@ class SessionState:
     def _decided(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
         t, over, poses = self.t, body["main_task_done"], {**self._poses, self.t: x_t}
         reply = yield from self._send("steps", poses, t, body, tries)
-        decision = _decision(json_object(reply), self.info.terminal_actions, over, timings(reply))
+        decision = _decision(json_object(reply), self.info, over, timings(reply))
         self._poses, self._stored, self.t, self._unanswered = poses, t + 1, t + 1, -1
         self.spec_status = decision.spec_status
         ends = own and decision.action in self.info.terminal_actions
@@ -194,7 +194,7 @@ class SessionState:
             self._continuation.branches = ()
             if item.decision is not None:
                 over = self.info.main_task_done
-                decision = _decision(item.decision, self.info.terminal_actions, over, {})
+                decision = _decision(item.decision, self.info, over, {})
                 self._continuation.learn(decision, item.pose)
 
     def _end(self, pose: Numbers | None = None) -> Flow[Verdict]:
@@ -217,7 +217,7 @@ class SessionState:
     def _events(self, after: int | None) -> Events:
         def decided(answer: Mapping[str, Any]) -> Decision:
             # Once the rule is settled, a session that is finished is one whose main task is over.
-            return _decision(answer, self.info.terminal_actions, bool(answer.get("finished")), {})
+            return _decision(answer, self.info, bool(answer.get("finished")), {})
 
         return Events(self.id, self.t - 1 if after is None else after, decided)
 
@@ -266,7 +266,7 @@ class SessionState:
 
 
 def _decision(
-    body: Mapping[str, Any], terminal: tuple[int, ...], over: bool, timings: Mapping[str, float]
+    body: Mapping[str, Any], info: SessionInfo, over: bool, timings: Mapping[str, float]
 ) -> Decision:
     residual, told = body.get("residual"), body.get("explanations")
     return build(
@@ -277,7 +277,8 @@ def _decision(
         if told is None
         else tuple(None if why is None else build(Explanation, why) for why in told),
         timings=timings,
-        execute=_execute(body, terminal, over),
+        execute=_execute(body, info.terminal_actions, over),
+        action_names=info.actions,
         source="service",
     )
 

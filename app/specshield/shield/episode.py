@@ -20,6 +20,7 @@ from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
+from specshield.shield.explanation import explanations
 from specshield.shield.feasibility import futures, prefix_of
 from specshield.shield.judgement import (
     Judged,
@@ -157,7 +158,9 @@ def decide(
         slack=shield.config.slack,
         threshold_left=shield.config.threshold,
         map_revision=0,
-        explanations=(),
+        explanations=explanations(shield, prefix, judged, shield.config.margin, shield.config.slack)
+        if explain
+        else (),
         carry=Carry(t, nexts, certified, memory, action=action),
     )
 

@@ -1,0 +1,102 @@
+"""What an explanation says is true: checked against every future of a robot on whole cells."""
+
+import math
+
+import numpy as np
+import pytest
+
+from specshield.shield.episode import decide, make_shield
+from tests.oracles.cells import MOTIONS, Cells, Exhaustive
+
+PLACES = {"A": (2, 0), "B": (0, 2), "C": (2, 2)}
+EVEN = np.zeros(5)
+
+
+def rule(parts):
+    """parts: (operator, from, to, place). The cells' rule, and its conjuncts as the formula prints them."""
+
+    def keeps(inside):
+        kept = True
+        for op, a, b, place in parts:
+            window = inside[place][..., a : b + 1]
+            kept = kept & (window.any(axis=-1) if op == "F" else ~window.any(axis=-1))
+        return kept
+
+    told = [f"{op}[{a},{b}] {place if op == 'F' else f'not {place}'}" for op, a, b, place in parts]
+    return Cells(" and ".join(told), keeps, {place: PLACES[place] for *_, place in parts}), told
+
+
+def after(parts, history):
+    """Whether some future keeps the rule after each motion; beyond its horizon no step counts."""
+    cells, _ = rule(parts)
+    return cells.feasible(history)
+
+
+def explained(parts, history):
+    cells, told = rule(parts)
+    decision = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=True)
+    return decision, told
+
+
+def test_what_is_late_would_be_kept_with_a_window_that_ends_so_much_later_and_with_none_that_ends_sooner():
+    random, seen = np.random.default_rng(5), {"late": 0, "broken": 0, "several": 0}
+    for _ in range(120):
+        a, b = (int(v) for v in random.integers(2, 6, 2))
+        parts = [("F", 0, a, "A"), ("F", 1, b, "B"), ("G", 0, 5, "C")][: random.integers(1, 4)]
+        cells, _ = rule(parts)
+        history = [cells.pose(*random.integers(0, 2, 2).tolist(), int(random.integers(4)))]
+        for _ in range(int(random.integers(0, 3))):
+            history.append(cells.pose(*cells.after(cells.state(history[-1]), int(random.integers(3)))))
+        decision, told = explained(parts, history)
+        if decision.spec_status != "pending":
+            continue
+        exact = after(parts, history)
+        for motion in range(MOTIONS):
+            why = decision.explanations[motion]
+            assert (why is None) == exact[motion]
+            if why is None:
+                continue
+            i = told.index(why.conjunct)
+            others = parts[:i] + parts[i + 1 :]
+            op, start, end, place = parts[i]
+            if why.late_by is None:
+                alone = others and after(others, history)[motion]
+                seen["broken" if op == "G" else "several"] += 1
+                assert why.robustness <= 0.0 or not alone
+                continue
+            seen["late"] += 1
+            assert op == "F"
+            enough = [(op, start, end + why.late_by, place)]
+            assert after(others + enough, history)[motion]
+            assert not after([*others, (op, start, end + why.late_by - 1, place)], history)[motion]
+    assert seen["late"] > 20, seen
+
+
+def test_an_action_that_breaks_a_keep_out_is_told_so():
+    cells, told = rule([("G", 0, 3, "C")])
+    beside = cells.pose(1, 2, 0)  # C lies ahead
+    if cells.after((1, 2, 0), 0) != (2, 2, 0):
+        pytest.skip("the map has a wall there")
+    decision, _ = explained([("G", 0, 3, "C")], [beside])
+    assert decision.explanations[0].conjunct == told[0]
+    assert decision.explanations[0].late_by is None
+    assert math.isclose(
+        decision.explanations[0].robustness, -0.1, abs_tol=1e-9
+    )  # the middle of a cell of 0.2 m
+    assert decision.explanations[1:] == (None,) * 4
+
+
+def test_without_being_asked_nothing_is_explained_and_the_decision_is_the_same():
+    cells, _ = rule([("F", 0, 3, "A")])
+    shield, history = make_shield([Exhaustive(cells)]), [cells.pose(0, 0, 0)]
+    plain = decide(shield, history, EVEN)
+    asked = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=True)
+    assert plain.explanations == ()
+    assert np.array_equal(plain.distribution, asked.distribution)
+    assert plain.j_values == asked.j_values
+
+
+def test_when_the_rule_is_over_every_action_is_allowed():
+    cells, _ = rule([("F", 0, 1, "A")])
+    decision = decide(make_shield([Exhaustive(cells)]), [cells.pose(2, 0, 0)] * 3, EVEN, explain=True)
+    assert decision.explanations == (None,) * 5
