@@ -166,6 +166,21 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
     return {name: float(value) for name, value in signals.items()}
 
 
+def check_signals(task: Task, signals: Mapping[str, float]) -> None:
+    """Raises SampleError for a signal that the task does not declare, or a value that is out of range."""
+    for name, value in signals.items():
+        if name not in task.signals:
+            declared = f"one of {sorted(task.signals)}, as the spec declares them"
+            raise SampleError(
+                f"unknown signal {name!r}", path=f"signals.{name}", got=name,
+                expected=declared if task.signals else "no signals: the rule declares none",
+            )  # fmt: skip
+        if not -LARGEST <= value <= LARGEST:
+            raise SampleError(
+                "a signal is out of range", path=f"signals.{name}", got=str(value), expected=SIGNAL
+            )
+
+
 def _check_name(name: str, path: str, error: type[InputError]) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
         raise error(

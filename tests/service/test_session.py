@@ -7,8 +7,7 @@ import pytest
 
 from specshield.errors import SampleError
 from specshield.robot import STRETCH
-from specshield.service.sessions.session import check_signals
-from specshield.task import make_task
+from specshield.task import check_signals, make_task
 from specshield.world.occupancy import OccupancyGrid
 
 TASK = make_task(

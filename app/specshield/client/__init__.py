@@ -8,23 +8,28 @@
                 decision = session.step(robot.pose(), model.logits())
                 robot.execute(decision.execute)
 
-Errors are those of `specshield.errors`. Needs httpx and nothing else.
+Errors are those of `specshield.errors`. Needs httpx and nothing else. Its names are imported when they are
+first used: `specshield.local` answers with the classes of `models`, and has no use for httpx.
 """
 
-from specshield.client.aio import AsyncSession, AsyncShieldClient
-from specshield.client.models import (
-    Decision,
-    Explanation,
-    LocalDecision,
-    Map,
-    Policy,
-    Residual,
-    SessionInfo,
-    Spec,
-    TrajectoryItem,
-    Verdict,
-)
-from specshield.client.sync import Session, ShieldClient
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from specshield.client.aio import AsyncSession, AsyncShieldClient
+    from specshield.client.models import (
+        Decision,
+        Explanation,
+        LocalDecision,
+        Map,
+        Policy,
+        Residual,
+        SessionInfo,
+        Spec,
+        TrajectoryItem,
+        Verdict,
+    )
+    from specshield.client.sync import Session, ShieldClient
 
 __all__ = [
     "AsyncSession",
@@ -42,3 +47,15 @@ __all__ = [
     "TrajectoryItem",
     "Verdict",
 ]
+
+_SHELLS = {"AsyncSession": "aio", "AsyncShieldClient": "aio", "Session": "sync", "ShieldClient": "sync"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_SHELLS.get(name, 'models')}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -243,3 +243,11 @@ def build(cls: type[T], body: Mapping[str, Any], **more: Any) -> T:
 
 def _tuples(value: Any) -> Any:
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
+
+
+def execute_of(body: Mapping[str, Any], terminal: Sequence[int], over: bool) -> Any:
+    """`Decision.execute` of an answer. terminal: the actions that end the main task. over: whether it is."""
+    action, pending = body.get("action"), body.get("spec_status") == "pending"
+    if pending:
+        return body.get("completion_action") if action in terminal else action
+    return terminal[0] if over and terminal else action

@@ -22,6 +22,7 @@ from specshield.client.models import (
     TrajectoryItem,
     Verdict,
     build,
+    execute_of,
 )
 from specshield.client.wire import (
     TRIES,
@@ -277,15 +278,7 @@ def _decision(
         if told is None
         else tuple(None if why is None else build(Explanation, why) for why in told),
         timings=timings,
-        execute=_execute(body, info.terminal_actions, over),
+        execute=execute_of(body, info.terminal_actions, over),
         action_names=info.actions,
         source="service",
     )
-
-
-def _execute(body: Mapping[str, Any], terminal: tuple[int, ...], over: bool) -> Any:
-    """The action to run; see `Decision`."""
-    action, pending = body.get("action"), body.get("spec_status") == "pending"
-    if pending:
-        return body.get("completion_action") if action in terminal else action
-    return terminal[0] if over and terminal else action

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import Conflict, InputError, NotFound, SampleError, SessionFinished, StepConflict
+from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
 from specshield.service.access.owners import shown
 from specshield.service.library import files
 from specshield.service.schemas.answers import StepAnswer, to_json
@@ -19,7 +19,6 @@ from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import history, record
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
-from specshield.task import LARGEST, SIGNAL, Task
 
 RACES = 10  # writes lost to others before a caller is told so
 
@@ -193,18 +192,3 @@ def contended(key: str) -> Conflict:
     return Conflict(
         f"several callers write to session {id!r} at once", path="id", got=id, expected="one caller a session"
     )
-
-
-def check_signals(task: Task, signals: Mapping[str, float]) -> None:
-    """Raises SampleError for a signal that the task does not declare, or a value that is out of range."""
-    for name, value in signals.items():
-        if name not in task.signals:
-            declared = f"one of {sorted(task.signals)}, as the spec declares them"
-            raise SampleError(
-                f"unknown signal {name!r}", path=f"signals.{name}", got=name,
-                expected=declared if task.signals else "no signals: the rule declares none",
-            )  # fmt: skip
-        if not -LARGEST <= value <= LARGEST:
-            raise SampleError(
-                "a signal is out of range", path=f"signals.{name}", got=str(value), expected=SIGNAL
-            )

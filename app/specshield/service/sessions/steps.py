@@ -24,7 +24,6 @@ from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import (
     RACES,
     Session,
-    check_signals,
     check_step,
     contended,
     logits_of,
@@ -37,6 +36,7 @@ from specshield.service.sessions.state import State, pack_carry
 from specshield.service.storage.store import Change, Store
 from specshield.shield import episode
 from specshield.shield.decision import Decision
+from specshield.task import check_signals
 
 ROOM = 64 << 20  # bytes of sessions kept in memory, some 5,000 of them. Chosen by hand.
 WATCHED = 32  # decisions in threads after a long one. Chosen by hand.

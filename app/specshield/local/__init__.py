@@ -1,0 +1,17 @@
+"""The shield in process: the interface of the SDK's sessions without a server.
+
+    from specshield.local import LocalShield
+
+    shield = LocalShield.shipped("case1")
+    with shield.session(initial_pose=(x, y, theta)) as session:
+        while not session.finished:
+            decision = session.step(robot.pose(), model.logits())
+            robot.execute(decision.execute)
+
+For training loops, tests and recordings. Nothing is stored: a session ends with its process.
+"""
+
+from specshield.local.session import LocalSession
+from specshield.local.shield import LocalShield
+
+__all__ = ["LocalSession", "LocalShield"]

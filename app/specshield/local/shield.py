@@ -1,0 +1,216 @@
+"""A shield in process, prepared once for many sessions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from specshield.client.models import SessionInfo
+from specshield.client.wire import pose_values
+from specshield.errors import InfeasibleStart, MapError, NotFound, PolicyError
+from specshield.local.session import LocalSession
+from specshield.lookahead.preferences import PROJECTION, check_shaping, prepare
+from specshield.policy.methods import DEFAULT, METHODS, Run, load_policy
+from specshield.policy.options import read_options
+from specshield.robot import Robot, robot_from_json
+from specshield.shield import episode
+from specshield.shield.decision import Config, Shield, check_preferring, make_shield
+from specshield.shield.proposal import Proposer
+from specshield.shield.uncertainty import Uncertainty
+from specshield.shipped import MAPS, MODELS
+from specshield.task import Task, make_task, parse_regions
+from specshield.world.formats import read_map
+from specshield.world.map_server import dump_map, load_map
+from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Region
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from specshield.client.models import Beginning
+
+World = OccupancyGrid | Path | str | Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class LocalShield:
+    """A task and the policy that proposes futures for it. `session` begins an episode.
+
+    card, weights: the policy's files, as `save` writes them.
+    """
+
+    shield: Shield
+    card: Mapping[str, Any]
+    weights: bytes
+
+    @property
+    def task(self) -> Task:
+        return self.shield.task
+
+    @staticmethod
+    def shipped(name: str) -> LocalShield:
+        """A policy that came with specshield, such as `case1`. Raises NotFound."""
+        folder = MODELS / name
+        names = sorted(card.parent.name for card in MODELS.glob("*/card.json"))
+        if name not in names:
+            raise NotFound(
+                "no such policy came with specshield",
+                path="name", got=name, expected=f"one of {', '.join(names)}",
+            )  # fmt: skip
+        wanted = json.loads((folder / "card.json").read_text())["map_id"]
+        for path in sorted(MAPS.glob("*.yaml")):
+            if wanted in (path.stem, _read_world(path)[0].content_hash):
+                return LocalShield.load(folder, path)
+        raise NotFound(f"the map of {name} is not in {MAPS}", path="map", got=wanted)
+
+    @staticmethod
+    def load(folder: str | Path, world: World | None = None) -> LocalShield:
+        """A policy from a folder: `card.json`, `policy.safetensors`, and its map unless `world` is given.
+
+        The map is the one `.yaml` in the folder, with its image beside it. Raises PolicyError, MapError.
+        """
+        folder = Path(folder)
+        if world is None:
+            found = sorted(folder.glob("*.yaml"))
+            if len(found) != 1:
+                raise MapError(
+                    "the folder does not say which map the policy is for", path="world",
+                    got=[path.name for path in found], expected=f"one .yaml in {folder}, or a `world`",
+                )  # fmt: skip
+            world = found[0]
+        try:
+            card = json.loads((folder / "card.json").read_text())
+            weights = (folder / "policy.safetensors").read_bytes()
+        except (OSError, ValueError) as error:
+            raise PolicyError(
+                f"no policy can be read there: {error}", path="folder", got=str(folder),
+                expected="a folder with card.json and policy.safetensors",
+            ) from None  # fmt: skip
+        grid, rooms = _read_world(world)
+        spec = card["spec"]
+        task = make_task(
+            grid, robot_from_json(card["robot"]), spec["formula"], spec.get("regions"), rooms,
+            spec.get("signals"),
+        )  # fmt: skip
+        return _prepared(load_policy(weights, card, task), card, weights)
+
+    @staticmethod
+    def make(
+        world: World,
+        formula: str,
+        regions: Mapping[str, Any] | None = None,
+        *,
+        rooms: Mapping[str, Region] | None = None,
+        signals: Mapping[str, float] | None = None,
+        robot: Robot | str | Mapping[str, Any] = "stretch",
+        method: str = DEFAULT,
+        options: Mapping[str, Any] | None = None,
+        seed: int = 0,
+    ) -> LocalShield:
+        """A policy made on the spot, by reachability in about a second.
+
+        world: a grid, the path of a map's `.yaml`, or a map as the API takes it in JSON, with its `format`.
+        rooms: named areas beside those that the map brings. The rest is as in the SDK's `policies.create`.
+        """
+        grid, own = _read_world(world)
+        made_robot = robot if isinstance(robot, Robot) else robot_from_json(robot)
+        task = make_task(grid, made_robot, formula, regions, {**own, **(rooms or {})}, signals)
+        how = METHODS.get(method)
+        settings = read_options(how.options, options or {})
+        how.check(task, settings)
+        made = how.make(task, settings, Run(seed))
+        weights = made.weights()
+        return _prepared(load_policy(weights, made.card, task), made.card, weights)
+
+    def save(self, folder: str | Path) -> None:
+        """Write what `load` reads, which is also what a server takes in its folder of policies."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        text, image = dump_map(self.task.grid)
+        (folder / "map.yaml").write_text(text)
+        (folder / "map.pgm").write_bytes(image)
+        (folder / "policy.safetensors").write_bytes(self.weights)
+        (folder / "card.json").write_text(json.dumps(dict(self.card), indent=1))
+
+    def session(self, **options: Unpack[Beginning]) -> LocalSession:
+        """Begin at `initial_pose`; the options are those of the SDK's `sessions.create`, without policies.
+
+        Raises PoseError, InfeasibleStart (unless `allow_infeasible`), and InputError for a setting.
+        """
+        settings: dict[str, Any] = {"uncertainty": "learned", "learn_map": True, **options}
+        pose = pose_values(settings.pop("initial_pose"))
+        id, allowed = settings.pop("id", None) or "local", settings.pop("allow_infeasible", False)
+        shaping = settings.pop("shaping", PROJECTION)
+        check_shaping(shaping)
+        told = settings.pop("uncertainty")
+        known = (
+            (Uncertainty() if told == "learned" else None) if isinstance(told, str) else Uncertainty(**told)
+        )
+        shield = replace(self.shield, config=Config(**settings, uncertainty=known))
+        if shaping != PROJECTION:
+            check_preferring(shield.config)
+            shield = replace(shield, preference=self._preference(shaping))
+        feasible = True
+        try:
+            episode.start(shield, pose)
+        except InfeasibleStart:
+            if not allowed:
+                raise
+            feasible = False
+        status, _ = episode.close(shield, [pose])
+        task = self.task
+        info = SessionInfo(
+            id=id,
+            policy_ids=(str(self.card["id"]),),
+            map_id=task.grid.content_hash,
+            spec={"formula": str(task.formula), "regions": self.card["spec"].get("regions", {})},
+            horizon=task.horizon,
+            actions=task.robot.action_names,
+            terminal_actions=tuple(np.flatnonzero(task.robot.terminal).tolist()),
+            next_t=0,
+            feasible=feasible,
+            spec_status=status,
+            main_task_done=False,
+            finished=False,
+            expires_at="",
+            margin=shield.config.margin,
+        )
+        return LocalSession(shield, info, pose)
+
+    @cache  # noqa: B019  a preference takes seconds to prepare, and shields are few
+    def _preference(self, name: str) -> Any:
+        grid = self.task.grid
+        row, column = np.unravel_index(int(np.argmax(grid.clearance)), grid.clearance.shape)
+        return prepare(name, self.task, self.shield.proposers, [*grid.centres[row, column], 0.0])
+
+
+def _prepared(policy: Proposer, card: Mapping[str, Any], weights: bytes) -> LocalShield:
+    return LocalShield(make_shield([policy]), card, weights)
+
+
+def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
+    """A map and its named areas, those of `<name>.regions.json` beside a `.yaml` included."""
+    if isinstance(world, OccupancyGrid):
+        return world, {}
+    if isinstance(world, Mapping):
+        members = dict(world)
+        return read_map(members.pop("format", None), members)
+    path = Path(world)
+    images = [image for kind in (".pgm", ".png") if (image := path.with_suffix(kind)).is_file()]
+    if not path.is_file() or not images:
+        raise MapError(
+            "no map can be read there",
+            path="world",
+            got=str(path),
+            expected="a .yaml with its image beside it",
+        )
+    named = path.with_suffix(".regions.json")
+    areas = json.loads(named.read_text()) if named.is_file() else {}
+    rooms = parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})
+    return load_map(path.read_text(), images[0].read_bytes()), rooms

@@ -1,0 +1,117 @@
+"""The shield in process is the one that a server runs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from specshield.client import ShieldClient
+from specshield.errors import HistoryConflict, InfeasibleStart, NotFound, SessionFinished
+from specshield.local import LocalShield
+from specshield.world.occupancy import OccupancyGrid
+from tests.serving import RunningServer
+
+START = (4.5, 5.0, 0.0)
+ROBOT = {
+    "footprint": {"radius": 0.2},
+    "actions": [
+        {"name": "forward", "translate": 0.25},
+        {"name": "left", "rotate": 0.5},
+        {"name": "right", "rotate": -0.5},
+        {"name": "end", "terminal": True},
+    ],
+}
+SETTINGS = [
+    {},
+    {"uncertainty": "none", "learn_map": False, "seed": 3},
+    {"uncertainty": "none", "threshold": 0.6},
+    {"uncertainty": "none", "evaluation": "robustness", "threshold": 0.1, "margin": 0.05},
+]
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_a_server_decides_the_same_to_the_bit(server: RunningServer, settings: dict[str, object]) -> None:
+    """A whole episode with a model that wanders, ends its task, and a robot that does not land exactly."""
+    options = {"initial_pose": START, "max_steps": 150, **settings}
+    random = np.random.default_rng(7)
+    with ShieldClient(server.url, timeout=30.0) as client:
+        remote = client.sessions.create(policy_id="case1", **options)
+        local = LocalShield.shipped("case1").session(**options)
+        assert replace(remote.info, id="", expires_at="", map_id="", spec={}) == replace(
+            local.info, id="", expires_at="", map_id="", spec={}
+        )
+        pose = START
+        while not local.finished:
+            logits = None if local.main_task_done else random.normal(0.0, 1.5, 20)
+            if logits is not None:
+                logits[4] = 5.0 if local.t == 40 else -np.inf
+            seen = {"occupied": [(pose[0] + 1.0, pose[1])], "free": [(pose[0] + 0.5, pose[1])]}
+            asked = {"explain": True, "witnesses": True, **seen} if local.t % 10 == 5 else {}
+            here = local.step(pose, logits, **asked)
+            there = remote.step(pose, logits, **asked)
+            assert here == replace(there, timings={})
+            assert (local.t, local.spec_status, local.main_task_done, local.finished) == (
+                remote.t, remote.spec_status, remote.main_task_done, remote.finished,
+            )  # fmt: skip
+            x, y, theta = here.next_poses[here.execute]
+            shake = random.normal(0.0, 0.003, 3)
+            pose = (x + shake[0], y + shake[1], theta + shake[2])
+        assert local.t > 80
+        assert local.close(pose) == remote.close(pose)
+        with pytest.raises(SessionFinished):
+            local.step(pose, random.normal(size=20))
+        assert [
+            json.loads(json.dumps([each.t, each.pose, each.signals, each.decision]))
+            for each in local.trajectory()
+        ] == [
+            json.loads(json.dumps([each.t, each.pose, each.signals, each.decision]))
+            for each in remote.trajectory()
+        ]
+
+
+def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -> None:
+    occupied = np.zeros((30, 40), bool)
+    occupied[10:20, 15] = True
+    regions = {"Dock": {"type": "circle", "center": [8.0, 6.0], "radius": 0.6}}
+    made = LocalShield.make(
+        OccupancyGrid(occupied, 0.25), "F[0,60] Dock and G[0,90] load < 5", regions,
+        signals={"load": 0.0}, robot=ROBOT,
+    )  # fmt: skip
+    made.save(tmp_path / "policy")
+    again = LocalShield.load(tmp_path / "policy")
+    sessions = [each.session(initial_pose=(1.0, 1.0, 0.0)) for each in (made, again)]
+    pose, statuses = (1.0, 1.0, 0.0), set()
+    for t in range(91):
+        signals = {"load": 3.0} if t == 70 else None
+        decisions = [session.step(pose, [1.0, 0.0, 0.0, -3.0], signals=signals) for session in sessions]
+        assert decisions[0] == decisions[1]
+        statuses.add(decisions[0].spec_status)
+        pose = decisions[0].next_poses[decisions[0].execute]
+    assert statuses == {"pending", "satisfied"}
+    assert [item.signals["load"] for item in sessions[0].trajectory()][69:72] == [0.0, 3.0, 3.0]
+
+
+def test_what_is_wrong_is_said() -> None:
+    with pytest.raises(NotFound, match="case1, case1-dqn"):
+        LocalShield.shipped("case9")
+    shield = LocalShield.shipped("case1")
+    session = shield.session(initial_pose=START)
+    with pytest.raises(HistoryConflict):
+        session.step((4.0, 5.0, 0.0), np.zeros(20))
+    session.step((*START[:2], 2 * np.pi), np.zeros(20))
+    wall = OccupancyGrid(np.repeat([[0, 0, 0, 1, 0, 0, 0]], 7, axis=0) > 0, 1.0)
+    with pytest.raises(InfeasibleStart):
+        LocalShield.make(wall, "F[0,60] x > 5", robot=ROBOT).session(initial_pose=(1.5, 1.5, 0.0))
+
+
+def test_no_web_part_is_imported() -> None:
+    code = "import specshield.local, specshield.client.models, sys; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    web = {"httpx", "fastapi", "starlette", "pydantic", "redis", "rq", "uvicorn", "torch"}
+    assert not web & set(done.stdout.split())
