@@ -44,7 +44,9 @@ def warm_up(part: str) -> None:
 
 def _propose(task: Task) -> None:
     """What reachability takes to make its tables and to propose. Nothing else takes as long to compile."""
-    synthesise(task).propose(np.array([START]), {}, 0.0)
+    policy = synthesise(task)
+    policy.propose(np.array([START]), {}, 0.0)
+    policy.on_body(make_body(task.robot, task.grid)).propose(np.array([START]), {}, 0.0)
 
 
 def _decide(task: Task) -> None:

@@ -31,6 +31,7 @@ from specshield.shield.judgement import (
     robustness_of,
     witnesses_of,
 )
+from specshield.shield.taught import handed_on, on_map, teach
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "close", "decide", "make_shield", "start"]
@@ -107,6 +108,8 @@ def decide(
     poses = _history(history)
     t, signals = len(poses) - 1, signals or {}
     log_prior = _log_prior(shield, logits, main_task_done)
+    taught, said = teach(shield, carry, poses, occupied, free)
+    shield = on_map(shield, taught.map)
     nexts = np.empty((len(robot.motions), 3))
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
@@ -153,15 +156,22 @@ def decide(
         witnesses=tuple(as_actions(shield, certified, a) for a in range(len(robot.actions)))
         if witnesses
         else (),
-        warnings=() if judged is None else judged.tried.warnings,
+        warnings=said if judged is None else (*said, *judged.tried.warnings),
         margin=shield.config.margin,
         slack=shield.config.slack,
         threshold_left=shield.config.threshold,
-        map_revision=0,
+        map_revision=taught.map.revision,
         explanations=explanations(shield, prefix, judged, shield.config.margin, shield.config.slack)
         if explain
         else (),
-        carry=Carry(t, nexts, certified, memory, action=action),
+        carry=Carry(
+            t,
+            nexts,
+            certified,
+            memory,
+            learned=handed_on(shield, taught, int(robot.motion_of[moved])),
+            action=action,
+        ),
     )
 
 

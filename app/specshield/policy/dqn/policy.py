@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from specshield.policy.dqn.scene import Scene, make_scene
 from specshield.policy.recall import pasts
 from specshield.policy.tensors import read_tensors
 from specshield.policy.undo import undoing_motions
-from specshield.robot.dynamics import make_body, motion_count
+from specshield.robot.dynamics import Body, make_body, motion_count
 from specshield.rule.progress import make_rules, signal_rows
 from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
@@ -46,6 +46,12 @@ class Policy:
     @cached_property
     def scene(self) -> Scene:
         return make_scene(self.task)
+
+    def on_body(self, body: Body) -> Policy:
+        """The policy on another map: it sees the distances that it saw, its ways are those that there are."""
+        other = replace(self)
+        other.__dict__["scene"] = self.scene._replace(body=body)
+        return other
 
     @cached_property
     def _undoing(self) -> Ints:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -84,6 +84,12 @@ class PlannerPolicy:
     @cached_property
     def _world(self) -> World:
         return self._world_of(self.task.formula)
+
+    def on_body(self, body: Body) -> PlannerPolicy:
+        """The policy on another map: its fields lead as they did, its ways are those that there are."""
+        other = replace(self)
+        other.__dict__.update(_body=body, _world=self._world._replace(body=body))
+        return other
 
     def _world_of(self, formula: Formula) -> World:
         """The world as a search sees it for the task's formula, or for what is left of it."""

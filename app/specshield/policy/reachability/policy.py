@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, lattice_shape, make_lattice, number_cells
 from specshield.policy.options import options_to_json, read_options
+from specshield.policy.reachability.around import go_around
 from specshield.policy.reachability.guide import Guide
 from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
 from specshield.policy.reachability.method import Settings
@@ -42,18 +43,29 @@ class ReachabilityPolicy:
     card: Card
     settings: Settings
     tables: Tables
+    told: bool = True  # whether the tables were made for the map that the policy goes by
 
     @property
     def id(self) -> str:
         return str(self.card["id"])
 
     @cached_property
-    def _prepared(self) -> tuple[Body, Rules]:
-        return make_body(self.task.robot, self.task.grid), make_rules(self.task)
+    def _body(self) -> Body:
+        return make_body(self.task.robot, self.task.grid)
+
+    @cached_property
+    def _rules(self) -> Rules:
+        return make_rules(self.task)
+
+    def on_body(self, body: Body) -> ReachabilityPolicy:
+        """The policy on another map: its tables suggest what they did, its ways are those that there are."""
+        other = replace(self, told=False)
+        other.__dict__.update(_body=body, _rules=self._rules)
+        return other
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A continuation after each first motion."""
-        body, rules = self._prepared
+        body, rules = self._body, self._rules
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
         rows = signal_rows(self.task, signals, len(history))
         guide = Guide(body, rules, self.tables, self.task.robot.wait_motion)
@@ -63,6 +75,11 @@ class ReachabilityPolicy:
             poses = np.empty((*motions.shape, 3))
             preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, int(preferred)))
+            if not self.told:
+                ways = np.empty_like(motions)
+                first = go_around(guide, past, history, rows, poses, ways)
+                if first >= 0:
+                    proposals.append(Proposal(ways, int(first)))
         return joined(*proposals)
 
     def weights(self) -> bytes:

@@ -1,0 +1,130 @@
+"""The shield as a session's own map has it: what the world taught, decision by decision.
+
+Certification uses the map that is known in the very decision that learns it. Policies are asked for ways on
+it too: one that has `on_body` proposes on the session's map, whatever its tables were made for.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+from dataclasses import dataclass, field, replace
+from threading import Lock
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from specshield.arrays import Floats
+from specshield.robot.dynamics import Body, make_body, overlap
+from specshield.shield.contact import Followed, cells_ahead, cells_under, contact_of
+from specshield.shield.decision import Carry, Shield
+from specshield.world.learned import (
+    CONTACT,
+    LearnedMap,
+    applied,
+    cells_of,
+    check_points,
+    forget,
+    learn,
+    revised,
+)
+
+KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
+UNDER = (
+    0.03  # [m] a footprint that covers a cell by more than this shows it free: three times the usual noise
+)
+
+
+@dataclass(frozen=True)
+class Taught:
+    """What a session has learned: its map, and how its caller follows what is drawn."""
+
+    map: LearnedMap = field(default_factory=LearnedMap)
+    followed: Followed = field(default_factory=Followed)
+
+    def to_bytes(self) -> bytes:
+        drawn, follows, halted = self.followed.drawn, self.followed.follows, self.followed.halted
+        return struct.pack("<h?h", drawn, follows, halted) + self.map.to_bytes()
+
+    @staticmethod
+    def from_bytes(value: bytes | None) -> Taught:
+        if value is None:
+            return Taught()
+        size = struct.calcsize("<h?h")
+        return Taught(LearnedMap.from_bytes(value[size:]), Followed(*struct.unpack("<h?h", value[:size])))
+
+
+def teach(
+    shield: Shield, carry: Carry | None, poses: Floats, occupied: ArrayLike | None, free: ArrayLike | None
+) -> tuple[Taught, tuple[str, ...]]:
+    """What is known at step t = len(poses) - 1, and what there is to say of the points [n, 2] that were sent.
+
+    carry: what the last decision handed on: what was known then, and where each motion would lead. Raises
+    SampleError for points that are none.
+    """
+    grid, config, t = shield.task.grid, shield.config, len(poses) - 1
+    before = Taught.from_bytes(None if carry is None else carry.learned)
+    known, followed = before.map, before.followed
+    if config.map_memory is not None:
+        known = forget(known, known.occupied & (t - known.step > config.map_memory))
+    if config.learn_map and carry is not None and carry.t == t - 1:
+        body = body_on(shield, before.map)
+        motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses)
+        for pose in _between(poses):
+            if overlap(body, *pose) > UNDER:
+                known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)
+        if motion >= 0:
+            known = learn(grid, known, t, cells_ahead(body, poses[-1], motion), True, CONTACT)
+    beyond = 0
+    for name, points in (("free", free), ("occupied", occupied)):  # what is both is taken for occupied
+        cells, outside = cells_of(grid, check_points(() if points is None else points, name))
+        known = learn(grid, known, t, cells, name == "occupied")
+        beyond += outside
+    said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
+    return Taught(revised(before.map, known), followed), said
+
+
+def _between(poses: Floats) -> Floats:
+    """The last pose, and the place half way to it: a motion goes straight on before it turns."""
+    x, y, _ = 0.5 * (poses[-2] + poses[-1])
+    return np.array([[x, y, poses[-2, 2]], poses[-1]])
+
+
+def on_map(shield: Shield, known: LearnedMap) -> Shield:
+    """The shield on a session's own map."""
+    if not len(known):
+        return shield
+    body = body_on(shield, known)
+    proposers = tuple(p.on_body(body) if hasattr(p, "on_body") else p for p in shield.proposers)
+    return replace(shield, body=body, proposers=proposers)
+
+
+def handed_on(shield: Shield, taught: Taught, drawn: int) -> bytes | None:
+    """What the next decision has to know; None where nothing was learned, and nothing is to be. drawn: the
+    motion that was drawn, -1 for none.
+    """
+    if not shield.config.learn_map and not taught.map.revision:
+        return None
+    return replace(taught, followed=replace(taught.followed, drawn=drawn)).to_bytes()
+
+
+_bodies: OrderedDict[tuple[str, bytes], Body] = OrderedDict()
+_lock = Lock()
+
+
+def body_on(shield: Shield, known: LearnedMap) -> Body:
+    """The robot on a session's own map, made once for each map in this process."""
+    if not len(known):
+        return shield.body
+    key = shield.task.content_hash, known.digest
+    with _lock:
+        body = _bodies.get(key)
+        if body is not None:
+            _bodies.move_to_end(key)
+            return body
+    body = make_body(shield.task.robot, applied(shield.task.grid, known))
+    with _lock:
+        _bodies[key] = body
+        while len(_bodies) > KEPT:
+            _bodies.popitem(last=False)
+    return body

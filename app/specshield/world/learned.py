@@ -1,0 +1,145 @@
+"""What a session has learned of its map: the cells that are not as the map of its policy has them.
+
+Points that the robot's sensors saw occupied or free change cells, and so do contacts. The map of the policy
+stays what it is; `applied` gives the session's own. What is learned is a value: it goes from one decision to
+the next as bytes, so that a replay, or another process, learns the same.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from hashlib import blake2b
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from specshield.arrays import Bools, Floats, Ints
+from specshield.errors import SampleError
+from specshield.world.occupancy import OccupancyGrid
+
+MAX_POINTS = 2000  # of each kind, in one step
+MAX_CELLS = 100_000  # that differ from the policy's map: 10 x 25 m of 5 cm cells, half a megabyte as bytes
+SENT, CONTACT = 0, 1  # who changed a cell: a point that was sent, or a motion that stopped short
+
+
+def _none() -> Ints:
+    return np.empty(0, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedMap:
+    """Changed cells, N of them.
+
+    cell [N]: row * width + column, ascending. occupied [N]: as the session has it; the policy's map has the
+    opposite. by [N]: SENT or CONTACT. step [N]: at which each was seen last. revision: how many steps have
+    changed a cell.
+    """
+
+    revision: int = 0
+    cell: Ints = field(default_factory=_none)
+    occupied: Bools = field(default_factory=lambda: np.empty(0, np.bool_))
+    by: Ints = field(default_factory=_none)
+    step: Ints = field(default_factory=_none)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Names the cells and what they are, whoever changed them and when."""
+        return blake2b(
+            self.cell.astype("<i8").tobytes() + np.packbits(self.occupied).tobytes(), digest_size=16
+        ).digest()
+
+    def to_bytes(self) -> bytes:
+        if not self.revision:
+            return b""
+        columns = (np.diff(self.cell, prepend=0), self.occupied, self.by, self.step)
+        table = np.stack([column.astype("<i4") for column in columns]).tobytes()
+        return zlib.compress(self.revision.to_bytes(8, "little") + table, 1)
+
+    @staticmethod
+    def from_bytes(value: bytes) -> LearnedMap:
+        """The inverse of `to_bytes`."""
+        if not value:
+            return LearnedMap()
+        content = zlib.decompress(value)
+        table = np.frombuffer(content, "<i4", offset=8).reshape(4, -1).astype(np.int64)
+        cell, occupied, by, step = np.cumsum(table[0]), table[1] != 0, table[2], table[3]
+        return LearnedMap(int.from_bytes(content[:8], "little"), cell, occupied, by, step)
+
+    def __len__(self) -> int:
+        return len(self.cell)
+
+
+def cells_of(grid: OccupancyGrid, points: Floats) -> tuple[Ints, int]:
+    """The cells that points [n, 2] of the map frame [m] lie in, ascending, and how many lie outside."""
+    column, row = np.floor(grid.to_grid(points) / grid.resolution).T
+    inside = (column >= 0) & (row >= 0) & (column < grid.width) & (row < grid.height)
+    flat = row[inside].astype(np.int64) * grid.width + column[inside].astype(np.int64)
+    return np.unique(flat), int(len(points) - inside.sum())
+
+
+def check_points(points: ArrayLike, path: str) -> Floats:
+    """Points as an array [n, 2]. Raises SampleError unless they are finite, and at most MAX_POINTS."""
+    try:
+        array = np.asarray(points, dtype=np.float64)
+        array = array.reshape(-1, 2) if array.size == 0 else array
+        if array.ndim == 2 and array.shape[1] == 2 and len(array) <= MAX_POINTS and np.isfinite(array).all():
+            return array
+        got: object = list(array.shape)
+    except (TypeError, ValueError):
+        got = str(points)[:80]
+    raise SampleError(
+        "not a list of points", path=path, got=got, expected=f"at most {MAX_POINTS} finite [x, y] in metres"
+    )
+
+
+def learn(
+    grid: OccupancyGrid, known: LearnedMap, t: int, cells: Ints, occupied: bool, by: int = SENT
+) -> LearnedMap:
+    """What is known once `cells` [n], ascending, were found occupied or free at step t. Same revision.
+
+    A cell that is as the policy's map has it is not kept, nor is one beyond MAX_CELLS.
+    """
+    if not len(cells):
+        return known
+    stays = ~np.isin(known.cell, cells, assume_unique=True)
+    differs = cells[grid.occupied.ravel()[cells] != occupied][: max(MAX_CELLS - int(stays.sum()), 0)]
+    count = len(differs)
+    cell = np.concatenate([known.cell[stays], differs])
+    order = np.argsort(cell, kind="stable")
+    return replace(
+        known,
+        cell=cell[order],
+        occupied=np.concatenate([known.occupied[stays], np.full(count, occupied)])[order],
+        by=np.concatenate([known.by[stays], np.full(count, by)])[order],
+        step=np.concatenate([known.step[stays], np.full(count, t)])[order],
+    )
+
+
+def forget(known: LearnedMap, old: Bools) -> LearnedMap:
+    """Without the cells that `old` [N] says. Same revision."""
+    if not old.any():
+        return known
+    stays = ~old
+    return replace(
+        known,
+        cell=known.cell[stays],
+        occupied=known.occupied[stays],
+        by=known.by[stays],
+        step=known.step[stays],
+    )
+
+
+def revised(before: LearnedMap, after: LearnedMap) -> LearnedMap:
+    """`after`, with the next revision where some cell is not what it was `before`."""
+    return replace(after, revision=before.revision + (before.digest != after.digest))
+
+
+def applied(grid: OccupancyGrid, known: LearnedMap) -> OccupancyGrid:
+    """The session's own map."""
+    if not len(known):
+        return grid
+    occupied = grid.occupied.copy()
+    occupied.ravel()[known.cell] = known.occupied
+    return replace(grid, occupied=occupied)

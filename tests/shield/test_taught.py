@@ -1,0 +1,135 @@
+"""A world that is not as the map says: what a session is told, or runs into, counts in that very decision.
+
+A room of 4 x 2 m; the goal is at its right end. In the middle of the real world stands something 0.3 m wide
+that is not on the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from specshield.policy.reachability.policy import Settings, synthesise
+from specshield.robot import STRETCH
+from specshield.robot.dynamics import in_collision, make_body, step
+from specshield.shield.episode import Config, decide, make_shield
+from specshield.shield.taught import Taught, on_map
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+
+GOAL = {"type": "circle", "center": [3.5, 1.0], "radius": 0.4}
+START = (0.6, 1.0, 0.0)
+BOX = [(x, y) for x in np.arange(1.825, 2.1, 0.05) for y in np.arange(0.875, 1.15, 0.05)]
+AHEAD, BACK = STRETCH.action_names.index("m"), STRETCH.action_names.index("b")
+
+
+@cache
+def room(steps=40):
+    grid = OccupancyGrid(np.zeros((40, 80), bool), 0.05)
+    return synthesise(make_task(grid, STRETCH, f"F[0,{steps}] Goal", {"Goal": GOAL}), Settings(pitch=0.1))
+
+
+def shield_of(steps=40, **config):
+    return make_shield([room(steps)], Config(**config))
+
+
+def real_world():
+    grid = room().task.grid
+    occupied = grid.occupied.copy()
+    for x, y in BOX:
+        occupied[int(y / 0.05), int(x / 0.05)] = True
+    return make_body(STRETCH, replace(grid, occupied=occupied))
+
+
+def drive(shield, sees=None):
+    """The robot does what completes the rule. Its states and the last decision. sees: points at each step."""
+    body, poses, carry = real_world(), [START], None
+    while True:
+        decision = decide(shield, poses, None, main_task_done=True, carry=carry, occupied=sees)
+        carry = decision.carry
+        if decision.spec_status != "pending" or len(poses) > shield.task.horizon:
+            return poses, decision
+        motion = int(STRETCH.motion_of[decision.action])
+        poses.append(step(body, *poses[-1], motion))
+
+
+def test_what_is_not_on_the_map_breaks_the_rule_of_a_session_that_does_not_learn():
+    _, last = drive(shield_of(22))
+    assert last.spec_status == "violated"
+    assert last.map_revision == 0
+    assert last.carry.learned is None
+
+
+def test_what_sensors_see_counts_in_the_same_decision_and_a_way_around_is_found():
+    shield = shield_of(30)
+    told = decide(shield, [START], None, True, occupied=BOX)
+    assert told.map_revision == 1
+    assert max(told.j_values) == 1.0
+    pose, body = np.array(START), real_world()
+    for action in [told.action, *told.witness]:  # its witness is simulated in the real world, by f alone
+        pose = np.array(step(body, *pose, STRETCH.motion_of[action]))
+        assert not in_collision(body, *pose)
+    poses, last = drive(shield, sees=BOX)
+    assert last.spec_status == "satisfied"
+    assert not any(in_collision(body, *pose) for pose in poses)
+
+
+def test_a_robot_without_sensors_learns_from_what_it_runs_into():
+    _, last = drive(shield_of(60, learn_map=True))
+    assert last.spec_status == "satisfied"
+    assert last.map_revision >= 1
+
+
+def test_what_is_free_again_is_unlearned_and_the_policy_never_changes():
+    shield = shield_of(30)
+    first = decide(shield, [START], None, True, occupied=BOX)
+    second = decide(shield, [START, START], None, True, carry=first.carry, free=BOX)
+    assert second.map_revision == 2
+    plain = decide(shield, [START, START], None, True)
+    assert second.robustness == plain.robustness
+    assert shield.body.occupied.sum() == 0
+
+
+def test_occupied_points_are_forgotten_after_the_steps_asked_for():
+    shield = shield_of(30, map_memory=2)
+    decision = decide(shield, [START], None, True, occupied=BOX)
+    for t in range(1, 4):
+        decision = decide(shield, [START] * (t + 1), None, True, carry=decision.carry)
+        assert decision.map_revision == (1 if t < 3 else 2)
+
+
+def test_a_decision_is_the_same_where_the_carry_was_stored_and_the_process_is_another():
+    shield = shield_of(30, learn_map=True)
+    first = decide(shield, [START], None, True, occupied=BOX)
+    on_map(shield, Taught.from_bytes(first.carry.learned).map)
+    stored = replace(first.carry, learned=bytes(first.carry.learned))
+    again = decide(shield_of(30, learn_map=True), [START], None, True, occupied=BOX)
+    assert again.carry.learned == stored.learned
+    assert again.witness == first.witness
+
+
+def test_points_outside_the_map_are_ignored_and_said():
+    decision = decide(shield_of(30), [START], None, True, occupied=[(50.0, 1.0)])
+    assert decision.map_revision == 0
+    assert decision.warnings == ("1 points lie outside the map and were ignored",)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_not_taken_for_a_contact(seed):
+    random, body = np.random.default_rng(seed), shield_of().body
+    shield = shield_of(40, learn_map=True, seed=seed)
+    poses, carry = [START], None
+    for _ in range(30):
+        decision = decide(shield, poses, np.zeros(len(STRETCH.actions)), carry=carry)
+        carry = decision.carry
+        motion = int(STRETCH.motion_of[decision.action])
+        if motion < 0:
+            break
+        x, y, theta = step(body, *poses[-1], motion)
+        noisy = (x + random.normal(0, 0.01), y + random.normal(0, 0.01), theta + random.normal(0, 0.0087))
+        slips = random.random() < 0.05
+        poses.append(poses[-1] if slips or in_collision(body, *noisy) else noisy)
+    assert decision.map_revision == 0
