@@ -12,6 +12,7 @@ SpecshieldError
 │   ├── LogitsError             wrong number, NaN, +inf or all null
 │   ├── PolicyError             weights or a card that do not fit their task
 │   ├── InfeasibleStart         no action from the initial pose has a satisfying future
+│   ├── InfeasibleSwitch        no action from here has a future that satisfies the new rule
 │   ├── Unsupported             an accepted word whose power this build lacks
 │   ├── TooExpensive            it took more time or memory than the server gives to one request
 │   ├── HeadersTooLarge         request headers over the limit
@@ -136,6 +137,10 @@ class PolicyError(InputError):
 
 class InfeasibleStart(InputError):
     type = "infeasible-start"
+
+
+class InfeasibleSwitch(InputError):
+    type = "infeasible-switch"
 
 
 class Unsupported(InputError):

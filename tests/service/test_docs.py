@@ -76,6 +76,7 @@ ORDER = [  # the way the description says: each example is sent as it stands
     ("get", "/v1/sessions", 200),
     ("get", "/v1/sessions/{session_id}", 200),
     ("post", "/v1/sessions/{session_id}/steps", 200),
+    ("post", "/v1/sessions/{session_id}/switch", 200),
     ("post", "/v1/sessions/{session_id}/close", 200),
     ("get", "/v1/sessions/{session_id}/trajectory", 200),
     ("get", "/v1/sessions/{session_id}/record", 200),

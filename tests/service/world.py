@@ -54,11 +54,11 @@ def grid_json() -> dict[str, Any]:
     return {"format": "occupancy_grid", "info": info, "data": (cells() * 100).ravel().tolist()}
 
 
-def policy_files(spec: dict[str, Any] = SPEC, seed: int = 0) -> dict[str, Any]:
+def policy_files(spec: dict[str, Any] = SPEC, seed: int = 0, robot: dict[str, Any] = ROBOT) -> dict[str, Any]:
     """A network of zeros: of equal actions the first is taken, so it drives forward for ever."""
     task = make_task(
         OccupancyGrid(cells(), RESOLUTION),
-        robot_from_json(ROBOT),
+        robot_from_json(robot),
         spec["formula"],
         spec["regions"],
         None,

@@ -267,6 +267,7 @@ class AsyncSession(SessionState, Generic[D]):
         ) -> Coroutine[Any, Any, D]: ...
     else:
         step = awaiting_step(SessionState._step)
+    switch = awaiting_step(SessionState._switch)
     trajectory = awaiting_step(SessionState._trajectory)
     save_record = awaiting_step(SessionState._save_record)
     close = awaiting_step(SessionState._end)

@@ -235,8 +235,7 @@ def create_session(
     none, where it has ended, and where the robot is not where it leads. "stop": one that says to stop.
     """
     on_failure_value(on_failure)
-    if (policy_id is None) == (policy_ids is None):
-        raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
+    asked = policies_asked(policy_id, policy_ids)
     key = str(uuid.uuid4()) if id is None else id
     body: dict[str, Any] = {
         "id": key,
@@ -252,8 +251,8 @@ def create_session(
         "learn_map": learn_map,
         "map_memory": map_memory,
         "threshold_over": threshold_over,
+        **asked,
     }
-    body.update({"policy_id": policy_id} if policy_ids is None else {"policy_ids": list(policy_ids)})
     body.update({} if max_steps is None else {"max_steps": max_steps})
     delivery = yield from deliver(post("sessions", body=body, slow=True))
     try:
@@ -265,6 +264,13 @@ def create_session(
         if id is not None and info.next_t > 0:  # the caller's id was in use before
             raise
         return info
+
+
+def policies_asked(policy_id: str | None, policy_ids: Sequence[str] | None) -> dict[str, Any]:
+    """The member of a body that names the policies. InputError unless exactly one of the two is given."""
+    if (policy_id is None) == (policy_ids is None):
+        raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
+    return {"policy_id": policy_id} if policy_ids is None else {"policy_ids": list(policy_ids)}
 
 
 def get_session(id: str, *, on_failure: OnFailure = "raise") -> Flow[SessionInfo]:

@@ -26,11 +26,19 @@ RESUMING = 9  # tries to make it again: 13 s where connections are refused
 class Events:
     """What follows step `after` of a session. feed: the connection that is open, for the shell to close.
 
-    decided: the decision of an answer, by the contract's names.
+    decided: the decision of an answer, by the contract's names. switched: takes the rule that a switch
+    brings.
     """
 
-    def __init__(self, id: str, after: int, decided: Callable[[Mapping[str, Any]], Decision]) -> None:
+    def __init__(
+        self,
+        id: str,
+        after: int,
+        decided: Callable[[Mapping[str, Any]], Decision],
+        switched: Callable[[Mapping[str, Any]], object] = lambda rule: None,
+    ) -> None:
         self._path, self._after, self._decided = path("sessions", id, "events"), after, decided
+        self._switched = switched
         self._tries, self._over, self._found = TRIES, False, deque[Decision]()
         self._rest, self._event = bytearray(), dict[bytes, bytes]()
         self.feed: Feed | None = None
@@ -84,11 +92,14 @@ class Events:
         kind, data = self._event.get(b"event", b"message"), self._event.get(b"data")
         self._event.clear()
         self._over = self._over or kind == b"end"
-        if data is None or kind != b"message" or self._over:
+        if data is None or kind not in (b"message", b"switch") or self._over:
             return
         try:
+            if kind == b"switch":
+                self._switched(json.loads(data))
+                return
             decision = self._decided(json.loads(data))
-        except (ValueError, RecursionError, AttributeError) as error:
+        except (ValueError, RecursionError, AttributeError, KeyError, TypeError) as error:
             raise ServerError(
                 f"the server told an event that this client does not understand: {error}"
             ) from error

@@ -72,6 +72,7 @@ class SessionInfo:
     finished: bool
     expires_at: str
     margin: float = 0.0
+    rules: tuple[Mapping[str, Any], ...] = ()  # by the contract's names; the last is in force
 
 
 class Beginning(TypedDict, total=False):
@@ -219,6 +220,7 @@ class TrajectoryItem:
     pose: Pose
     signals: Mapping[str, float]
     decision: Mapping[str, Any] | None
+    rule: int = 0  # which of the session's `rules` decides, or decided, this step
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
+from specshield.client.calls import policies_asked
 from specshield.client.core import Flow, Within, call, deliver
 from specshield.client.events import Events
 from specshield.client.models import (
@@ -193,10 +195,39 @@ class SessionState:
             return
         for item in (yield from self._trajectory()) if self.t else ():
             self._continuation.branches = ()
-            if item.decision is not None:
+            if item.decision is not None and item.rule == max(0, len(self.info.rules) - 1):
                 over = self.info.main_task_done
                 decision = _decision(item.decision, self.info, over, {})
                 self._continuation.learn(decision, item.pose)
+
+    def _switch(
+        self,
+        policy_id: str | None = None,
+        policy_ids: Sequence[str] | None = None,
+        *,
+        clock: Literal["keep", "restart"] = "keep",
+        pose: Numbers | None = None,
+    ) -> Flow[SessionInfo]:
+        """Go on under another rule, on another map or for another robot, from the next step on.
+
+        `clock`: "keep" has the new rule's windows count from where those of the present one do, at first the
+        session's start; "restart" from the next step. `pose` is x_t where the robot is by now; without it the
+        service takes it to be where the last decision's action leads, and the step that follows tells.
+        Raises InfeasibleSwitch where the new rule cannot be kept from there; nothing is changed then.
+        """
+        yield Within(None)
+        body = {**policies_asked(policy_id, policy_ids), "clock": clock}
+        poses = self._poses if pose is None else {**self._poses, self.t: pose_values(pose)}
+        if pose is None:
+            told = post("sessions", self.id, "switch", body={"t": self.t, **body}, slow=True)
+            reply = (yield from deliver(told)).reply
+        else:
+            reply = yield from self._send("switch", poses, self.t, body, slow=True)
+        info = build(SessionInfo, json_object(reply))
+        self.info, self.spec_status = info, info.spec_status
+        self._poses, self._continuation = poses, Continuation(info.margin)
+        self._stored = max(self._stored, self.t + (pose is not None))
+        return info
 
     def _end(self, pose: Numbers | None = None) -> Flow[Verdict]:
         """End the session; `pose` is the state the last action led to."""
@@ -216,11 +247,14 @@ class SessionState:
         return verdict
 
     def _events(self, after: int | None) -> Events:
+        rules = list(self.info.rules)
+
         def decided(answer: Mapping[str, Any]) -> Decision:
             # Once the rule is settled, a session that is finished is one whose main task is over.
-            return _decision(answer, self.info, bool(answer.get("finished")), {})
+            then = _under(self.info, rules, answer.get("t", 0))
+            return _decision(answer, then, bool(answer.get("finished")), {})
 
-        return Events(self.id, self.t - 1 if after is None else after, decided)
+        return Events(self.id, self.t - 1 if after is None else after, decided, rules.append)
 
     def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
         """The states x_0..x_t that the server has, and its answers."""
@@ -239,7 +273,13 @@ class SessionState:
         return reply.headers.get("x-record-seal", "")
 
     def _send(
-        self, action: str, poses: Mapping[int, Pose], t: int, body: Mapping[str, Any], tries: int = TRIES
+        self,
+        action: str,
+        poses: Mapping[int, Pose],
+        t: int,
+        body: Mapping[str, Any],
+        tries: int = TRIES,
+        slow: bool = False,
     ) -> Flow[Reply]:
         """Post the poses the server lacks up to x_t; on a gap once more, from where it says it stands."""
 
@@ -250,6 +290,7 @@ class SessionState:
                 self.id,
                 action,
                 body={"t": t, "poses": newest, **body},
+                slow=slow,
                 tries=tries,
                 t=t if action == "steps" else None,
             )
@@ -282,3 +323,11 @@ def _decision(
         action_names=info.actions,
         source="service",
     )
+
+
+def _under(info: SessionInfo, rules: Sequence[Mapping[str, Any]], t: int) -> SessionInfo:
+    """The session with the actions of the robot that step t was decided for."""
+    rule = next((rule for rule in reversed(rules) if rule["from"] <= t), None)
+    if rule is None:
+        return info
+    return replace(info, actions=tuple(rule["actions"]), terminal_actions=tuple(rule["terminal_actions"]))

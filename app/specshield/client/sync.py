@@ -265,6 +265,7 @@ class Session(SessionState, Generic[D]):
         ) -> D: ...
     else:
         step = blocking_step(SessionState._step)
+    switch = blocking_step(SessionState._switch)
     trajectory = blocking_step(SessionState._trajectory)
     save_record = blocking_step(SessionState._save_record)
     close = blocking_step(SessionState._end)

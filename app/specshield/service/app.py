@@ -69,7 +69,8 @@ LINKS = {  # which answers name a thing, by what parameter, and the operations o
     ("/v1/maps", "201"): ("map_id", ("maps_read", "maps_image")),
     ("/v1/policies", "202"): ("policy_id", ("policies_read",)),
     ("/v1/sessions", "201"): (
-        "session_id", ("sessions_read", "sessions_step", "sessions_close", "sessions_trajectory"),
+        "session_id",
+        ("sessions_read", "sessions_step", "sessions_switch", "sessions_close", "sessions_trajectory"),
     ),
 }  # fmt: skip
 

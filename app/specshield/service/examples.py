@@ -44,4 +44,6 @@ STEP: dict[str, Any] = {
     "main_task_done": False,
 }
 
+SWITCH: dict[str, Any] = {"t": 1, "policy_id": "case1", "clock": "restart", "poses": [[5.2, 5.0, 0.0]]}
+
 CLOSE: dict[str, Any] = {"t": 1, "poses": [[5.2, 5.0, 0.0]]}

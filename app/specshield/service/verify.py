@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from specshield.errors import InputError, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions import chain, history, record
-from specshield.service.sessions.chain import Chain
+from specshield.service.sessions.chain import Chain, Config
 from specshield.service.sessions.config import settings_of
 from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.rules import carried_over
 from specshield.service.sessions.session import columns
 from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
@@ -40,22 +40,25 @@ def verify(file: Path, settings: Settings) -> int:
         print(f"NOT as it was: {error}")
         return 1
     decided = sum(map(bool, found.steps))
-    print(f"session {found.config.id}: {decided} decided steps, {len(found.rows)} poses")
-    print(f"map {found.config.map_id}")
-    print(f"policies {', '.join(found.config.policy_ids)}")
+    print(f"session {found.configs[0].id}: {decided} decided steps, {len(found.rows)} poses")
+    for config in found.configs:
+        if len(found.configs) > 1:
+            print(f"from step {config.begins}, windows from step {config.origin}: {config.spec.formula}")
+        print(f"map {config.map_id}")
+        print(f"policies {', '.join(config.policy_ids)}")
     print("the chain is whole: no byte was changed since it was sealed")
     print(f"seal {found.seal}")
     try:
-        shield = _shield(found, settings)
+        shields = _shields(found, settings)
     except SpecshieldError as error:
         print(f"NOT decided again: {error}")
         return 2
-    return _decide(found, shield)
+    return _decide(found, shields)
 
 
-def _decide(found: Chain, shield: Shield) -> int:
+def _decide(found: Chain, shields: Sequence[Shield]) -> int:
     try:
-        differing = list(differences(found, shield))
+        differing = list(differences(found, shields))
     except (SpecshieldError, ValueError, IndexError) as error:  # a record that no server made
         print(f"NOT as decided: it cannot be decided again: {error}")
         return 1
@@ -68,14 +71,18 @@ def _decide(found: Chain, shield: Shield) -> int:
     return 0
 
 
-def differences(found: Chain, shield: Shield) -> Iterator[tuple[int, list[str]]]:
-    """The steps whose decision is another one now, each with the fields that differ."""
-    plain, carry = replace(shield, preference=None), None
+def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, list[str]]]:
+    """The steps whose decision is another one now, each with the fields that differ. shields: one a rule."""
+    configs, carry, rule = [msgspec.to_builtins(config) for config in found.configs], None, 0
     for t, content, kept in found.decided():
+        while rule < found.rule_at(t):
+            carry = carried_over(carry, configs[rule], configs[rule + 1])
+            rule += 1
+        shield = shields[rule]
         again, following = _again(found, shield, t, kept, carry)
         if record.encode(again) != content and shield.preference is not None:
             # Where its preference was not at hand, the server projected.
-            projected, other = _again(found, plain, t, kept, carry)
+            projected, other = _again(found, replace(shield, preference=None), t, kept, carry)
             if record.encode(projected) == content:
                 again, following = projected, other
         carry = following
@@ -87,8 +94,10 @@ def differences(found: Chain, shield: Shield) -> Iterator[tuple[int, list[str]]]
 def _again(
     found: Chain, shield: Shield, t: int, kept: StepRecord, carry: Carry | None
 ) -> tuple[StepRecord, Carry]:
-    rows, names = found.rows[: t + 1], found.names
-    if len(kept.rows) != len(found.config.actions):
+    rule = found.rule_at(t)
+    config, names = found.configs[rule], found.names[rule]
+    rows = found.rows[config.origin : t + 1, : 3 + len(names)]
+    if len(kept.rows) != len(config.actions):
         raise InputError(f"step {t} is of {len(kept.rows)} actions", t=t)
     if not history.agree(kept.pose_sent(rows[-1]), rows[-1, :3]).all():
         raise InputError(f"the pose sent at step {t} is not the one stored", t=t)
@@ -105,7 +114,7 @@ def _again(
         kept.explain,
     )
     made = record.make(
-        decision,
+        replace(decision, t=t),
         rows[-1],
         kept.before,
         kept.pose_sent(rows[-1]).tolist(),
@@ -124,19 +133,24 @@ def _differ(a: object, b: object) -> bool:
     return msgspec.msgpack.encode(a) != msgspec.msgpack.encode(b)
 
 
-def _shield(found: Chain, settings: Settings) -> Shield:
-    """As the server had it. Raises SpecshieldError where map or policy are not at hand."""
-    config = found.config
+def _shields(found: Chain, settings: Settings) -> list[Shield]:
+    """As the server had them, one a rule. Raises SpecshieldError where map or policy are not at hand."""
     with tempfile.TemporaryDirectory() as folder:  # where there is no data folder, none is made
         if not settings.data_dir.is_dir():
             settings = settings.model_copy(update={"data_dir": Path(folder)})
         policies = Policies(settings, Maps(settings))
-        proposers = [policies.policy(policies.record(id)) for id in config.policy_ids]
+        last = len(found.rows) - 1
+        starts = [found.rows[min(config.origin, last), :3].tolist() for config in found.configs]
+        return [_shield(config, start, policies) for config, start in zip(found.configs, starts, strict=True)]
+
+
+def _shield(config: Config, pose: list[float], policies: Policies) -> Shield:
+    """pose: the first one that the rule looks at."""
+    proposers = [policies.policy(policies.record(id)) for id in config.policy_ids]
     shield = replace(make_shield(proposers), config=settings_of(msgspec.structs.asdict(config)))
     task = shield.task
     if [*task.robot.action_names] != config.actions or str(task.formula) != config.spec.formula:
         raise InputError("the policy at hand is for another task", expected=config.spec.formula)
     if config.shaping != PROJECTION:
-        preference = prepare(config.shaping, task, proposers, np.asarray(found.rows[0, :3]).tolist())
-        shield = replace(shield, preference=preference)
+        shield = replace(shield, preference=prepare(config.shaping, task, proposers, pose))
     return shield

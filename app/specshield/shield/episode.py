@@ -34,7 +34,7 @@ from specshield.shield.judgement import (
 from specshield.shield.taught import handed_on, on_map, teach
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
-__all__ = ["Carry", "Config", "Decision", "Shield", "close", "decide", "make_shield", "start"]
+__all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
 
 Signals = Mapping[str, Floats]
 SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
@@ -45,24 +45,13 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
 
     Raises PoseError for a pose that is not finite, outside the map or in collision, else InfeasibleStart.
     """
-    grid = shield.task.grid
     try:
         history = _history([pose])
     except (PoseError, ValueError):
         raise PoseError(
             "not a pose", path="initial_pose", got=str(list(pose)), expected="finite [x, y, theta]"
         ) from None
-    u, v = grid.to_grid(pose[:2])
-    if not (0.0 <= u < grid.width * grid.resolution and 0.0 <= v < grid.height * grid.resolution):
-        raise PoseError(
-            "the pose is outside the map", path="initial_pose", got=list(pose),
-            expected=f"within {list(grid.bounds)} (xmin, ymin, xmax, ymax)",
-        )  # fmt: skip
-    if in_collision(shield.body, *history[0]):
-        raise PoseError(
-            "the footprint touches an obstacle", path="initial_pose", got=list(pose),
-            expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
-        )  # fmt: skip
+    check_place(shield, history[0], "initial_pose")
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
     tried = futures(prefix, shield.body, shield.proposers, None, shield.config.margin)
     best = float(tried.rho.max(initial=-np.inf))
@@ -72,6 +61,22 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
             f"no future from here was found that satisfies the formula: {found}",
             path="initial_pose", got=list(pose),
             expected="a pose from which some action, followed by a policy, satisfies it; or allow_infeasible",
+        )  # fmt: skip
+
+
+def check_place(shield: Shield, pose: Floats, path: str) -> None:
+    """Raises PoseError, at `path`, for a pose (3,) that is outside the map or in collision."""
+    grid, got = shield.task.grid, pose.tolist()
+    u, v = grid.to_grid(pose[:2])
+    if not (0.0 <= u < grid.width * grid.resolution and 0.0 <= v < grid.height * grid.resolution):
+        raise PoseError(
+            "the pose is outside the map", path=path, got=got,
+            expected=f"within {list(grid.bounds)} (xmin, ymin, xmax, ymax)",
+        )  # fmt: skip
+    if in_collision(shield.body, *pose):
+        raise PoseError(
+            "the footprint touches an obstacle", path=path, got=got,
+            expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
         )  # fmt: skip
 
 

@@ -9,10 +9,11 @@ from specshield.arrays import Floats
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import StepBody
-from specshield.service.sessions import sessions, steps
+from specshield.service.sessions import sessions, steps, switch
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.shields import Shields
+from specshield.service.sessions.switch import Wanted
 from specshield.service.settings import Settings
 from specshield.shield.decision import Config, Decision
 
@@ -34,3 +35,7 @@ def begin(
     settings: Settings, request: SessionRequest, config: Config, owner: str
 ) -> tuple[dict[str, Any], bool, str, Floats]:
     return sessions.begin(policies_of(settings), _shields(settings), request, config, None, owner)
+
+
+def switched(settings: Settings, wanted: Wanted, most_steps: int) -> Session:
+    return switch.switched(policies_of(settings), _shields(settings), wanted, most_steps)

@@ -12,7 +12,7 @@ from specshield.service import examples
 from specshield.service.access.owners import Caller, Owner, scoped
 from specshield.service.routes.messages import MSGPACK
 from specshield.service.schemas.base import Id
-from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse
+from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse, SwitchRequest
 from specshield.service.schemas.steps import (
     CloseRequest,
     CloseResponse,
@@ -124,6 +124,30 @@ async def step(key: SessionKey, body: StepRequest) -> Response:
 
 
 @router.post(
+    "/{session_id}/switch",
+    response_model=SessionResponse,
+    summary="Go on under another rule",
+    responses=problems(
+        _404="No such session or policy.",
+        _409="`history-gap` (with `expected_t`), `history-conflict`, `step-conflict`, `session-finished`",
+        _429="The session has had too many rules.",
+        _503="The store is away: try again.",
+    ),
+)
+async def switch(key: SessionKey, body: SwitchRequest, server: ServerState, caller: Caller) -> Any:
+    """Another rule, map or robot, from step t on; the settings of the session stay.
+
+    Refused with `infeasible-switch` where no action from x_t has a future that satisfies the new rule, with
+    `invalid-pose` where x_t is outside another map, or touches something there or with another footprint. A
+    refusal changes nothing. The same switch sent again is the same switch. `max_steps` grows to what the new
+    rule needs.
+    """
+    made = await server.sessions.switches.make(key, body, caller.name)
+    logs.tell("session switched", policy_ids=made["policy_ids"], t=body.t)
+    return made
+
+
+@router.post(
     "/{session_id}/close",
     response_model=CloseResponse,
     summary="End a session",
@@ -160,10 +184,10 @@ async def trajectory(
     ] = None,
 ) -> Response:
     """x_0 to x_t with the answers, streamed: as one JSON object, or newline-delimited."""
-    lines = await server.sessions.trajectory(key)
+    lines, rules = await server.sessions.trajectory(key)
     if format == "ndjson" or (format is None and NDJSON in accept):
         return StreamingResponse(_each(lines), media_type=NDJSON)
-    return StreamingResponse(_listed(lines), media_type="application/json")
+    return StreamingResponse(_listed(lines, rules), media_type="application/json")
 
 
 async def _each(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
@@ -171,8 +195,8 @@ async def _each(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
         yield line + b"\n"
 
 
-async def _listed(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
+async def _listed(lines: Iterator[bytes], rules: bytes) -> AsyncIterator[bytes]:
     yield b'{"items":['
     for i, line in enumerate(lines):
         yield b"," + line if i else line
-    yield b'],"next":null}'
+    yield b'],"next":null,"rules":' + rules + b"}"

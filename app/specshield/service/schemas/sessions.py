@@ -108,6 +108,55 @@ class SessionRequest(Strict):
         return self.policy_ids or [str(self.policy_id)]
 
 
+class SwitchRequest(Strict):
+    model_config = ConfigDict(json_schema_extra={"examples": [examples.SWITCH]})
+
+    t: int = Field(ge=0, le=1_000_000, description="The first step that the new rule decides.")
+    policy_id: Id | None = Field(None, description="Id or name of the policy.")
+    policy_ids: list[Id] | None = Field(
+        None, min_length=1, max_length=8, fail_fast=True, description="Several policies for one task."
+    )
+    clock: Literal["keep", "restart"] = Field(
+        "keep",
+        description="`keep`: the new rule's windows count from where those of the present one do, at first "
+        "the session's start, and its history counts. `restart`: both begin at t.",
+    )
+    poses: list[Pose] | None = Field(
+        None,
+        min_length=1,
+        max_length=10_001,
+        fail_fast=True,
+        description="Ends with x_t, joined as in a step. Without it, x_t is taken to be where the action of "
+        "the last decision leads.",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> SwitchRequest:
+        if (self.policy_id is None) == (self.policy_ids is None):
+            raise ValueError("exactly one of policy_id and policy_ids")
+        return self
+
+    @property
+    def policies(self) -> list[str]:
+        return self.policy_ids or [str(self.policy_id)]
+
+
+class SessionRule(Answer):
+    begins: int = Field(alias="from", description="The first step that it decides, or decided.")
+    origin: int = Field(description="The step from which its windows count.")
+    clock: Literal["keep", "restart"] = Field(description="As the switch said; of the first one `restart`.")
+    policy_ids: list[str] = Field(description="Ids of its policies.")
+    map_id: str = Field(description="Id of its map.")
+    formula: str = Field(description="The rule.")
+    horizon: int = Field(description="In steps from `origin`.")
+    actions: list[str] = Field(description="Names of its robot's actions, in the order of the logits.")
+    terminal_actions: list[int] = Field(description="Indices of those that end the main task.")
+    spec_status: SpecStatus = Field(
+        description="Of the states from `origin` to the last one under this rule. `pending`: it was neither "
+        "kept nor broken by then."
+    )
+
+
 class SessionResponse(Answer):
     id: str = Field(description="For the paths below /v1/sessions.")
     policy_ids: list[str] = Field(description="Ids of its policies.")
@@ -134,12 +183,17 @@ class SessionResponse(Answer):
     threshold_over: str = Field("step", description="`step` or `episode`.")
     max_steps: int = Field(description="The last step there can be.")
     next_t: int = Field(description="The step expected next.")
-    feasible: bool = Field(description="Whether some action from x_0 had a satisfying future.")
+    feasible: bool = Field(
+        description="Whether some action had a satisfying future where the rule began to hold."
+    )
     spec_status: SpecStatus = Field(description="Of the history so far, whatever may follow.")
     main_task_done: bool = Field(description="As the last step said.")
     finished: bool = Field(description="No further step will be taken.")
     created_at: str = Field(description="RFC 3339.")
     expires_at: str = Field(description="RFC 3339; every change moves it on.")
+    rules: list[SessionRule] = Field(
+        description="Every rule that the session has had. The last is in force: the fields above are of it."
+    )
 
 
 class SessionList(Answer):

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from specshield.service import examples
 from specshield.service.schemas.base import Answer, Point, Pose, SpecStatus, Strict
-from specshield.service.schemas.sessions import SessionResponse
+from specshield.service.schemas.sessions import SessionResponse, SessionRule
 
 MOST_POINTS = 2000  # of each kind, in one step
 
@@ -178,6 +178,7 @@ class TrajectoryItem(Answer):
     t: int = Field(description="The step.")
     pose: Pose
     signals: dict[str, float] = Field(description="The samples held at t.")
+    rule: int = Field(description="Which of `rules` decides, or decided, this step.")
     decision: StepResponse | None = Field(
         description="The answer given; null for a pose sent later or by close."
     )
@@ -186,3 +187,4 @@ class TrajectoryItem(Answer):
 class Trajectory(Answer):
     items: list[TrajectoryItem]
     next: None = Field(None, description="Always null: a trajectory is one page.")
+    rules: list[SessionRule] = Field(description="As in the session.")

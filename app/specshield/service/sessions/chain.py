@@ -18,6 +18,7 @@ from specshield.arrays import Floats
 from specshield.errors import InputError
 from specshield.service.sessions import record
 from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.rules import added
 
 FORMAT: Literal["specshield-record-1"] = "specshield-record-1"
 LARGEST = 256 << 20  # [bytes]; a session of 10,000 steps takes about 7 MB
@@ -25,7 +26,7 @@ MEDIA_TYPE = "application/vnd.specshield.record"
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """config, rows: as stored. steps: the record of each, b"" where passed over. seal: SHA-256."""
+    """config, rows: as stored (rules.py). steps: the record of each, b"" where passed over. seal: SHA-256."""
 
     format: Literal["specshield-record-1"]
     config: bytes
@@ -47,6 +48,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     policy_ids: list[str]
     map_id: str
     spec: Spec
+    robot: str | dict[str, Any]
     actions: list[str]
     seed: int
     threshold: float
@@ -59,21 +61,26 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     threshold_over: Literal["step", "episode"] = "step"
     learn_map: bool = False
     map_memory: int | None = None
+    begins: int = msgspec.field(name="from", default=0)
+    origin: int = 0
+    before: str = ""
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A record whose chain is whole. rows [n, 3 + signals]; steps: b"" where passed over. seal: in hex."""
+    """A record whose chain is whole. rows [n, 3 + signals]; steps: b"" where passed over. seal: in hex.
 
-    config: Config
+    configs: one a rule. names: of the signals, for each rule: those of the rows' columns that there were.
+    """
+
+    configs: Sequence[Config]
+    names: Sequence[list[str]]
     rows: Floats
     steps: Sequence[bytes]
     seal: str
 
-    @property
-    def names(self) -> list[str]:
-        """Of the signals, as in the rows."""
-        return sorted(self.config.spec.signals)
+    def rule_at(self, t: int) -> int:
+        return max(i for i, config in enumerate(self.configs) if config.begins <= t)
 
     def decided(self) -> Iterator[tuple[int, bytes, StepRecord]]:
         for t, content in enumerate(self.steps):
@@ -83,11 +90,12 @@ class Chain:
 
 def pack(config: bytes, rows: bytes, steps: Sequence[bytes]) -> tuple[bytes, str]:
     """The file, and its seal in hex. Rows: no more than the session has."""
-    names = msgspec.json.decode(config, type=Config).spec.signals
-    held = np.frombuffer(rows, "<f8").reshape(-1, 3 + len(names))
-    last, begin = record.digest(config), 0
+    lines = config.split(b"\n")
+    configs = [msgspec.json.decode(line, type=Config) for line in lines]
+    held = np.frombuffer(rows, "<f8").reshape(-1, 3 + len(_names(configs)[-1]))
+    last, begin = record.digest(lines[-1]), configs[-1].begins
     for t, content in enumerate(steps):
-        if content:
+        if content and t >= begin:
             last, begin = record.digest(content), t + 1
     seal = record.link(last, held[begin:])
     return msgspec.msgpack.encode(_File(FORMAT, config, rows, list(steps), seal)), seal.hex()
@@ -101,25 +109,57 @@ def read(content: bytes) -> Chain:
         raise _broken(None, "the file is too large", f"at most {LARGEST} bytes")
     try:
         file = msgspec.msgpack.decode(content, type=_File)
-        config = msgspec.json.decode(file.config, type=Config)
+        lines = file.config.split(b"\n")
+        configs = [msgspec.json.decode(line, type=Config) for line in lines]
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise _broken(None, f"the file is not a session's record: {error}", FORMAT) from None
     if msgspec.msgpack.encode(file) != content:
         raise _broken(None, "the file is not written as a server writes it", "every byte as it was")
-    rows = _rows(file.rows, 3 + len(config.spec.signals))
+    names = _names(configs)
+    rows = _rows(file.rows, 3 + len(names[-1]))
     if len(file.steps) > len(rows):
         raise _broken(None, f"{len(file.steps)} steps and {len(rows)} poses", "a pose for each step")
-    last, begin = record.digest(file.config), 0
-    for t, step in enumerate(file.steps):
+    _check_switches(configs, names, rows)
+    last, begin, rule = record.digest(lines[0]), 0, 0
+    for t in range(len(rows) + 1):
+        while rule + 1 < len(configs) and configs[rule + 1].begins == t:
+            linked = record.link(last, rows[begin:t, : 3 + len(names[rule])])
+            rule += 1
+            if configs[rule].before != linked.hex():
+                raise _broken(t, "the chain is broken: something before this switch is not as it was", None)
+            last, begin = record.digest(lines[rule]), t
+        step = file.steps[t] if t < len(file.steps) else b""
         if not step:
             continue
         found = _decode(t, step)
-        if found.before != record.link(last, rows[begin : t + 1]):
+        if found.before != record.link(last, rows[begin : t + 1, : 3 + len(names[rule])]):
             raise _broken(t, "the chain is broken: something before this step is not as it was", None)
         last, begin = record.digest(step), t + 1
     if file.seal != record.link(last, rows[begin:]):
         raise _broken(None, "the seal is not that of the last record and of what follows it", None)
-    return Chain(config, rows, file.steps, file.seal.hex())
+    return Chain(configs, names, rows, file.steps, file.seal.hex())
+
+
+def _names(configs: Sequence[Config]) -> list[list[str]]:
+    """The signals of the rows, by column, as each rule found them with its own."""
+    names, found = list[str](), list[list[str]]()
+    for config in configs:
+        names = [*names, *added(names, config.spec.signals)]
+        found.append(names)
+    return found
+
+
+def _check_switches(configs: Sequence[Config], names: Sequence[list[str]], rows: Floats) -> None:
+    """That rules follow each other in time, and that a column holds its first value until its rule begins."""
+    if configs[0].begins or configs[0].origin:
+        raise _broken(0, "the first rule does not begin with the session", None)
+    for i in range(1, len(configs)):
+        config, old = configs[i], configs[i - 1]
+        if not old.begins <= config.begins <= len(rows) or config.origin not in (config.begins, old.origin):
+            raise _broken(config.begins, "a rule begins out of its turn", None)
+        for column in range(len(names[i - 1]), len(names[i])):
+            if (rows[: config.begins, 3 + column] != config.spec.signals[names[i][column]]).any():
+                raise _broken(config.begins, "a signal has values before its rule began", None)
 
 
 def _rows(content: bytes, width: int) -> Floats:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from specshield.service.library.policies import Description
 from specshield.service.schemas.sessions import KnownUncertainty, SessionRequest, Uncertain
 from specshield.shield.decision import Config
 from specshield.shield.uncertainty import Uncertainty
+from specshield.task import Task
 
 # The settings that are stored by the names that `Config` has for them.
 ALIKE = (
@@ -24,8 +28,15 @@ ALIKE = (
 
 
 def settings_of(config: Mapping[str, Any]) -> Config:
-    """Of a stored config. One from before a setting existed has the paper's default for it."""
+    """Of a stored config. One from before a setting existed has the paper's default for it.
+
+    The core counts steps from where the rule's windows begin. So does the draw of actions: each origin has a
+    seed of its own.
+    """
     alike = {name: config[name] for name in ALIKE if name in config}
+    origin = config.get("origin", 0)
+    if origin:
+        alike |= {"seed": alike["seed"] + origin, "max_steps": alike["max_steps"] - origin}
     return Config(**alike, uncertainty=_uncertainty(config.get("uncertainty", "none")))
 
 
@@ -33,6 +44,23 @@ def asked_for(request: SessionRequest) -> Config:
     """What a request asks for. Raises InputError for settings that cannot be had."""
     alike = {name: getattr(request, name) for name in ALIKE}
     return Config(**alike, uncertainty=_uncertainty(_told(request.uncertainty)))
+
+
+def asked_by(policy_ids: Sequence[str], about: Description, task: Task) -> dict[str, Any]:
+    """What the config holds of the policies, and of the task that they are for."""
+    return {
+        "policy_ids": list(policy_ids),
+        "map_id": about.map_id,
+        "spec": {
+            "formula": str(task.formula),
+            "regions": about.spec.get("regions") or {},
+            "signals": dict(sorted(task.signals.items())),
+        },
+        "robot": about.robot,
+        "horizon": task.horizon,
+        "actions": list(task.robot.action_names),
+        "terminal_actions": np.flatnonzero(task.robot.terminal).tolist(),
+    }
 
 
 def stored(settings: Config, request: SessionRequest) -> dict[str, Any]:

@@ -6,8 +6,9 @@ to the last bit.
 
 The records of a session are a chain. `before` is `link(SHA-256 of the previous record, rows)`, where `rows`
 are those from the step after the previous record's up to this step's; for the first record it is
-`link(SHA-256 of the config, x_0 .. x_t)`. So none of config, poses, signals and records can be changed
-afterwards without its being seen.
+`link(SHA-256 of the config, x_0 .. x_t)`. A switch to another rule is a link of the same kind: its line of
+the config holds the hash of what came before, and the next record that of the line. So none of config, poses,
+signals and records can be changed afterwards without its being seen.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     format: `FORMAT`, of records of this layout. before: SHA-256, as `link` has it.
 
     Asked: pose, x_t as it was sent, three float64, None where it is the stored one to the bit. logits: as
-    `_pack_logits` has them. signals: which of the declared names (in alphabetical order) were sent, bit i
-    for name i; their values are in the row. all_witnesses: whether one was asked for each action.
+    `_pack_logits` has them. signals: which were sent, bit i for column i of the row's signals; their
+    values are there. all_witnesses: whether one was asked for each action.
 
     occupied, free: the points that were sent, two float64 each. explain: whether explanations were asked for.
 
@@ -93,7 +94,7 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
         return row[:3] if self.pose is None else np.frombuffer(self.pose, "<f8")
 
     def signals_sent(self, row: Floats, names: Sequence[str]) -> dict[str, float]:
-        """names: those that the session declares, in alphabetical order."""
+        """names: of the row's signals, by column."""
         return {name: float(row[3 + i]) for i, name in enumerate(names) if self.signals >> i & 1}
 
 
@@ -138,9 +139,9 @@ def make(
     free: Floats | None = None,
     explain: bool = False,
 ) -> StepRecord:
-    """The record of `decision`, made at the stored `row` for a caller who sent what follows.
+    """The record of `decision`, made at step t and its stored `row` for a caller who sent what follows.
 
-    logits [A], -inf for null. names: of the signals that the session declares, in alphabetical order.
+    logits [A], -inf for null. names: of the rows' signals, by column.
     """
     sent = np.array(pose, "<f8").tobytes()
     actions = np.empty((len(decision.distribution), COLUMNS))

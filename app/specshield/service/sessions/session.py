@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +16,7 @@ from specshield.service.library import files
 from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import history, record
+from specshield.service.sessions import rules as ruled
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
 
@@ -27,10 +27,10 @@ RACES = 10  # writes lost to others before a caller is told so
 class Session:
     """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held.
 
-    signal_names: in alphabetical order, as in the rows.
+    rules: the config of each rule that it has had, the one in force last. signal_names: as in the rows.
     """
 
-    config: Mapping[str, Any]
+    rules: Sequence[Mapping[str, Any]]
     state: State
     version: bytes
     rows: Floats
@@ -38,10 +38,16 @@ class Session:
 
     @staticmethod
     def of(stored: Record | Dump) -> Session:
-        config, state = json.loads(stored.config), State.of(stored.state)
-        names = sorted(config["spec"]["signals"])
-        rows = np.frombuffer(stored.rows, "<f8").reshape(-1, 3 + len(names))
-        return Session(config, state, stored.version, rows[: state.length], names)
+        rules, state = ruled.read(stored.config), State.of(stored.state)
+        names = ruled.columns_of(rules)
+        width = 3 + len(names)
+        rows = np.frombuffer(stored.rows, "<f8", state.length * width).reshape(-1, width)
+        return Session(rules, state, stored.version, rows, names)
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """Of the rule that is in force."""
+        return self.rules[-1]
 
     @property
     def id(self) -> str:
@@ -50,6 +56,11 @@ class Session:
     @property
     def poses(self) -> Floats:
         return self.rows[:, :3]
+
+    @property
+    def since(self) -> Floats:
+        """The rows that the rule in force looks at."""
+        return self.rows[ruled.origin(self.config) :]
 
     def extended(self, t: int, poses: Floats, signals: Mapping[str, float]) -> Session:
         """The session with its history up to t; signals that are not sent hold their last value."""
@@ -66,19 +77,20 @@ class Session:
         first = min(self.state.length, len(self.rows) - 1)
         return pack(self.rows[first:]), first * 8 * self.rows.shape[1]
 
-    @property
-    def signals(self) -> dict[str, Floats]:
-        return columns(self.rows, self.signal_names)
+
+# What others are not told of a config.
+INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before")
 
 
-def describe(config: Mapping[str, Any], state: State) -> dict[str, Any]:
+def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]:
     """The session as the contract shows it."""
-    shown = {name: value for name, value in config.items() if name not in ("robot", "nonce", "owner")}
+    shown = {name: value for name, value in rules[-1].items() if name not in INSIDE}
     names = ("next_t", "feasible", "spec_status", "main_task_done", "finished")
     return {
         **shown,
         **{name: getattr(state, name) for name in names},
         "expires_at": files.rfc3339(state.expires_at),
+        "rules": ruled.told(rules, [*state.verdicts, state.spec_status]),
     }
 
 
@@ -129,7 +141,7 @@ def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:
             expected_t=session.state.next_t,
         )
     history.join(session.poses, request.t, np.array(request.poses))
-    return record.answer(kept, row, session.config["actions"])
+    return record.answer(kept, row, session.rules[ruled.at(session.rules, request.t)]["actions"])
 
 
 def logits_of(request: StepBody) -> Floats | None:
@@ -149,14 +161,14 @@ def _equal(a: Floats | None, b: Floats | None) -> bool:
 
 
 def lines(session: Session, steps: Sequence[bytes]) -> Iterator[bytes]:
-    """One JSON object a step: t, pose, signals, and the answer that was given."""
-    names = session.config["actions"]
+    """One JSON object a step: t, pose, signals, which rule held, and the answer that was given."""
     for t, row in enumerate(session.rows):
-        held = row.tolist()
-        signals = dict(zip(session.signal_names, held[3:], strict=True))
-        head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals})
+        held, rule = row.tolist(), ruled.at(session.rules, t)
+        config, values = session.rules[rule], dict(zip(session.signal_names, held[3:], strict=True))
+        signals = {name: values[name] for name in sorted(config["spec"]["signals"])}
+        head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals, "rule": rule})
         step = steps[t] if t < len(steps) else b""
-        told = to_json(record.answer(record.decode(step), row, names)) if step else b"null"
+        told = to_json(record.answer(record.decode(step), row, config["actions"])) if step else b"null"
         yield head[:-1] + b',"decision":' + told + b"}"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import os
 import secrets
@@ -19,17 +18,15 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.errors import FragmentError, InfeasibleStart, InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
-from specshield.robot.dynamics import make_body
-from specshield.rule.view import view_of
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.access.owners import scoped
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
-from specshield.service.library.policies import Description, Policies
+from specshield.service.library.policies import Policies
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import CloseRequest
-from specshield.service.sessions import chain, record
-from specshield.service.sessions.config import asked_for, stored
+from specshield.service.sessions import chain, record, rules
+from specshield.service.sessions.config import asked_by, asked_for, stored
 from specshield.service.sessions.session import (
     RACES,
     Session,
@@ -44,11 +41,12 @@ from specshield.service.sessions.session import (
 from specshield.service.sessions.shields import Shields, refused
 from specshield.service.sessions.state import State
 from specshield.service.sessions.steps import Steps
+from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.store import Change, Dump, Record
 from specshield.shield import episode
-from specshield.shield.decision import Config, Shield, check_preferring
+from specshield.shield.decision import Config, check_preferring
 from specshield.shield.preference import Preference
 
 R = TypeVar("R")
@@ -64,6 +62,7 @@ class Sessions:
         self._shields = Shields(policies, settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl)
+        self.switches = Switches(store, policies, self._shields, self._threads, heavy, settings)
         self._heavy = heavy
 
     async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
@@ -76,7 +75,8 @@ class Sessions:
         preference = None
         if request.shaping != PROJECTION:
             try:
-                preparing = await self._run(self._shields.prepared, request, key.name)
+                asked = request.shaping, request.policies, request.initial_pose, key.name
+                preparing = await self._run(self._shields.prepared, *asked)
                 preference = await asyncio.shield(asyncio.wrap_future(preparing))
             except FragmentError as error:
                 raise refused(request.shaping, error) from None
@@ -90,7 +90,7 @@ class Sessions:
         except SpecshieldError:
             await self._store.delete(stored_as)
             raise
-        return describe(config, state)
+        return describe([config], state)
 
     async def _begun(
         self, request: SessionRequest, settings: Config, preference: Preference | None, owner: str
@@ -118,13 +118,13 @@ class Sessions:
 
     async def read(self, id: str) -> dict[str, Any]:
         session = Session.of(await self._load(id))
-        return describe(session.config, session.state)
+        return describe(session.rules, session.state)
 
     async def page(
         self, owner: str, after: str | None, limit: int
     ) -> tuple[list[dict[str, Any]], str | None]:
         found, following = await self._store.everything(f"{owner}@", after, limit)
-        shown = [describe(json.loads(config), State.of(state)) for config, state in found]
+        shown = [describe(rules.read(config), State.of(state)) for config, state in found]
         for item in shown:  # they can be long, and whoever wants them reads the session
             item["spec"] = {name: held for name, held in item["spec"].items() if name != "regions"}
         return shown, following
@@ -149,10 +149,10 @@ class Sessions:
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
                     raise over(session, request.t)
-            status, bounds = await self._run(self._verdict, session)
+            session, status, bounds = await self._run(self._closed, session)
             if not state.closed:
                 state = msgspec.structs.replace(
-                    state,
+                    session.state,
                     length=len(session.rows),
                     spec_status=status,
                     finished=True,
@@ -163,21 +163,19 @@ class Sessions:
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue
             finite = [value if math.isfinite(value) else None for value in bounds]
-            return {**describe(session.config, state), "robustness_bounds": finite}
+            return {**describe(session.rules, state), "robustness_bounds": finite}
         raise contended(id)
 
-    def _verdict(self, session: Session) -> tuple[str, tuple[float, float]]:
-        """Needs no policy, since those of a session that is over may have been deleted."""
-        config = session.config
-        task = self._policies.task(Description(config["map_id"], config["robot"], config["spec"], "", 0, {}))
-        body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
-        shield = Shield(task, (), Config(), body, view)
-        return episode.close(shield, session.poses, session.signals)
+    def _closed(self, session: Session) -> tuple[Session, str, tuple[float, float]]:
+        session = self._shields.settled(session)
+        return session, *self._shields.verdict(session.config, session.rows, session.signal_names)
 
-    async def trajectory(self, id: str) -> Iterator[bytes]:
-        """One JSON object a step: t, pose, signals, and the answer that was given."""
+    async def trajectory(self, id: str) -> tuple[Iterator[bytes], bytes]:
+        """One JSON object a step, as `lines` has it; and the rules, as one JSON list."""
         found = await self._dump(id)
-        return lines(Session.of(found), found.steps)
+        session = Session.of(found)
+        shown = describe(session.rules, session.state)["rules"]
+        return lines(session, found.steps), files.to_json(shown)
 
     async def record(self, id: str) -> tuple[bytes, str]:
         """The session's record as a file, and its seal."""
@@ -197,9 +195,9 @@ class Sessions:
         while True:
             found, after = await self._store.everything(f"{owner}@", after, 1000)
             for config, state in found:
-                fixed = json.loads(config)
-                if policy_id in fixed["policy_ids"] and not State.of(state).finished:
-                    return str(fixed["id"])
+                latest = rules.read(config)[-1]
+                if policy_id in latest["policy_ids"] and not State.of(state).finished:
+                    return str(latest["id"])
             if after is None:
                 return None
 
@@ -252,22 +250,12 @@ def begin(
             raise
         feasible = False
     task, about = shield.task, records[0].about
-    signals = {name: task.signals[name] for name in sorted(task.signals)}
+    signals = dict(sorted(task.signals.items()))
     rows = np.array([[*request.initial_pose, *signals.values()]])
     status, _ = episode.close(shield, rows[:, :3], columns(rows, signals))
     config = {
         "id": request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
-        "policy_ids": ids,
-        "map_id": about.map_id,
-        "spec": {
-            "formula": str(task.formula),
-            "regions": about.spec.get("regions") or {},
-            "signals": signals,
-        },
-        "robot": about.robot,
-        "horizon": task.horizon,
-        "actions": list(task.robot.action_names),
-        "terminal_actions": np.flatnonzero(task.robot.terminal).tolist(),
+        **asked_by(ids, about, task),
         **stored(settings, request),
         "shaping": request.shaping,
         "max_steps": shield.max_steps,

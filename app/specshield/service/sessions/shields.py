@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
+import msgspec
+
+from specshield.arrays import Floats
 from specshield.errors import FragmentError
 from specshield.lookahead.lookahead import AHEADS
 from specshield.lookahead.preferences import PROJECTION, prepare
+from specshield.robot.dynamics import make_body
+from specshield.rule.view import view_of
 from specshield.service.library import files
-from specshield.service.library.policies import Policies
-from specshield.service.schemas.sessions import SessionRequest
+from specshield.service.library.policies import Description, Policies
+from specshield.service.sessions import rules
 from specshield.service.sessions.config import settings_of
-from specshield.service.sessions.session import Session
+from specshield.service.sessions.session import Session, columns
+from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 
+Bounds = tuple[float, float]
 QUICK = ("reachability", "dqn")  # methods whose decisions take a millisecond; of others nothing is known
 
 
@@ -63,10 +72,36 @@ class Shields:
             return shield
         return replace(shield, preference=self._preference_at_hand(shield, session))
 
-    def prepared(self, request: SessionRequest, owner: str) -> Future[Preference]:
-        """The preference that a new session asks for, or will be."""
-        ids = [self._policies.find(key, owner).id for key in request.policies]
-        return self._prepare(request.shaping, ids, self.get(ids, Config()), request.initial_pose)
+    def prepared(
+        self, name: str, keys: Sequence[str], pose: Sequence[float], owner: str
+    ) -> Future[Preference]:
+        """The preference that a session with these policies asks for, or will be."""
+        ids = [self._policies.find(key, owner).id for key in keys]
+        return self._prepare(name, ids, self.get(ids, Config()), pose)
+
+    def verdict(self, config: Mapping[str, Any], rows: Floats, names: Sequence[str]) -> tuple[str, Bounds]:
+        """Of a rule on a session's rows [t + 1, 3 + signals], and the bounds on its robustness.
+
+        Needs no policy, since those of a rule that is over may have been deleted.
+        """
+        task = self._policies.task(Description(config["map_id"], config["robot"], config["spec"], "", 0, {}))
+        body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
+        since = rows[rules.origin(config) :]
+        if not len(since):
+            return "pending", (-math.inf, math.inf)
+        shield = Shield(task, (), Config(), body, view)
+        return episode.close(shield, since[:, :3], columns(since, names))
+
+    def settled(self, session: Session) -> Session:
+        """The session, with the verdicts of the rules that its last switch ended once its x_t is known."""
+        begins, verdicts = rules.begins(session.config), list(session.state.verdicts)
+        if not verdicts or session.state.length > begins or len(session.rows) <= begins:
+            return session
+        for i, verdict in enumerate(verdicts):
+            if rules.begins(session.rules[i + 1]) == begins and verdict == "pending":
+                last = session.rows[: begins + 1]
+                verdicts[i], _ = self.verdict(session.rules[i], last, session.signal_names)
+        return replace(session, state=msgspec.structs.replace(session.state, verdicts=tuple(verdicts)))
 
     def _prepare(
         self, name: str, policy_ids: Sequence[str], shield: Shield, pose: Sequence[float]

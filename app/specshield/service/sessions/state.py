@@ -12,7 +12,8 @@ class State(msgspec.Struct, frozen=True, array_like=True):
     """Of a session after its last change.
 
     length: of the stored poses. next_t: the step after the last decided one. expires_at [s since 1970]. head:
-    SHA-256 of the last step's record, of the config where none was decided. carry: as `pack_carry` has it.
+    SHA-256 of the last step's record, of the config where none was decided under it. carry: as `pack_carry`
+    has it. verdicts: of the rules that held before the one in force.
     """
 
     length: int
@@ -25,6 +26,7 @@ class State(msgspec.Struct, frozen=True, array_like=True):
     finished: bool = False
     closed: bool = False
     carry: PackedCarry | None = None
+    verdicts: tuple[str, ...] = ()
 
     @staticmethod
     def of(content: bytes) -> State:

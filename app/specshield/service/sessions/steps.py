@@ -25,6 +25,7 @@ from specshield.service.sessions.session import (
     RACES,
     Session,
     check_step,
+    columns,
     contended,
     logits_of,
     missing,
@@ -197,21 +198,24 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
     shield, signals = shields.of(session), request.signals or {}
     check_signals(shield.task, signals)
     state, logits = session.state, logits_of(request)
-    session = session.extended(request.t, np.array(request.poses, np.float64), signals)
+    session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), signals))
     carry = None if state.carry is None else state.carry.unpacked()
     occupied, free = points_of(request.occupied), points_of(request.free)
+    since = session.since
     decision = episode.decide(
         shield,
-        session.poses,
+        since[:, :3],
         logits,
         request.main_task_done,
-        session.signals,
+        columns(since, session.signal_names),
         carry,
         request.witnesses,
         occupied,
         free,
         request.explain,
     )
+    if len(since) < len(session.rows):  # the rule's clock began after the session
+        decision = replace(decision, t=request.t)
     made = record.make(
         decision,
         session.rows[-1],

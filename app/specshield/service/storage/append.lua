@@ -1,7 +1,7 @@
 -- Appends to a session, or begins one: all of it or nothing, and only to the state the caller looked at.
 -- KEYS: session (hash), rows (string), steps (list), all of one slot.
 -- ARGV: version looked at ('' to begin), first byte to write, rows, step ('' for none), its record, state,
---       config ('' where there is one already), time to live in ms.
+--       config ('' where it stays as it is), time to live in ms.
 -- Returns the new version; where the session is no longer the one looked at, what there is instead:
 --         {config, state, version, rows, what that step left}, each false where there is none.
 if (redis.call('HGET', KEYS[1], 'version') or '') ~= ARGV[1] then

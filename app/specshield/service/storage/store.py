@@ -64,13 +64,16 @@ class News:
 
 @dataclass(frozen=True)
 class Change:
-    """What one write adds: `rows` from byte `offset` on, what step `t` left, the state after it."""
+    """What one write adds: `rows` from byte `offset` on, what step `t` left, the state after it. config: the
+    one that takes the place of the stored one.
+    """
 
     state: bytes
     rows: bytes = b""
     offset: int = 0
     t: int | None = None
     step: bytes = b""
+    config: bytes = b""
 
 
 class Store:
@@ -122,7 +125,7 @@ class Store:
         """All of the change, and the new version; or nothing where `version` is no longer the latest: then
         the session as it is, with what step `change.t` left, or None where it is gone. One round trip.
         """
-        return await self._write(id, version, change, b"")
+        return await self._write(id, version, change, change.config)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """The session, with what step t left; None where there is none. One round trip."""
@@ -221,12 +224,12 @@ class Store:
         async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
             for id, t, width, count in asked:
                 session, rows, steps = keys(id)
-                pipe.hget(session, "state")
                 pipe.lrange(steps, t, t + count - 1)
-                pipe.getrange(rows, t * width, (t + count) * width - 1)  # last: it has all rows of the steps
+                pipe.getrange(rows, t * width, (t + count) * width - 1)  # later: it has all rows of the steps
+                pipe.hget(session, "state")  # last: a switch that makes the rows wider is seen here
             found = await pipe.execute()
         three = zip(found[::3], found[1::3], found[2::3], strict=True)
-        return [None if state is None else News(state, rows, steps) for state, steps, rows in three]
+        return [None if state is None else News(state, rows, steps) for steps, rows, state in three]
 
     async def held_bytes(self) -> int:
         """The memory that the store takes: in a cluster all its masters, their replicas not counted."""

@@ -11,14 +11,15 @@ import asyncio
 import json
 import logging
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from specshield.errors import LimitReached, SpecshieldError
 from specshield.service import metrics
 from specshield.service.schemas.answers import to_json
-from specshield.service.sessions import record
-from specshield.service.sessions.session import Session, missing
+from specshield.service.sessions import record, rules
+from specshield.service.sessions.session import Session, describe, missing
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import News, Store
 
@@ -32,14 +33,16 @@ log = logging.getLogger("specshield")
 
 @dataclass(eq=False)
 class Feed:
-    """A session that is watched here. actions: their names. width: bytes of a row.
+    """A session that is watched here. rules: those that it has had, `told` as the contract shows them. width:
+    bytes of a row.
 
     recent: the events of the steps from `start` to before `end`. version: the one that was read; None for a
     session that is not in the store.
     """
 
     id: str
-    actions: list[str]
+    rules: Sequence[Mapping[str, Any]]
+    told: list[dict[str, Any]]
     width: int
     version: bytes | None
     start: int
@@ -110,9 +113,8 @@ class Watchers:
         session = Session.of(found)
         state = session.state
         return Feed(
-            id, session.config["actions"], 8 * session.rows.shape[1], found.version,
-            state.next_t, state.next_t, state.finished, state.spec_status,
-        )  # fmt: skip
+            id, *_ruled(session), found.version, state.next_t, state.next_t, state.finished, state.spec_status
+        )
 
     async def _stream(self, feed: Feed, t: int) -> AsyncIterator[bytes]:
         feed = self._feeds.setdefault(feed.id, feed)
@@ -155,7 +157,8 @@ class Watchers:
         if here:
             news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed, _ in here])
             for (feed, version), new in zip(here, news, strict=True):
-                self._gone_on(feed, version, new)
+                if new is None or not _outdated(feed, new) or not await self._switched(feed):
+                    self._gone_on(feed, version, new)
         for feed, found in gone_on:
             if found is None:
                 await self._left(feed)
@@ -170,6 +173,14 @@ class Watchers:
         if end >= state.next_t:  # else there is more, for the next look
             feed.version = version
 
+    async def _switched(self, feed: Feed) -> bool:
+        """Reads the rules anew; what else is new is for the next look. False where the session is gone."""
+        found = await self._store.load(feed.id)
+        if found is None or _begun(found.version) != _begun(feed.version or found.version):
+            return False
+        feed.rules, feed.told, feed.width = _ruled(Session.of(found))
+        return True
+
     async def _left(self, feed: Feed) -> None:
         """The session is no longer in the store: it was erased, or lies in the archive."""
         dump = await self._store.dump(feed.id)
@@ -177,6 +188,7 @@ class Watchers:
             feed.over = True
             feed.wake()
         else:
+            feed.rules, feed.told, feed.width = _ruled(Session.of(dump))
             new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
             feed.add(State.of(dump.state), *_events(feed, feed.end, new))
         feed.version = None
@@ -188,20 +200,41 @@ class Watchers:
             dump = await self._store.dump(feed.id)
             if dump is None:
                 return [], feed.end
+            feed.rules, feed.told, feed.width = _ruled(Session.of(dump))
             new = News(dump.state, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
+        elif _outdated(feed, new):
+            return [], t if await self._switched(feed) else feed.end
         found, end = _events(feed, t, new)
         return found, end if end > t else feed.end
 
 
 def _events(feed: Feed, t: int, new: News) -> tuple[list[tuple[int, bytes]], int]:
-    """The events of the steps from t on that `new` has, and the step that follows them."""
+    """The events of the steps from t on that `new` has, and the step that follows them. The first decision
+    after a switch brings the switch.
+    """
     found = []
+    switched = [rule for rule in feed.told[1:] if rule["from"] >= t]
     for i, step in enumerate(new.steps):
         if step:
             row = record.row_of(new.rows[i * feed.width : (i + 1) * feed.width])
-            answer = to_json(record.answer(record.decode(step), row, feed.actions))
-            found.append((t + i, b"id: %d\ndata: %s\n\n" % (t + i, answer)))
+            actions = feed.rules[rules.at(feed.rules, t + i)]["actions"]
+            answer = to_json(record.answer(record.decode(step), row, actions))
+            event = b"id: %d\ndata: %s\n\n" % (t + i, answer)
+            while switched and switched[0]["from"] <= t + i:
+                event = b"event: switch\ndata: %s\n\n%s" % (json.dumps(switched.pop(0)).encode(), event)
+            found.append((t + i, event))
     return found, t + len(new.steps)
+
+
+def _outdated(feed: Feed, new: News) -> bool:
+    """Whether the session has had a switch that the feed does not know of; its rows may be wider since."""
+    return len(State.of(new.state).verdicts) >= len(feed.rules)
+
+
+def _ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str, Any]], int]:
+    """`Feed.rules`, `told` and `width`."""
+    told = describe(session.rules, session.state)["rules"]
+    return session.rules, told, 8 * session.rows.shape[1]
 
 
 def _end(feed: Feed) -> bytes:

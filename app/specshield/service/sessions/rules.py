@@ -1,0 +1,109 @@
+"""The rules that a session has had (pure).
+
+A session's stored config is a line of JSON for each of its rules. The first line is what the session began
+with. A switch adds a line: the whole config from then on, and beside it `from`, the first step that the rule
+decides; `origin`, the step from which its windows count; `clock`, as it was asked for; `before`, the link of
+the chain (record.py) that the switch follows, in hex.
+
+The rows have a column for each signal that a rule so far declares: those of the first rule in alphabetical
+order, then what each further one adds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.shield.decision import Carry
+
+NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
+MOST_RULES = 256  # of one session; chosen by hand: every load of the session reads their lines
+Config = Mapping[str, Any]
+
+
+def read(content: bytes) -> list[Config]:
+    """The config of each rule, the one in force last."""
+    return [json.loads(line) for line in content.split(b"\n")]
+
+
+def begins(config: Config) -> int:
+    """The first step that the rule decides."""
+    return int(config.get("from", 0))
+
+
+def origin(config: Config) -> int:
+    """The step from which the rule's windows count, and its history."""
+    return int(config.get("origin", 0))
+
+
+def at(rules: Sequence[Config], t: int) -> int:
+    """Which rule decides, or decided, step t."""
+    return max(i for i, config in enumerate(rules) if begins(config) <= t)
+
+
+def added(names: Iterable[str], signals: Iterable[str]) -> list[str]:
+    """The columns that a rule with these signals adds to the columns `names`."""
+    known = set(names)
+    return [name for name in sorted(signals) if name not in known]
+
+
+def columns_of(rules: Sequence[Config]) -> list[str]:
+    """The signals of the rows, by column."""
+    names = list[str]()
+    for config in rules:
+        names += added(names, config["spec"]["signals"])
+    return names
+
+
+def widened(rows: Floats, names: Sequence[str], signals: Mapping[str, float]) -> Floats:
+    """The rows with the columns that a rule with these signals adds; they hold the initial values."""
+    first = [signals[name] for name in added(names, signals)]
+    return np.hstack([rows, np.tile(first, (len(rows), 1))]) if first else rows
+
+
+def carried_over(carry: Carry | None, old: Config, new: Config) -> Carry | None:
+    """What the last decision under the old rule hands to the first one under the new.
+
+    What the map has learned stays where the map is the same, what is known of the robot where the robot is;
+    where both are and the clock goes on, so does what the last motion should have led to. Continuations are
+    of the old rule.
+    """
+    if carry is None:
+        return None
+    same_map, same_robot = old["map_id"] == new["map_id"], old["robot"] == new["robot"]
+    stays = same_map and same_robot and origin(old) == origin(new)
+    return replace(
+        carry,
+        t=carry.t if stays else NEVER,
+        next_poses=carry.next_poses if stays else np.empty((0, 3)),
+        witnesses=(None,) * len(carry.witnesses) if stays else (),
+        memory=None,
+        residuals=carry.residuals if same_robot else None,
+        threshold_left=None,
+        learned=carry.learned if same_map else None,
+        action=carry.action if stays else None,
+    )
+
+
+def told(rules: Sequence[Config], verdicts: Sequence[str]) -> list[dict[str, Any]]:
+    """The rules as the contract shows them; verdicts: of each."""
+    return [
+        {
+            "from": begins(config),
+            "origin": origin(config),
+            "clock": config.get("clock", "restart"),
+            "policy_ids": config["policy_ids"],
+            "map_id": config["map_id"],
+            "formula": config["spec"]["formula"],
+            "horizon": config["horizon"],
+            "actions": config["actions"],
+            "terminal_actions": config["terminal_actions"],
+            "spec_status": verdict,
+        }
+        for config, verdict in zip(rules, verdicts, strict=True)
+    ]

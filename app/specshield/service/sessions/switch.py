@@ -1,0 +1,237 @@
+"""Another rule, map or robot for a session from step t on: checked first, then written as a step is."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.errors import (
+    FragmentError,
+    HistoryGap,
+    InputError,
+    LimitReached,
+    SpecshieldError,
+    StepConflict,
+)
+from specshield.lookahead.preferences import PROJECTION
+from specshield.service.heavy.heavy import Heavy
+from specshield.service.library import files
+from specshield.service.library.policies import Policies
+from specshield.service.schemas.sessions import SwitchRequest
+from specshield.service.sessions import history, record, rules
+from specshield.service.sessions.config import asked_by
+from specshield.service.sessions.session import (
+    RACES,
+    Session,
+    columns,
+    contended,
+    describe,
+    missing,
+    over,
+    pack,
+)
+from specshield.service.sessions.shields import Shields, refused
+from specshield.service.sessions.state import pack_carry
+from specshield.service.settings import Settings
+from specshield.service.storage.store import Change, Store
+from specshield.shield import episode
+from specshield.shield.decision import Config
+from specshield.shield.switching import switch
+
+R = TypeVar("R")
+
+
+class Switches:
+    """Nothing is changed by a switch that is refused."""
+
+    def __init__(
+        self,
+        store: Store,
+        policies: Policies,
+        shields: Shields,
+        threads: ThreadPoolExecutor,
+        heavy: Heavy,
+        settings: Settings,
+    ) -> None:
+        self._store, self._policies, self._shields = store, policies, shields
+        self._threads, self._heavy = threads, heavy
+        self._ttl, self._most = settings.session_ttl, settings.max_steps
+
+    async def make(self, id: str, request: SwitchRequest, owner: str) -> dict[str, Any]:
+        """The session after it. Raises NotFound, InfeasibleSwitch, PoseError, HistoryGap, HistoryConflict,
+        StepConflict, SessionFinished, LimitReached.
+        """
+        for _ in range(RACES):
+            found = await self._store.load(id, request.t - 1 if request.t else None)
+            if found is None:
+                raise missing(id)
+            session = Session.of(found)
+            ids = await self._run(lambda: [self._policies.find(key, owner).id for key in request.policies])
+            if _is_last(session, request, ids):
+                return describe(session.rules, session.state)
+            wanted = _wanted(session, request, ids, found.step)
+            made = await self._made(wanted, owner)
+            before, after = session.rows.shape[1], made.rows.shape[1]
+            rows = made.added() if before == after else (pack(made.rows), 0)
+            state = msgspec.structs.replace(made.state, expires_at=time.time() + self._ttl)
+            line = files.to_json(made.config)
+            change = Change(state.packed(), *rows, config=b"\n".join([found.config, line]))
+            version = await self._store.append(id, session.version, change)
+            if not isinstance(version, bytes):
+                continue
+            try:  # whoever deletes a policy sees this session now, or has marked the policy before
+                await self._run(self._policies.still_there, ids, owner)
+            except SpecshieldError:
+                await self._store.append(id, version, Change(found.state, found.rows, config=found.config))
+                raise
+            return describe(made.rules, state)
+        raise contended(id)
+
+    async def _made(self, wanted: Wanted, owner: str) -> Session:
+        """In a thread, or in another process where the policies' decisions take long."""
+        session, ids = wanted.session, wanted.policy_ids
+        shaping = session.config["shaping"]
+        if shaping == PROJECTION and await self._run(self._shields.slow_policies, ids):
+            made: Session = await self._heavy.decide(
+                "switched", wanted, self._most, session=session.id, key=tuple(ids)
+            )
+            return made
+        if shaping != PROJECTION:
+            asked = shaping, ids, wanted.row[:3].tolist(), owner
+            try:
+                preparing = await self._run(self._shields.prepared, *asked)
+                await asyncio.shield(asyncio.wrap_future(preparing))
+            except FragmentError as error:
+                raise refused(shaping, error) from None
+        return await self._run(switched, self._policies, self._shields, wanted, self._most)
+
+    async def _run(self, function: Callable[..., R], *args: Any) -> R:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A switch at step t of `session`, which has the poses that came with it. row [3 + signals]: that of x_t;
+    where the session does not have it yet, as the last decision foresaw it.
+    """
+
+    session: Session
+    t: int
+    policy_ids: Sequence[str]
+    clock: str
+    row: Floats
+
+
+def _is_last(session: Session, request: SwitchRequest, policy_ids: Sequence[str]) -> bool:
+    """Whether this very switch was made last, so that it was sent again. Raises HistoryConflict where it was
+    made from another x_t.
+    """
+    if len(session.rules) == 1:
+        return False
+    last = session.config
+    made = rules.begins(last), last["policy_ids"], last["clock"]
+    if made != (request.t, list(policy_ids), request.clock):
+        return False
+    if request.poses is not None:
+        history.join(session.poses, request.t, np.array(request.poses))
+    return True
+
+
+def _wanted(
+    session: Session, request: SwitchRequest, policy_ids: Sequence[str], step: bytes | None
+) -> Wanted:
+    """step: what the decision before x_t left. Raises what is wrong with asking for it."""
+    state, t = session.state, request.t
+    if state.finished:
+        raise over(session, t)
+    if t < state.next_t:
+        raise StepConflict(
+            f"step {t} is decided, or was passed over: no other rule can hold there", path="t", got=t,
+            expected=f"{state.next_t} or later", expected_t=state.next_t,
+        )  # fmt: skip
+    if len(session.rules) >= rules.MOST_RULES:
+        raise LimitReached(
+            f"a session has at most {rules.MOST_RULES} rules", expected="a new session for what follows"
+        )
+    if request.poses is not None:
+        session = session.extended(t, np.array(request.poses), {})
+    if len(session.rows) > t:
+        return Wanted(session, t, policy_ids, request.clock, session.rows[t])
+    if len(session.rows) < t or step is None:
+        raise HistoryGap(
+            f"the server does not know where the robot is at step {t}", path="poses", got=None,
+            expected=f"poses from step {len(session.rows)} or earlier up to step {t}",
+            expected_t=len(session.rows),
+        )  # fmt: skip
+    row = session.rows[-1].copy()
+    row[:3] = _foreseen(session, step)
+    return Wanted(session, t, policy_ids, request.clock, row)
+
+
+def _foreseen(session: Session, step: bytes) -> Sequence[float]:
+    """Where the action leads that the last decision gives to run, as the SDK's `execute` has it."""
+    answer = record.answer(record.decode(step), session.rows[-1], session.config["actions"])
+    action: int | None = answer.action
+    if action in session.config["terminal_actions"]:
+        action = answer.completion_action
+    return session.rows[-1, :3].tolist() if action is None else answer.next_poses[action]
+
+
+def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: int) -> Session:
+    """The session under its new rule. Raises PoseError, InfeasibleSwitch, InputError."""
+    session, t, old = shields.settled(wanted.session), wanted.t, wanted.session.config
+    about = policies.record(wanted.policy_ids[0]).about
+    task = shields.get(wanted.policy_ids, Config()).task
+    origin = t if wanted.clock == "restart" else rules.origin(old)
+    last = origin + task.horizon + 1
+    if last > max(most_steps, old["max_steps"]):
+        raise InputError(
+            "the rule ends after the last step that a session can have", path="policy_id",
+            got=f"step {last}", expected=f"at most step {most_steps}",
+        )  # fmt: skip
+    before = record.link(session.state.head, session.rows[session.state.next_t : t])
+    config = {
+        **old,
+        **asked_by(wanted.policy_ids, about, task),
+        "max_steps": max(old["max_steps"], last),
+        "from": t,
+        "origin": origin,
+        "clock": wanted.clock,
+        "before": before.hex(),
+    }
+    signals = config["spec"]["signals"]
+    names = [*session.signal_names, *rules.added(session.signal_names, signals)]
+    verdict, _ = shields.verdict(old, session.rows, session.signal_names)
+    made = replace(
+        session,
+        rules=[*session.rules, config],
+        rows=rules.widened(session.rows, session.signal_names, signals),
+        signal_names=names,
+    )
+    carry = None if session.state.carry is None else session.state.carry.unpacked()
+    carry = rules.carried_over(carry, old, config)
+    seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
+    shield = shields.of(made)
+    elsewhere = any(old[name] != config[name] for name in ("map_id", "robot"))
+    switch(shield, seen[:, :3], columns(seen, names), carry, elsewhere)
+    known = made.since
+    status = episode.close(shield, known[:, :3], columns(known, names))[0] if len(known) else "pending"
+    state = msgspec.structs.replace(
+        session.state,
+        length=len(made.rows),
+        next_t=t,
+        feasible=True,
+        spec_status=status,
+        head=record.digest(files.to_json(config)),
+        carry=None if carry is None else pack_carry(carry),
+        verdicts=(*session.state.verdicts, verdict),
+    )
+    return replace(made, state=state)

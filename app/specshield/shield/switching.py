@@ -1,0 +1,34 @@
+"""Whether another rule, on another map or for another robot, can begin to hold in mid-episode."""
+
+from __future__ import annotations
+
+from specshield.arrays import Floats
+from specshield.errors import InfeasibleSwitch
+from specshield.shield.decision import Carry, Shield
+from specshield.shield.episode import Signals, check_place, decide
+
+
+def switch(
+    shield: Shield, history: Floats, signals: Signals | None, carry: Carry | None, elsewhere: bool
+) -> None:
+    """Checks that the rule of `shield` can be kept from x_t on, as the next decision will see it.
+
+    history [t + 1, 3], signals: since the step from which the rule's windows count. carry: what the next
+    decision will be given. elsewhere: whether the map or the robot is another than before; x_t is then
+    checked as an initial pose is. Raises PoseError, InfeasibleSwitch.
+    """
+    if elsewhere:
+        check_place(shield, history[-1], "poses")
+    found = decide(shield, history, None, True, signals, carry)
+    if found.spec_status == "satisfied" or found.mode == "completion":
+        return
+    if found.spec_status == "violated":
+        why = "what was driven before has broken it already"
+    else:
+        rho = [value for value in found.robustness if value is not None]
+        best = f"the best robustness found is {max(rho):.3f}" if rho else "; ".join(found.warnings)
+        why = f"no future was found that satisfies it: {best}"
+    raise InfeasibleSwitch(
+        f"the new rule cannot be kept from here: {why}", path="policy_id",
+        expected="a rule that some action from x_t, followed by a policy, satisfies; or clock 'restart'",
+    )  # fmt: skip

@@ -1,0 +1,239 @@
+"""Another rule or robot in mid-session: what holds from then on, what stays, and what is refused."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import msgspec
+import pytest
+
+from specshield.client import AsyncShieldClient, ShieldClient
+from specshield.errors import HistoryGap, InfeasibleSwitch, InputError
+from specshield.service.sessions import chain
+from tests.service.test_sessions import problem, state
+from tests.service.test_verify import told
+from tests.service.world import LOGITS, ROBOT, START, ahead, send_policy
+
+END = {"type": "circle", "center": [3.2, 1.5], "radius": 0.4}  # entered by the seventh move after step 3
+ORIGIN = {"type": "circle", "center": START[:2], "radius": 0.3}
+LATER = {"formula": "F[0,8] End", "regions": {"End": END}}
+TOO_SOON = {"formula": "F[0,2] End", "regions": {"End": END}}
+BOTH = {"formula": "F[0,3] Origin and F[0,20] End", "regions": {"End": END, "Origin": ORIGIN}}
+ALARMED = {"formula": "F[0,16] End and G[0,16] alarm < 1", "regions": {"End": END}, "signals": {"alarm": 0.0}}
+AHEAD = [40.0, 0.0, 0.0, 0.0, None]  # so that the drawn action is the first
+CRAWLER: dict[str, Any] = {
+    "footprint": ROBOT["footprint"],
+    "on_contact": "stay",
+    "actions": [{"name": "crawl", "translate": 0.1}, {"name": "done", "terminal": True}, {"name": "rest"}],
+}
+
+
+@pytest.fixture
+def switch(client):
+    """switch(session, t, spec, **fields): the response."""
+
+    def switch(session, t, spec, robot=ROBOT, **fields):
+        policy = send_policy(client, spec=spec, robot=robot)
+        body = {"t": t, "policy_id": policy["id"], **fields}
+        return client.post(f"/v1/sessions/{session['id']}/switch", json=body)
+
+    return switch
+
+
+def driven(step, session, poses, since=0):
+    """The contents of the answers to a step a pose."""
+    answers = [step(session, since + i, [pose], logits=AHEAD) for i, pose in enumerate(poses)]
+    assert all(answer.status_code == 200 for answer in answers), answers[-1].text
+    return [answer.content for answer in answers]
+
+
+def record_of(client, session):
+    return client.get(f"/v1/sessions/{session['id']}/record").content
+
+
+def test_each_rule_holds_over_its_own_steps(server, client, begin, step, switch, capsys, tmp_path):
+    session, poses = begin(), ahead(12)
+    before = driven(step, session, poses[:3])
+    answer = switch(session, 3, LATER, clock="restart")
+    assert answer.status_code == 200, answer.text
+    shown = answer.json()
+    assert (shown["next_t"], shown["horizon"], shown["spec"]["formula"]) == (3, 8, "F[0,8] End")
+    assert [rule["spec_status"] for rule in shown["rules"]] == ["pending", "pending"]
+    assert [(rule["from"], rule["origin"], rule["clock"]) for rule in shown["rules"]] == [
+        (0, 0, "restart"),
+        (3, 3, "restart"),
+    ]
+    assert switch(session, 3, LATER, clock="restart").json()["rules"] == shown["rules"]
+
+    driven(step, session, poses[3:11], since=3)
+    assert driven(step, session, poses[:3]) == before
+    assert switch(session, 3, LATER, clock="restart").json()["next_t"] == 11
+    assert problem(switch(session, 3, LATER), 409, "step-conflict")["expected_t"] == 11
+    rules = state(client, session)["rules"]
+    assert [rule["spec_status"] for rule in rules] == ["pending", "satisfied"]
+
+    trajectory = client.get(f"/v1/sessions/{session['id']}/trajectory").json()
+    assert [item["rule"] for item in trajectory["items"]] == [0] * 3 + [1] * 8
+    assert [set(item["signals"]) for item in trajectory["items"][2:4]] == [{"battery"}, set()]
+    assert trajectory["items"][10]["decision"]["t"] == 10
+    assert trajectory["rules"] == rules
+    status, said = told(capsys, tmp_path, record_of(client, session), data_dir=server.data_dir)
+    assert status == 0, said
+    assert "from step 3, windows from step 3: F[0,8] End" in said
+
+
+def test_the_state_in_which_a_rule_ends_is_its_last(client, begin, step, switch):
+    """x_3 is in the first goal; the server hears of it after the switch, and before."""
+    for told_later in (True, False):
+        session, poses = begin(), ahead(9)
+        driven(step, session, poses[:3])
+        spec = {"formula": "F[0,3] Goal", "regions": {"Goal": {**END, "center": [2.0, 1.5], "radius": 0.5}}}
+        assert switch(session, 0, spec).status_code == 409
+        assert switch(session, 3, spec, clock="keep").status_code == 200
+        fields = {} if told_later else {"poses": poses[2:4]}
+        shown = switch(session, 3, LATER, clock="restart", **fields).json()
+        assert shown["rules"][1]["spec_status"] == ("pending" if told_later else "satisfied")
+        driven(step, session, poses[3:4], since=3)
+        verdicts = [rule["spec_status"] for rule in state(client, session)["rules"]]
+        assert verdicts == ["pending", "satisfied", "pending"]
+
+
+def test_what_cannot_be_kept_changes_nothing(client, begin, step, switch):
+    session, poses = begin(), ahead(8)
+    driven(step, session, poses[:3])
+    before, record = state(client, session), record_of(client, session)
+    for spec, fields in ((TOO_SOON, {"clock": "restart"}), (TOO_SOON, {}), (BOTH, {"clock": "restart"})):
+        for poses_sent in ({}, {"poses": [poses[3]]}):
+            problem(switch(session, 3, spec, **fields, **poses_sent), 422, "infeasible-switch")
+    problem(switch(session, 3, LATER, poses=[[99.0, 1.5, 0.0]], robot=CRAWLER), 422, "invalid-pose")
+    assert problem(switch(session, 5, LATER), 409, "history-gap")["expected_t"] == 3
+    problem(switch(session, 3, LATER, clock="later"), 422, "invalid-input")
+    assert state(client, session) == before
+    assert record_of(client, session) == record
+    driven(step, session, poses[3:], since=3)
+
+
+def test_a_history_that_counts_and_one_that_does_not(begin, step, switch):
+    """BOTH asks to be at the start first: it has been there, if that counts."""
+    session, poses = begin(), ahead(6)
+    driven(step, session, poses[:5])
+    problem(switch(session, 5, BOTH, clock="restart"), 422, "infeasible-switch")
+    shown = switch(session, 5, BOTH, clock="keep").json()
+    assert (shown["rules"][1]["from"], shown["rules"][1]["origin"]) == (5, 0)
+    assert step(session, 5, poses[5:6]).json()["mode"] == "shaped"
+
+
+def test_another_robot_with_other_signals_and_back(server, client, begin, step, switch, capsys, tmp_path):
+    session, poses = begin(), ahead(3)
+    before = driven(step, session, poses[:3])
+    shown = switch(session, 3, ALARMED, CRAWLER, clock="restart", poses=[poses[3]]).json()
+    assert (shown["actions"], shown["terminal_actions"]) == (["crawl", "done", "rest"], [1])
+    pose, crawled = poses[3], []
+    for t in range(3, 6):
+        body: dict[str, Any] = {"logits": [0.0, None, 1.0], "signals": {"alarm": 0.1 * t}}
+        answer = step(session, t, [pose], **body)
+        crawled.append((t, [pose], body, answer.content))
+        assert answer.json()["action_name"] in ("crawl", "rest")
+        pose = answer.json()["next_poses"][0]
+    problem(step(session, 6, [pose], logits=LOGITS), 422, "invalid-logits")
+    problem(
+        step(session, 6, [pose], logits=[0.0, None, 1.0], signals={"battery": 1.0}), 422, "invalid-samples"
+    )
+    shown = switch(session, 6, LATER, clock="restart").json()
+    assert shown["max_steps"] == 600
+    assert step(session, 6, [pose], logits=LOGITS).json()["action_name"] in session["actions"]
+
+    assert driven(step, session, poses[:3]) == before
+    for t, sent, body, content in crawled:
+        assert step(session, t, sent, **body).content == content
+    items = client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]
+    assert [item["signals"] for item in items[2:4]] == [{"battery": 90.0}, {"alarm": pytest.approx(0.3)}]
+    content = record_of(client, session)
+    status, said = told(capsys, tmp_path, content, data_dir=server.data_dir)
+    assert status == 0, said
+    assert chain.read(content).rows.shape == (7, 5)
+
+
+def test_a_switch_that_was_written_otherwise_is_found(client, begin, step, switch):
+    session = begin()
+    driven(step, session, ahead(2))
+    assert switch(session, 3, LATER, clock="restart").status_code == 200
+    driven(step, session, ahead(4)[3:], since=3)
+    content = record_of(client, session)
+    config = msgspec.msgpack.decode(content)["config"]
+    for a, b in ((b'"from":3', b'"from":2'), (b'"origin":3', b'"origin":0'), (b"F[0,8] End", b"F[0,9] End")):
+        assert config.count(a) == 1
+        with pytest.raises(InputError):
+            chain.read(content.replace(a, b))
+
+
+def test_of_a_step_and_a_switch_at_once_one_is_first(client, begin, step, switch):
+    poses = ahead(4)
+    for _ in range(4):
+        session = begin()
+        driven(step, session, poses[:3])
+        with ThreadPoolExecutor(4) as pool:
+            stepping = [pool.submit(step, session, 3, [poses[3]], logits=AHEAD) for _ in range(2)]
+            switching = [pool.submit(switch, session, 3, LATER, clock="restart") for _ in range(2)]
+            stepped = [each.result() for each in stepping]
+            switched = [each.result() for each in switching]
+        assert len({answer.content for answer in stepped}) == 1
+        assert stepped[0].status_code == 200
+        rules = state(client, session)["rules"]
+        assert len({answer.status_code for answer in switched}) == 1
+        assert len(rules) == (2 if switched[0].status_code == 200 else 1)
+        if len(rules) == 1:
+            problem(switched[0], 409, "step-conflict")
+
+
+def test_the_sdk_switches_and_watches(server, client, begin, step):
+    later = send_policy(client, spec=LATER)["id"]
+    crawling = send_policy(client, spec=ALARMED, robot=CRAWLER)["id"]
+    too_soon = send_policy(client, spec=TOO_SOON)["id"]
+    policy, poses = begin()["policy_ids"][0], ahead(12)
+    with (
+        ShieldClient(server.url, timeout=30.0) as shield,
+        shield.sessions.create(policy_id=policy, initial_pose=START, uncertainty="none") as session,
+    ):
+        for pose in poses[:3]:
+            session.step(pose, LOGITS)
+        session.record(poses[3])
+        with pytest.raises(HistoryGap):
+            session.switch(later, clock="restart")
+        with pytest.raises(InfeasibleSwitch):
+            session.switch(too_soon, clock="restart", pose=poses[4])
+        assert session.info.policy_ids == (policy,)
+        info = session.switch(policy_ids=[crawling], clock="restart", pose=poses[4])
+        assert session.info is info
+        assert info.actions == ("crawl", "done", "rest")
+        decision = session.step(poses[4], [0.0, 9.0, 0.0])
+        assert (decision.t, decision.execute in (0, 2)) == (4, True)
+        events = session.events(-1)
+        assert [next(events).t for _ in range(4)] == [0, 1, 2, 4]
+        events.close()
+        again = shield.sessions.get(session.id, on_failure="witness")
+        assert [rule["from"] for rule in again.info.rules] == [0, 4]
+    text = client.get(f"/v1/sessions/{session.id}/events", params={"after": 1}).text
+    assert [line for line in text.splitlines() if line.startswith(("id", "event"))] == [
+        "id: 2",
+        "event: switch",
+        "id: 4",
+        "event: end",
+    ]
+
+
+def test_the_sdk_switches_awaiting(server, client, begin):
+    later, policy = send_policy(client, spec=LATER)["id"], begin()["policy_ids"][0]
+
+    async def main():
+        async with AsyncShieldClient(server.url, timeout=30.0) as shield:
+            session = await shield.sessions.create(policy_id=policy, initial_pose=START)
+            async with session:
+                await session.step(START, LOGITS)
+                info = await session.switch(later, clock="restart", pose=ahead(1)[1])
+                assert (info.rules[-1]["from"], session.t) == (1, 1)
+                assert (await session.step(ahead(1)[1], LOGITS)).t == 1
+
+    asyncio.run(main())
