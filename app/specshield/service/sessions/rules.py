@@ -20,6 +20,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.shield.decision import Carry
+from specshield.world.learned import LearnedMap
 
 NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
 MOST_RULES = 256  # of one session; chosen by hand: every load of the session reads their lines
@@ -85,9 +86,17 @@ def carried_over(carry: Carry | None, old: Config, new: Config) -> Carry | None:
         memory=None,
         residuals=carry.residuals if same_robot else None,
         threshold_left=None,
-        learned=carry.learned if same_map else None,
+        learned=_learned(carry.learned, origin(new) - origin(old)) if same_map else None,
         action=carry.action if stays else None,
     )
+
+
+def _learned(learned: bytes | None, later: int) -> bytes | None:
+    """What the map has learned, by a clock that begins so many steps later."""
+    if not learned or not later:
+        return learned
+    known = LearnedMap.from_bytes(learned)
+    return replace(known, step=known.step - later).to_bytes()
 
 
 def told(rules: Sequence[Config], verdicts: Sequence[str]) -> list[dict[str, Any]]:
