@@ -131,7 +131,7 @@ def digest(decision: Decision) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-LATER = ("carry", "warnings")
+LATER = ("carry", "warnings", "margin", "slack", "threshold_left", "map_revision", "explanations")
 FIELDS = sorted(each.name for each in fields(Decision) if each.name not in LATER)
 
 

@@ -3,6 +3,7 @@
     none        as told
     gaussian    every motion ends off by sigma 0.01 m along x and y and 0.5 degrees, as in SPOC's stochastic
                 controller; standing still does not
+    rough       the same, twice as much
     slip        one motion in twenty does nothing
     obstacle    something 0.3 m wide, on no map, stands on the way that was certified at the start
     shift       walls and furniture stand 0.05 m from where the map has them, along x or y
@@ -30,8 +31,9 @@ from specshield.sim.robot import Pose
 from specshield.task import Task
 from specshield.world.occupancy import OccupancyGrid
 
-DISTURBANCES = ("none", "gaussian", "slip", "obstacle", "shift", "collider")
+DISTURBANCES = ("none", "gaussian", "rough", "slip", "obstacle", "shift", "collider")
 SIGMA_MOVE, SIGMA_TURN = 0.01, math.radians(0.5)  # [m], [rad]
+ROUGHNESS = {"gaussian": 1.0, "rough": 2.0}  # times the two
 SLIP = 0.05
 OBSTACLE, SHIFT = 0.3, 0.05  # [m]
 AWAY = 0.8  # [m] an obstacle keeps this far from the start and from the target
@@ -73,9 +75,9 @@ def executed(name: str, body: Body, before: Pose, after: Pose, random: np.random
         return after
     if name == "slip" and chance < SLIP:
         return before
-    if name == "gaussian":
-        x, y = after[0] + SIGMA_MOVE * noise[0], after[1] + SIGMA_MOVE * noise[1]
-        theta = wrap(after[2] + SIGMA_TURN * noise[2])
+    if name in ROUGHNESS:
+        move, turn = ROUGHNESS[name] * SIGMA_MOVE, ROUGHNESS[name] * SIGMA_TURN
+        x, y, theta = after[0] + move * noise[0], after[1] + move * noise[1], wrap(after[2] + turn * noise[2])
         if not in_collision(body, x, y, theta):
             return float(x), float(y), float(theta)
     return after

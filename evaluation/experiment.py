@@ -22,6 +22,7 @@ from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body
 from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, make_shield
+from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MODELS
 from specshield.sim.cases import Case, case_name, case_names, load_case, shipped
 from specshield.sim.learned.model import FOLDER, WEIGHTS, read
@@ -30,7 +31,7 @@ from specshield.task import Task
 
 METHODS = ("unmodified", "hcd", "rcd", "simplex", "paper", "ours", "lookahead")
 CERTIFYING = ("simplex", "paper", "ours", "lookahead")
-CAREFUL = ("simplex", "ours", "lookahead")  # NAME@M/K asks for a margin of M metres and K steps of slack
+CAREFUL = ("simplex", "paper", "ours", "lookahead")  # NAME@M/K: a margin of M metres, K steps of slack
 
 
 @dataclass(frozen=True)
@@ -136,14 +137,13 @@ class Setting:
 
         Raises NotFound for a name that there is not, InputError for a margin that cannot be.
         """
-        kind, margin, slack = split(name)
-        careful = Config(margin=margin, slack=slack)
+        kind, careful = split(name)
         make: dict[str, Callable[[], Method]] = {
             "unmodified": lambda: Decoding(self.task),
             "hcd": lambda: Decoding(self.task, HardDecoding(self.task)),
             "rcd": lambda: Decoding(self.task, RobustDecoding(self.task)),
             "simplex": lambda: Simplex(make_shield(self.policies, careful)),
-            "paper": lambda: Shielded(self.paper, carries=False),
+            "paper": lambda: Shielded(replace(self.paper, config=careful), carries=False),
             "ours": lambda: Shielded(make_shield(self.policies, careful)),
             "lookahead": lambda: Shielded(
                 make_shield(self.policies, careful, prepare(self.task, self.policies))
@@ -166,15 +166,17 @@ def available(case: str) -> list[str]:
     return [name for name in METHODS if name != "paper" or learned]
 
 
-def split(method: str) -> tuple[str, float, int]:
-    """The kind of a method, its margin [m] and its slack [steps]. Raises NotFound or InputError."""
+def split(method: str) -> tuple[str, Config]:
+    """The kind of a method, and its session's settings. Raises NotFound or InputError."""
     kind, at, asked = method.partition("@")
     if kind not in METHODS:
         raise NotFound(
             f"there is no method {kind!r}", path="methods", got=method, expected=f"of {', '.join(METHODS)}"
         )
     if not at:
-        return kind, 0.0, 0
+        return kind, Config()
+    if asked == "learned" and kind in CAREFUL:
+        return kind, Config(uncertainty=Uncertainty())
     metres, _, steps = asked.partition("/")
     try:
         margin, slack = float(metres), int(steps or 0)
@@ -183,9 +185,9 @@ def split(method: str) -> tuple[str, float, int]:
     if kind not in CAREFUL or not math.isfinite(margin):
         raise InputError(
             "not a method with a margin", path="methods", got=method,
-            expected=f"NAME@METRES or NAME@METRES/STEPS, the name one of {', '.join(CAREFUL)}",
+            expected=f"NAME@METRES, NAME@METRES/STEPS or NAME@learned, the name one of {', '.join(CAREFUL)}",
         )  # fmt: skip
-    return kind, margin, slack
+    return kind, Config(margin=margin, slack=slack)
 
 
 def _hash(content: bytes) -> str:

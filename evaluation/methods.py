@@ -10,7 +10,7 @@ lookahead    ours, feasible actions weighted by what the rule will still cost th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -101,7 +101,8 @@ class Shielded:
 
     def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
         decision = decide(self._shield, history, logits, logits is None, carry=self._carry)
-        self._carry = decision.carry if self._carries else None
+        alone = (None,) * len(decision.carry.witnesses)
+        self._carry = decision.carry if self._carries else replace(decision.carry, witnesses=alone)
         distribution, action, mode = self._chosen(decision, logits, draw)
         moves = decision.completion_action if self._shield.task.robot.terminal[action] else action
         return Answer(

@@ -154,10 +154,10 @@ def recall_prefix(view: View, known: Floats, t: int, buffer: Floats) -> None:
 
 
 @kernel
-def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Floats) -> None:
+def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Floats, leaves: Floats) -> None:
     """rho (N,) of the futures poses (N, T - t, 3) of the prefix that `look` left in `known`; NaN as there.
 
-    held (1, S): the values that the signals keep from step t + 1 on.
+    held (1, S): the values that the signals keep from step t + 1 on. leaves (N, tree.size) are written.
     """
     tree = view.tree
     values = np.empty(value_count(view, held))
@@ -165,4 +165,5 @@ def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Fl
     for f in range(poses.shape[0]):
         recall_prefix(view, known, t, buffer)
         sound = _read(view, poses[f], held, t + 1, values, stack, buffer)
+        leaves[f] = buffer
         rho[f] = tree_value(tree, buffer) if sound else math.nan

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 from specshield.arrays import Floats
 from specshield.errors import InputError, PolicyError
 from specshield.robot.dynamics import Body, make_body
+from specshield.rule.early import Conjuncts, conjunction_of
 from specshield.rule.view import View, view_of
 from specshield.shield.preference import Preference
 from specshield.shield.proposal import Proposer
 from specshield.shield.uncertainty import Uncertainty
-from specshield.stl import Verdict
+from specshield.stl import Formula, Verdict
 from specshield.task import Task
 
 Mode = Literal["prior", "shaped", "completion", "fallback", "violated"]
@@ -101,6 +103,10 @@ class Shield:
     def __post_init__(self) -> None:
         if self.preference is not None:
             check_preferring(self.config)
+
+    @cached_property
+    def conjunction(self) -> tuple[Formula, Conjuncts]:
+        return conjunction_of(self.task, self.task.formula)
 
     @property
     def max_steps(self) -> int:

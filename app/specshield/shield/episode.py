@@ -19,6 +19,7 @@ from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
 from specshield.shield import shaping
+from specshield.shield.caution.experience import learn, remember
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
 from specshield.shield.explanation import explanations
 from specshield.shield.feasibility import futures, prefix_of
@@ -119,17 +120,18 @@ def decide(
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
     memory, weights = None if carry is None else carry.memory, None
+    seen, care = learn(shield, carry, poses, taught.contact)
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
-    margin = SATISFIED_ABOVE + shield.config.margin
-    margin_decided = prefix.low > margin or prefix.high <= margin  # whatever follows, it is kept or it is not
+    asked = SATISFIED_ABOVE + care.margin
+    margin_decided = prefix.low > asked or prefix.high <= asked  # whatever follows, it is kept or it is not
 
     answer: _Answer
     if t >= task.horizon or (spec_status == "satisfied" and margin_decided):
         judged = None
         answer = _unmodified(shield, log_prior)
     else:
-        judged = judge(shield, prefix, tail, violated=spec_status == "violated")
+        judged = judge(shield, prefix, tail, spec_status == "violated", care)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior)
@@ -140,6 +142,10 @@ def decide(
     action = _draw(answer.distribution, shield.config.seed, t)
     moved = judged.completion if judged is not None and robot.terminal[action] else action
     certified = witnesses_of(shield, judged)
+    margin, slack = (care.margin, care.least) if judged is None else (judged.margin, judged.slack)
+    remembered = None
+    if seen is not None:
+        remembered = remember(shield, seen, answer.distribution, moved, nexts, poses[-1])
     return Decision(
         t=t,
         mode=answer.mode,
@@ -162,18 +168,17 @@ def decide(
         if witnesses
         else (),
         warnings=said if judged is None else (*said, *judged.tried.warnings),
-        margin=shield.config.margin,
-        slack=shield.config.slack,
+        margin=margin,
+        slack=slack,
         threshold_left=shield.config.threshold,
         map_revision=taught.map.revision,
-        explanations=explanations(shield, prefix, judged, shield.config.margin, shield.config.slack)
-        if explain
-        else (),
+        explanations=explanations(shield, prefix, judged, margin, slack) if explain else (),
         carry=Carry(
             t,
             nexts,
             certified,
             memory,
+            residuals=remembered,
             learned=handed_on(shield, taught, int(robot.motion_of[moved])),
             action=action,
         ),

@@ -75,13 +75,15 @@ class Futures:
     """The futures that were tried at one step, several a motion, as the shield itself simulated them.
 
     motions [N, T - t]: each begins with the motion it is for. poses [N, T - t, 3]: where they lead. rho [N]:
-    of each joined to the prefix, -inf where it was given up on the way. preferred: what the first proposer
-    would do itself. warnings: which proposers were not used and why.
+    of each joined to the prefix, -inf where it was given up on the way. leaves [N, size]: of the
+    formula, along each that was not. preferred: what the first proposer would do itself. warnings: which
+    proposers were not used and why.
     """
 
     motions: Ints
     poses: Floats
     rho: Floats
+    leaves: Floats
     preferred: int
     warnings: tuple[str, ...]
 
@@ -121,15 +123,16 @@ def simulated(
     """The futures of these motions, [n, T - t] each, all within range: simulated and judged in one pass."""
     motions = np.concatenate([np.empty((0, prefix.steps), np.int64), *rows]) if len(rows) != 1 else rows[0]
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
+    leaves = np.empty((len(motions), prefix.view.tree.size))
     violated = (
         prefix.high <= SATISFIED_ABOVE
     )  # then every row is wanted whole: parts of the rule are judged on it
     finite = _simulate_and_rate(
         body, prefix.view, prefix.known, prefix.t, prefix.poses[-1], prefix.rows[-1:],
-        prefix.task.robot.wait_motion, not violated, motions, poses, rho,
+        prefix.task.robot.wait_motion, not violated, motions, poses, rho, leaves,
     )  # fmt: skip
     said = warnings if finite else [*warnings, NOT_FINITE]
-    return Futures(motions, poses, rho, preferred, tuple(dict.fromkeys(said)))
+    return Futures(motions, poses, rho, leaves, preferred, tuple(dict.fromkeys(said)))
 
 
 def together(tried: Futures, more: Futures) -> Futures:
@@ -138,16 +141,19 @@ def together(tried: Futures, more: Futures) -> Futures:
         np.concatenate([tried.motions, more.motions]),
         np.concatenate([tried.poses, more.poses]),
         np.concatenate([tried.rho, more.rho]),
+        np.concatenate([tried.leaves, more.leaves]),
         more.preferred,
         tuple(dict.fromkeys([*tried.warnings, *more.warnings])),
     )
 
 
-def rho_of(prefix: Prefix, tried: Futures) -> Floats:
-    """The robustness of each future by another formula than it was tried with, shape (N,): a part of it."""
-    values = np.empty(len(tried.motions))
-    rate(prefix.view, prefix.known, prefix.t, tried.poses, prefix.rows[-1:], values)
-    return np.where(np.isnan(values), -np.inf, values)
+def rho_of(prefix: Prefix, tried: Futures) -> tuple[Floats, Floats]:
+    """The robustness (N,) of each future by another formula than it was tried with, a part of it, and the
+    leaves (N, size) of that formula.
+    """
+    values, leaves = np.empty(len(tried.motions)), np.empty((len(tried.motions), prefix.view.tree.size))
+    rate(prefix.view, prefix.known, prefix.t, tried.poses, prefix.rows[-1:], values, leaves)
+    return np.where(np.isnan(values), -np.inf, values), leaves
 
 
 @kernel
@@ -163,9 +169,11 @@ def _simulate_and_rate(
     motions: Ints,
     poses: Floats,
     rho: Floats,
+    leaves: Floats,
 ) -> bool:
     """Simulates each row of motions (N, T - t) from x_t, pose (3,), and computes rho (N,) of the joint
-    trajectory; poses (N, T - t, 3) are written. False where the arithmetic was not finite on some row.
+    trajectory; poses (N, T - t, 3) and leaves (N, tree.size) are written. False where the arithmetic was not
+    finite on some row.
 
     known (tree.size,): the leaves of the prefix; held (1, S): the values that the signals keep; wait: the
     motion that leaves the pose as it is, -1 where the robot has none. With `gives_up`, a row is given up
@@ -202,6 +210,7 @@ def _simulate_and_rate(
             k += 1
         for rest in range(k, steps):
             row[rest, 0], row[rest, 1], row[rest, 2] = x, y, theta
+        leaves[f] = buffer
         rho[f] = tree_value(tree, buffer) if whole else -np.inf
         best[first] = max(best[first], rho[f])
     return finite

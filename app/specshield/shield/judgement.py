@@ -13,10 +13,11 @@ from specshield.compiled import kernel
 from specshield.rule.residual import again, joined, left_over
 from specshield.rule.view import view_of
 from specshield.shield import shaping
-from specshield.shield.aim import aim
+from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, flat, is_place
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho_of, together
+from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
 
 
@@ -31,27 +32,30 @@ class Judged:
     values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf where nothing was evaluated
     robustness: Floats  # [A], rho of the whole formula along the same trajectories; -inf likewise
     completion: int
-    margin_unattainable: bool  # less than the margin or the slack asked for can be had
+    margin: float  # [m] and
+    slack: int  # [steps]: how much of what was asked for can be had
+    margin_unattainable: bool  # it is less
 
 
-def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) -> Judged:
+def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, care: Care) -> Judged:
     """Tries the futures from x_t, and judges each motion by the best of its futures.
 
     prefix: as the whole formula sees it; tail: the witness the robot follows, one motion a byte; violated:
-    whether the prefix decides so.
+    whether the prefix decides so; care: what J asks for beyond satisfaction.
     """
-    robot, asked = shield.task.robot, shield.config.margin
+    robot, asked = shield.task.robot, care.margin
     motions = len(robot.motions)
     tried = futures(prefix, shield.body, shield.proposers, tail, asked)
-    kept = tried.rho
+    kept, leaves = tried.rho, tried.leaves
     best, part = best_of(tried, kept, motions), prefix
     if violated:
         tried, best, part = _left(shield, prefix, tried)
-        kept = rho_of(part, tried)
+        kept, leaves = rho_of(part, tried)
     feasible, lowered = _kept(best.robustness, asked)
-    values = best.robustness
-    if lowered or (shield.config.slack and _some(best)):
-        best, feasible, lowered = aim(shield, part, tried, kept)
+    values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
+    if lowered or (care.has_slack and _some(best)):
+        aimed = aim(shield, care, part, tried, kept, leaves)
+        best, feasible = aimed.best, aimed.kept
     some, first = bool(feasible.any()), tried.preferred
     if tail and feasible[tail[0]]:
         first = tail[0]
@@ -59,7 +63,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool) ->
         first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
     completion = int(robot.representative[first])
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
-    return Judged(tried, best, feasible, *by_action, completion, lowered)
+    return Judged(tried, best, feasible, *by_action, completion, aimed.margin, aimed.slack, aimed.lowered)
 
 
 @kernel
@@ -124,10 +128,10 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best
     for parts in filter(None, options()):
         formula = joined(parts)
         part = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
-        best = best_of(tried, rho_of(part, tried), len(task.robot.motions))
+        best = best_of(tried, rho_of(part, tried)[0], len(task.robot.motions))
         if _some(best):
             break
-    return tried, best or best_of(tried, rho_of(part, tried), len(task.robot.motions)), part
+    return tried, best or best_of(tried, rho_of(part, tried)[0], len(task.robot.motions)), part
 
 
 def _holds_now(prefix: Prefix, formula: Always) -> bool:

@@ -37,10 +37,14 @@ UNDER = (
 
 @dataclass(frozen=True)
 class Taught:
-    """What a session has learned: its map, and how its caller follows what is drawn."""
+    """What a session has learned: its map, and how its caller follows what is drawn.
+
+    contact: whether the last motion ran into something; it is not handed on.
+    """
 
     map: LearnedMap = field(default_factory=LearnedMap)
     followed: Followed = field(default_factory=Followed)
+    contact: bool = False
 
     def to_bytes(self) -> bytes:
         drawn, follows, halted = self.followed.drawn, self.followed.follows, self.followed.halted
@@ -64,7 +68,7 @@ def teach(
     """
     grid, config, t = shield.task.grid, shield.config, len(poses) - 1
     before = Taught.from_bytes(None if carry is None else carry.learned)
-    known, followed = before.map, before.followed
+    known, followed, motion = before.map, before.followed, -1
     if config.map_memory is not None:
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
@@ -81,7 +85,7 @@ def teach(
         known = learn(grid, known, t, cells, name == "occupied")
         beyond += outside
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
-    return Taught(revised(before.map, known), followed), said
+    return Taught(revised(before.map, known), followed, motion >= 0), said
 
 
 def _between(poses: Floats) -> Floats:

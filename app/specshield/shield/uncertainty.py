@@ -1,13 +1,29 @@
-"""What is known of how far the robot's motions differ from f, before its first step."""
+"""How far the robot's motions differ from f, and the margin and the slack that follow from it.
+
+A motion is taken to differ from f in two ways, whatever was before it:
+
+    noise   it ends off by a normal deviate along x and along y [m], and in heading [rad]
+    slip    it is not executed, with some probability
+
+What was said or is assumed of them before the first step is weighed against the motions that are seen
+(caution/experience.py). docs/uncertainty.md says what the margin and the slack promise, and on what terms.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
+from specshield.compiled import leaf
 from specshield.errors import InputError
 
 MOST_TRANSLATION = 10.0  # [m] a motion that is less certain than this is none. Chosen by hand.
+CHANCE = 0.01  # that margin and slack do not suffice in an episode: half of it for each. Chosen by hand.
+MENDED = (
+    0.1  # [rad] a heading that is off by this costs a motion to mend; a Stretch's smallest turn is 6 degrees
+)
+HARDER = 2.0  # times the noise itself: what it costs in motions (measured by `evaluation uncertain`)
 
 
 @dataclass(frozen=True)
@@ -35,3 +51,84 @@ class Uncertainty:
                     f"the {name} of the uncertainty is out of range", path=f"uncertainty.{name}", got=value,
                     expected=f"from 0 to {highest:g}",
                 )  # fmt: skip
+
+
+class Noise(NamedTuple):
+    """What motions are taken to do from here on.
+
+    move [m] and turn [rad]: standard deviations. slips: the probability that motions slip at all; if they do,
+    the share that does has the density Beta(lost, kept).
+    """
+
+    move: float
+    turn: float
+    slips: float
+    lost: float
+    kept: float
+
+
+EXACT = Noise(0.0, 0.0, 0.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Care:
+    """What J asks for beyond satisfaction at one step.
+
+    margin [m]; least [steps]: the slack of every deadline. noise: because of which more of it is asked for.
+    stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice.
+    """
+
+    margin: float
+    least: int
+    noise: Noise = EXACT
+    stride: float = 1.0
+    chance: float = CHANCE
+
+    @property
+    def has_slack(self) -> bool:
+        return self.least > 0 or self.noise is not EXACT
+
+
+def margin_for(noise: Noise, stride: float, steps: int) -> float:
+    """The margin [m] that none of `steps` motions oversteps, but for CHANCE / 2.
+
+    A deviation has two normal coordinates, and a heading that is off moves the end of the next stride too. It
+    is longer than r with the probability exp(-r^2 / 2 sigma^2); the chances of the steps are added up.
+    """
+    sigma = math.hypot(noise.move, stride * noise.turn)
+    return sigma * math.sqrt(2.0 * math.log(2.0 * max(steps, 1) / CHANCE))
+
+
+@leaf
+def slack_for(noise: Noise, stride: float, left: int, chance: float) -> int:
+    """The fewest steps to keep free of `left` ones, so that motions cost more of them but for `chance`.
+
+    Of n = left - slack motions, a beta-binomial number is not executed; what noise costs the others is taken
+    to be normal, of a standard deviation that grows with the root of n.
+    """
+    spread = HARDER * math.hypot(noise.move / stride, noise.turn / MENDED)
+    both = math.lgamma(noise.lost + noise.kept) - math.lgamma(noise.kept) if noise.slips > 0.0 else 0.0
+    for free in range(left):
+        n = left - free
+        sigma = spread * math.sqrt(n)
+        over = (1.0 - noise.slips) * _above(free, sigma)
+        if noise.slips > 0.0:
+            share = math.exp(both + math.lgamma(noise.kept + n) - math.lgamma(noise.lost + noise.kept + n))
+            rest = 1.0  # of the probability: that more motions are lost than were counted
+            for k in range(min(free + int(4.0 * sigma), n) + 1):
+                over += noise.slips * share * _above(free - k, sigma)
+                rest -= share
+                if k < n:
+                    share *= (n - k) / (k + 1.0) * (noise.lost + k) / max(noise.kept + n - k - 1.0, 1e-9)
+            over += noise.slips * max(rest, 0.0)
+        if over <= chance:
+            return free
+    return left
+
+
+@leaf
+def _above(value: float, sigma: float) -> float:
+    """The probability that a normal deviate of standard deviation `sigma` is above a value."""
+    if sigma <= 0.0:
+        return 1.0 if value < 0.0 else 0.0
+    return 0.5 * math.erfc(value / (sigma * math.sqrt(2.0)))

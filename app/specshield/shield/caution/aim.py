@@ -1,0 +1,119 @@
+"""What J asks for beyond satisfaction, so that noise does not break the rule: a margin [m] and slack [steps].
+
+The margin is asked of the whole trajectory first. Where no future keeps it there, or where slack is asked for
+too, it is asked of what the formula still leaves open. Where both cannot be had, the slack is lowered first,
+to the most steps with which the margin can be had, and then the margin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats, Ints
+from specshield.compiled import kernel
+from specshield.rule.early import EVENTUALLY, Conjuncts, conjunction_of, find_open, rate_open
+from specshield.rule.view import view_of
+from specshield.shield.decision import Shield
+from specshield.shield.feasibility import Best, Futures, Prefix, prefix_of, rho_of
+from specshield.shield.uncertainty import Care, Noise, slack_for
+from specshield.stl import SATISFIED_ABOVE
+
+
+@dataclass(frozen=True)
+class Aimed:
+    """best: the best future of each motion. kept [M]: those that keep as much as can be had of what is asked.
+
+    margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
+    than the session's settings ask for; what is asked for beside them is had where it can be.
+    """
+
+    best: Best
+    kept: Bools
+    margin: float
+    slack: int
+    lowered: bool
+
+
+def aim(shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Floats, leaves: Floats) -> Aimed:
+    """The most that can be had of the margin and the slack.
+
+    whole [N], leaves [N, size]: rho of the futures on the whole of `prefix.formula`, and its leaves. A future
+    that does not satisfy it counts for nothing, whatever it keeps of a part.
+    """
+    task, margin = shield.task, SATISFIED_ABOVE + care.margin
+    own = prefix.formula is task.formula
+    formula, parts = shield.conjunction if own else conjunction_of(task, prefix.formula)
+    if formula is not prefix.formula:  # it is written as a plain conjunction, and may have other leaves
+        prefix = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
+        _, leaves = rho_of(prefix, tried)
+    asked = np.zeros(len(parts.kind), np.int64)
+    still = np.empty(len(asked), np.bool_)
+    soonest = _ask(
+        parts, prefix.known, prefix.t, care.noise, care.stride, care.least, care.chance, still, asked
+    )
+    next_due = int(asked[soonest]) if soonest >= 0 else 0
+
+    def at(most: int) -> Best:
+        rows, robustness = np.empty(motions, np.int64), np.empty(motions)
+        _best_open(parts, still, prefix.t, asked, most, leaves, whole, tried.motions, rows, robustness)
+        return Best(robustness, rows)
+
+    motions, high = len(task.robot.motions), int(asked.max())
+    best = at(high)
+    kept = best.robustness > margin
+    if kept.any():
+        return Aimed(best, kept, care.margin, next_due, False)
+    low = 0  # slack `high` cannot be had
+    best = at(low)
+    if not (best.robustness > margin).any():
+        highest = max(float(best.robustness.max()), SATISFIED_ABOVE)
+        kept = (best.robustness >= highest) & (best.robustness > SATISFIED_ABOVE)
+        found = highest - SATISFIED_ABOVE
+        return Aimed(best, kept, found, low, found <= shield.config.margin)
+    while high - low > 1:
+        middle = (low + high) // 2
+        tighter = at(middle)
+        if (tighter.robustness > margin).any():
+            low, best = middle, tighter
+        else:
+            high = middle
+    return Aimed(best, best.robustness > margin, care.margin, min(low, next_due), low < shield.config.slack)
+
+
+@kernel
+def _ask(
+    parts: Conjuncts, known: Floats, t: int, noise: Noise, stride: float, least: int, chance: float,
+    still: Bools, asked: Ints,
+) -> int:  # fmt: skip
+    """Writes which conjuncts (K,) are open, and how many steps early each F of them is asked for. The F whose
+    deadline is next, -1 where there is none. A window keeps at least half its length.
+    """
+    find_open(parts, known, t, still)
+    soonest, first = -1, 0
+    for k in range(still.shape[0]):
+        if still[k] and parts.kind[k] == EVENTUALLY:
+            left = parts.b[k] + parts.horizon[k] - t
+            wanted = max(least, slack_for(noise, stride, left, chance))
+            asked[k] = min(wanted, (parts.b[k] - parts.a[k]) // 2)
+            if soonest < 0 or left < first:
+                soonest, first = k, left
+    return soonest
+
+
+@kernel
+def _best_open(
+    parts: Conjuncts, still: Bools, t: int, asked: Ints, most: int, leaves: Floats, whole: Floats,
+    motions: Ints, rows: Ints, robustness: Floats,
+) -> None:  # fmt: skip
+    """Writes the best future of each motion, as `feasibility.Best` has it, by what is open."""
+    rho = np.empty(whole.shape[0])
+    rate_open(parts, still, t, np.minimum(asked, most), leaves, rho)
+    rows[:] = -1
+    robustness[:] = -np.inf
+    for f in range(whole.shape[0]):
+        m = motions[f, 0]
+        value = rho[f] if whole[f] > SATISFIED_ABOVE else -np.inf
+        if rows[m] < 0 or value > robustness[m]:
+            rows[m], robustness[m] = f, value

@@ -1,0 +1,173 @@
+"""What a session has seen of its robot: every motion is compared with f, and weighed against what is known.
+
+A pose that is on the way of a motion and short of its end, or where the robot stood, is a motion that was not
+executed, or not all of it; any other gap between a pose and f is noise. The shield knows poses and its own
+draws, not what was executed: a robot that stands may have been told to, and counts by how likely that is.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from specshield.arrays import Floats, Ints
+from specshield.compiled import kernel, leaf
+from specshield.robot.dynamics import wrap
+from specshield.shield.decision import Carry, Shield
+from specshield.shield.uncertainty import CHANCE, Care, Noise, margin_for
+from specshield.stl import Eventually, conjuncts
+from specshield.task import Task
+
+# How much what is known before the first step weighs. Chosen by hand.
+NOISE_WEIGHT = 20.0  # [motions]
+SLIP_WEIGHT = 60.0  # [motions]
+SLIPS_AT_ALL = 0.5  # the probability that motions slip, before the first
+EXACT = 1e-6  # [m] and [rad]: what ends this near to where f has it shows no noise
+SURE = 3  # [motions] that have shown none, after which there is none but for what is seen
+STRAY = (
+    0.25  # of a motion's length: what misses by more than this, and than noise does, was stopped on its way
+)
+MOST_ODDS = 1e6  # so that what changes late is still noticed
+TINY = 1e-9  # [motions]
+FAR = 5.0  # [sigma] what noise does: one motion in 270,000 ends farther off
+
+FORMAT = struct.Struct("<8d")
+
+
+class Seen(NamedTuple):
+    """What a session remembers of its motions.
+
+    moved: how many there were, and lost: how many of them were not executed; both may be fractions. odds: of
+    what was seen if motions never slip, to if they do. noisy: how many were measured against f; moves, turns:
+    the sums of their squared residuals [m^2], [rad^2]; exact: how many of them had none. standing: the
+    probability, by the last answer, that the robot is not told to move.
+    """
+
+    moved: float = 0.0
+    lost: float = 0.0
+    odds: float = 1.0
+    noisy: float = 0.0
+    moves: float = 0.0
+    turns: float = 0.0
+    exact: float = 0.0
+    standing: float = 0.0
+
+
+def learn(
+    shield: Shield, carry: Carry | None, poses: Floats, contact: bool = False
+) -> tuple[Seen | None, Care]:
+    """What has been seen up to x_t, and what J asks for because of it. poses [t + 1, 3].
+
+    contact: the last motion ran into something, and says nothing of how the robot moves.
+    """
+    config, t, known = shield.config, len(poses) - 1, shield.config.uncertainty
+    if known is None:
+        return None, Care(config.margin, config.slack)
+    told = (known.translation, known.rotation, known.slip)
+    seen = Seen() if carry is None or carry.residuals is None else Seen(*FORMAT.unpack(carry.residuals))
+    if carry is not None and carry.t == t - 1 and not contact:
+        seen = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
+    noise = noise_of(told, seen)
+    stride, deadlines = _measures(shield.task)
+    margin = margin_for(noise, stride, shield.task.horizon - t)
+    return seen, Care(max(config.margin, margin), config.slack, noise, stride, 0.5 * CHANCE / deadlines)
+
+
+@lru_cache(maxsize=256)
+def _measures(task: Task) -> tuple[float, int]:
+    """The longest move [m], and how many deadlines the formula has, both at least 1 where there is none."""
+    longest = max((abs(move) for move, _ in task.robot.motions), default=0.0)
+    return longest or 1.0, max(sum(isinstance(part, Eventually) for part in conjuncts(task.formula)), 1)
+
+
+def remember(
+    shield: Shield, seen: Seen, distribution: Floats, moved: int, nexts: Floats, pose: Floats
+) -> bytes:
+    """What is handed on. distribution [A]: the answer; moved: what is executed for a terminal action; nexts
+    [M, 3]: where f leads from the pose (3,).
+    """
+    standing = _standing(
+        shield.task.robot.motion_of, distribution, int(shield.task.robot.motion_of[moved]), nexts, pose
+    )
+    return FORMAT.pack(*seen[:-1], standing)
+
+
+@kernel
+def _standing(motion_of: Ints, distribution: Floats, ending: int, nexts: Floats, pose: Floats) -> float:
+    """The probability that the robot is not told to move. ending: what a terminal action is followed by."""
+    total = 0.0
+    for a in range(motion_of.shape[0]):
+        m = motion_of[a] if motion_of[a] >= 0 else ending
+        if distribution[a] > 0.0 and (m < 0 or _gap(nexts[m], pose) <= EXACT):
+            total += distribution[a]
+    return total
+
+
+@leaf
+def noise_of(told: tuple[float, float, float], seen: Seen) -> Noise:
+    """The means of what was told, as in `Uncertainty`, and of what was seen, each by how many motions it
+    stands for.
+    """
+    translation, rotation, slip = told
+    weight = NOISE_WEIGHT if seen.exact < SURE else 0.0
+    count = max(weight + seen.noisy, 1.0)
+    slips = SLIPS_AT_ALL / (SLIPS_AT_ALL + (1.0 - SLIPS_AT_ALL) * seen.odds)
+    return Noise(
+        math.sqrt((weight * translation**2 + 0.5 * seen.moves) / count),  # along two axes
+        math.sqrt((weight * rotation**2 + seen.turns) / count),
+        slips if slip > 0.0 or seen.lost > 0.0 else 0.0,
+        max(SLIP_WEIGHT * slip + seen.lost, TINY),
+        max(SLIP_WEIGHT * (1.0 - slip) + seen.moved - seen.lost, TINY),
+    )
+
+
+@kernel
+def observe(
+    told: tuple[float, float, float], seen: Seen, before: Floats, foreseen: Floats, pose: Floats
+) -> Seen:
+    """Takes one step into what is remembered. before, pose (3,): x_{t-1} and x_t; foreseen [M, 3]: where f
+    leads from x_{t-1}.
+    """
+    miss, way, motion = np.inf, 0.0, -1
+    for m in range(foreseen.shape[0]):
+        length = _gap(foreseen[m], before)
+        if length > EXACT and _gap(foreseen[m], pose) < miss:
+            miss, way, motion = _gap(foreseen[m], pose), length, m
+    if motion < 0:  # f leads nowhere from there
+        return seen
+    noise, still = noise_of(told, seen), _gap(before, pose)
+    far = FAR * (noise.move + noise.turn)
+    if still < miss or miss > max(STRAY * way, far):
+        # It was to move and did not, or it was to stand: how likely is either?
+        rate, standing = (
+            noise.lost / (noise.lost + noise.kept),
+            seen.standing if still <= EXACT + far else 0.0,
+        )
+        asked = (1.0 - standing) * rate
+        slipped = noise.slips * asked / (noise.slips * asked + standing) if standing > 0.0 else 1.0
+        odds = seen.odds * standing / (standing + asked)
+        return Seen(
+            seen.moved + slipped, seen.lost + slipped * min(1.0, miss / way), odds,
+            seen.noisy, seen.moves, seen.turns, seen.exact, seen.standing,
+        )  # fmt: skip
+    dx, dy = pose[0] - foreseen[motion, 0], pose[1] - foreseen[motion, 1]
+    return Seen(
+        seen.moved + 1.0,
+        seen.lost,
+        min(seen.odds * (1.0 + noise.lost / noise.kept), MOST_ODDS),
+        seen.noisy + 1.0,
+        seen.moves + dx * dx + dy * dy,
+        seen.turns + wrap(pose[2] - foreseen[motion, 2]) ** 2,
+        seen.exact + (1.0 if miss <= EXACT else 0.0),
+        seen.standing,
+    )
+
+
+@leaf
+def _gap(one: Floats, other: Floats) -> float:
+    """How far two poses (3,) are apart: metres and radians, added up."""
+    return math.hypot(one[0] - other[0], one[1] - other[1]) + abs(wrap(one[2] - other[2]))

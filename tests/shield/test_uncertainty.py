@@ -1,0 +1,117 @@
+"""What a session learns of its robot, and the margin and the slack that follow; distributions are scipy's."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import betabinom, binom, norm
+
+from specshield.shield.caution.experience import Seen, noise_of, observe
+from specshield.shield.episode import Config, decide, make_shield
+from specshield.shield.uncertainty import HARDER, MENDED, Noise, Uncertainty, margin_for, slack_for
+from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted
+
+STRETCH = (0.01, math.radians(0.5), 0.05)  # what is assumed
+MOVES = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, -0.1], [0.0, 0.0, 0.0]])
+HERE = np.zeros(3)
+
+
+def walked(seen, poses, told=STRETCH):
+    for pose in poses:
+        seen = Seen(*observe(told, seen, HERE, MOVES, np.asarray(pose, dtype=float)))
+    return seen
+
+
+def test_motions_as_foreseen_let_go():
+    noise = noise_of(STRETCH, walked(Seen(), [MOVES[0]] * 3))
+    assert (noise.move, noise.turn) == (0.0, 0.0)
+    slack = [
+        slack_for(noise_of(STRETCH, walked(Seen(), [MOVES[0]] * n)), 0.2, 40, 0.0025) for n in (0, 30, 300)
+    ]
+    assert slack[0] >= 7 > slack[1] > slack[2]
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 3.0])
+def test_noise_is_found_out(times):
+    random = np.random.default_rng(0)
+    shaken = MOVES[random.integers(3, size=150)] + random.normal(size=(150, 3)) * times * np.array(
+        [0.01, 0.01, math.radians(0.5)]
+    )
+    noise = noise_of(STRETCH, walked(Seen(), shaken))
+    assert noise.move == pytest.approx(times * 0.01, rel=0.25)
+    assert noise.turn == pytest.approx(times * math.radians(0.5), rel=0.25)
+    assert noise.slips * noise.lost / (noise.lost + noise.kept) < 0.02
+
+
+def test_motions_that_are_not_executed_are_counted_where_the_robot_was_told_to_move():
+    random = np.random.default_rng(1)
+    poses = np.where(random.random((200, 1)) < 0.15, HERE, MOVES[0])
+    noise = noise_of(STRETCH, walked(Seen(), poses))
+    assert noise.slips == 1.0
+    assert noise.lost / (noise.lost + noise.kept) == pytest.approx(0.13, abs=0.04)
+    waits = walked(Seen(standing=1.0), [HERE] * 50)
+    assert (waits.moved, waits.lost, waits.odds) == (0.0, 0.0, 1.0)
+    assert walked(Seen(), [0.3 * MOVES[0]]).lost == pytest.approx(0.7)  # stopped on its way: no noise
+    assert walked(Seen(), [0.3 * MOVES[0]]).noisy == 0.0
+
+
+def test_a_robot_whose_caller_chooses_to_wait_is_not_taken_to_slip():
+    random = np.random.default_rng(2)
+    poses = np.where(random.random((300, 1)) < 0.1, HERE, MOVES[0])
+    noise = noise_of(STRETCH, walked(Seen(standing=0.1), poses))
+    assert noise.slips * noise.lost / (noise.lost + noise.kept) < 0.01
+
+
+@pytest.mark.parametrize("left", [1, 4, 20, 60, 150])
+@pytest.mark.parametrize("slips", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize(("lost", "kept"), [(3.0, 57.0), (1e4, 9e4)])
+@pytest.mark.parametrize("move", [0.0, 0.01, 0.03])
+def test_slack_covers_what_motions_may_cost(left, slips, lost, kept, move):
+    """The fewest steps for which motions cost no more of them, but for the chance: summed over all cases."""
+    chance, noise = 0.0025, Noise(move, move / 2.0, slips, lost, kept)
+    spread = HARDER * math.hypot(move / 0.2, move / 2.0 / MENDED)
+
+    def over(slack):
+        n = left - slack
+        number = betabinom(n, lost, kept) if lost < 100 else binom(n, lost / (lost + kept))
+        k = np.arange(n + 1)
+        tail = norm.sf(slack - k, scale=spread * math.sqrt(n)) if move else (k > slack).astype(float)
+        return (1.0 - slips) * tail[0] + slips * float(number.pmf(k) @ tail)
+
+    found = slack_for(noise, 0.2, left, chance)
+    fits = [slack for slack in range(left) if over(slack) <= chance * 1.02]
+    assert found in (fits[0] if fits else left, next((s for s in fits if over(s) <= chance * 0.98), left))
+
+
+def test_margin_is_overstepped_as_seldom_as_it_says():
+    """By the deviation and what its turn makes of the next stride, over all steps of an episode."""
+    random, steps = np.random.default_rng(3), 100
+    margin = margin_for(Noise(0.01, 0.01, 0.0, 1.0, 1.0), 0.2, steps)
+    moves, turns = random.normal(0.0, 0.01, (4000, steps, 2)), random.normal(0.0, 0.01, (4000, steps))
+    over = np.hypot(moves[..., 0], moves[..., 1] + 0.2 * turns) > margin
+    assert 0.0 < over.any(axis=1).mean() <= 0.005 * 1.5
+
+
+def cells(formula):
+    return Cells(formula, None, {"A": (1, 0)})
+
+
+def test_margin_and_slack_begin_cautious_and_let_go_and_what_was_given_is_the_least():
+    world = cells("F[0,12] A and F[14,30] A")
+    policy = Scripted(
+        world,
+        lambda t, motion: {WAIT: [FORWARD], LEFT: [RIGHT, FORWARD], RIGHT: [LEFT, FORWARD]}.get(motion, []),
+    )
+    for config in (
+        Config(uncertainty=Uncertainty()),
+        Config(uncertainty=Uncertainty(), margin=0.01, slack=1),
+    ):
+        shield, history, carry, said = make_shield([policy], config), [world.pose(0, 0, 0)], None, []
+        for motion in [LEFT, RIGHT, LEFT, RIGHT]:
+            found = decide(shield, history, np.zeros(5), carry=carry)
+            said.append((found.margin, found.slack))
+            carry = found.carry
+            history.append(world.pose(*world.after(world.state(history[-1]), motion)))
+        assert said[0][0] > 0.03
+        assert said[-1][0] == config.margin
+        assert said[0][1] >= said[-1][1] >= config.slack
