@@ -237,3 +237,18 @@ def test_the_sdk_switches_awaiting(server, client, begin):
                 assert (await session.step(ahead(1)[1], LOGITS)).t == 1
 
     asyncio.run(main())
+
+
+def test_what_the_map_has_learned_goes_on_with_its_age(server, client, begin, step, switch, capsys, tmp_path):
+    """A point that is remembered for 4 steps was seen at step 1: it still counts at step 5, by either clock."""
+    for clock in ("restart", "keep"):
+        session, poses = begin(map_memory=4, learn_map=False), ahead(9)
+        for t in range(7):
+            if t == 3:
+                spec = LATER if clock == "restart" else {**LATER, "formula": "F[0,14] End"}
+                assert switch(session, 3, spec, clock=clock).status_code == 200
+            seen = {"occupied": [[1.0, 2.5]]} if t == 1 else {}
+            answer = step(session, t, [poses[t]], logits=AHEAD, **seen).json()
+            assert answer["map_revision"] == [0, 1, 1, 1, 1, 1, 2][t], (clock, t)
+        status, said = told(capsys, tmp_path, record_of(client, session), data_dir=server.data_dir)
+        assert status == 0, said

@@ -20,7 +20,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.shield.decision import Carry
-from specshield.world.learned import LearnedMap
+from specshield.shield.taught import Taught
 
 NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
 MOST_RULES = 256  # of one session; chosen by hand: every load of the session reads their lines
@@ -95,8 +95,8 @@ def _learned(learned: bytes | None, later: int) -> bytes | None:
     """What the map has learned, by a clock that begins so many steps later."""
     if not learned or not later:
         return learned
-    known = LearnedMap.from_bytes(learned)
-    return replace(known, step=known.step - later).to_bytes()
+    known = Taught.from_bytes(learned)
+    return replace(known, map=replace(known.map, step=known.map.step - later)).to_bytes()
 
 
 def told(rules: Sequence[Config], verdicts: Sequence[str]) -> list[dict[str, Any]]:
