@@ -170,17 +170,39 @@ def test_the_main_task_stays_over(client, begin, step):
 
 
 def test_the_last_step_is_max_steps(client, begin, step):
-    session = begin(max_steps=2)
-    for t in (3, 100_000):
-        refused = problem(step(session, t, ahead(3)), 422, "invalid-input")
-        assert (refused["path"], refused["got"], refused["expected"]) == ("t", t, "at most 2")
+    session = begin(max_steps=8)
+    for t in (9, 100_000):
+        refused = problem(step(session, t, ahead(9)), 422, "invalid-input")
+        assert (refused["path"], refused["got"], refused["expected"]) == ("t", t, "at most 8")
         assert "max_steps" in refused["detail"]
-    assert problem(step(session, 2, ahead(2)[2:]), 409, "history-gap")["expected_t"] == 1
-    for t in range(3):
+    assert problem(step(session, 8, ahead(8)[8:]), 409, "history-gap")["expected_t"] == 1
+    for t in range(9):
         answer = step(session, t, ahead(t)[-1:]).json()
     assert answer["finished"]
-    problem(step(session, 3, ahead(3)), 409, "session-finished")
-    assert step(session, 2, ahead(2)[-1:]).json() == answer  # a replay
+    problem(step(session, 9, ahead(9)), 409, "session-finished")
+    assert step(session, 8, ahead(8)[-1:]).json() == answer  # a replay
+
+
+def test_a_refused_start_says_whether_that_is_proved_and_what_is_wrong_with_each_part(client, policy):
+    body = {"policy_id": policy["id"], "initial_pose": [3.5, 0.5, 0.0]}
+    refused = problem(client.post("/v1/sessions", json=body), 422, "infeasible-start")
+    assert refused["proved"] is True
+    assert "F[0,6] Goal is out of reach" in refused["detail"]
+    goal, battery = refused["conjuncts"]
+    assert (goal["formula"], goal["feasible_alone"]) == ("F[0,6] Goal", False)
+    assert goal["robustness"] < 0.0 < goal["late_by"]
+    assert (battery["formula"], battery["feasible_alone"], battery["late_by"]) == (
+        "G[0,8] battery > 10",
+        True,
+        None,
+    )
+
+
+def test_a_session_that_would_end_before_its_rule_is_decided_is_refused(client, policy):
+    body = {"policy_id": policy["id"], "initial_pose": START, "max_steps": 7}
+    refused = problem(client.post("/v1/sessions", json=body), 422, "invalid-input")
+    assert (refused["path"], refused["got"]) == ("max_steps", 7)
+    assert refused["expected"].startswith("at least 8")
 
 
 def test_signals_hold_and_count(client, begin, step):

@@ -61,6 +61,9 @@ FIELD_ERRORS: Mapping[str, type[InputError]] = {
 }
 
 
+LISTS = ("errors", "conjuncts")  # stay the lists that they are: their entries were cut when they were made
+
+
 def status_of(error: SpecshieldError) -> int:
     return next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
 
@@ -79,8 +82,7 @@ def document(error: SpecshieldError) -> dict[str, Any]:
         body["got"] = plain(error.got)
     if error.expected is not None:
         body["expected"] = error.expected
-    # `errors` stays the list it is: its entries were cut when they were made.
-    return body | {name: value if name == "errors" else plain(value) for name, value in error.details.items()}
+    return body | {name: value if name in LISTS else plain(value) for name, value in error.details.items()}
 
 
 def plain(value: Any, room: int = 400) -> Any:

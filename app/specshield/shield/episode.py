@@ -32,6 +32,7 @@ from specshield.shield.judgement import (
     robustness_of,
     witnesses_of,
 )
+from specshield.shield.oddity import oddities
 from specshield.shield.taught import handed_on, on_map, teach
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
@@ -115,6 +116,7 @@ def decide(
     t, signals = len(poses) - 1, signals or {}
     log_prior = _log_prior(shield, logits, main_task_done)
     taught, said = teach(shield, carry, poses, occupied, free)
+    said = (*oddities(shield, np.asarray(history, np.float64)), *said)
     shield = on_map(shield, taught.map)
     nexts = np.empty((len(robot.motions), 3))
     touches = _look_around(shield.body, poses[-1], nexts)

@@ -50,7 +50,7 @@ def explanations(
     slack [steps]: what J asked for.
     """
     robot = shield.task.robot
-    if judged is None:
+    if judged is None or not prefix.formula.names:
         return (None,) * len(robot.actions)
     parts = _parts(prefix, slack)
     found: dict[int, Explanation] = {}
@@ -81,16 +81,16 @@ def _explained(
     for earlier, rows in _futures(shield, prefix, judged, motion):
         if best is not None and best.late_by is not None and best.late_by <= earlier:
             break  # what comes now is as late or later
-        samples = _samples(shield, prefix, rows)
-        rho = np.array([_values(part.asked, samples) for part in parts])  # [parts, rows]
+        samples = samples_of(shield, prefix.poses, prefix.signals, rows)
+        rho = np.array([values_of(part.asked, samples) for part in parts])  # [parts, rows]
         for n, i in enumerate(np.argmin(rho, axis=0)):
             same = parts[i].conjunct is parts[i].asked
-            robustness = float(rho[i, n] if same else _values(parts[i].conjunct, samples)[n])
+            robustness = float(rho[i, n] if same else values_of(parts[i].conjunct, samples)[n])
             if (rho[:, n] <= above).sum() != 1:
                 if robustness > nearest.robustness:
                     nearest = Explanation(str(parts[i].conjunct), robustness, None)
                 continue
-            late = _late_by(parts[i].asked, {name: values[n] for name, values in samples.items()}, above)
+            late = late_by(parts[i].asked, {name: values[n] for name, values in samples.items()}, above)
             order = (1, -robustness) if late is None else (0, late)
             if order < rank:
                 best, rank = Explanation(str(parts[i].conjunct), robustness, late), order
@@ -156,18 +156,18 @@ def _after(shield: Shield, pose: Floats, motion: int) -> Floats:
     return np.array(step(shield.body, x, y, theta, motion), np.float64)
 
 
-def _samples(shield: Shield, prefix: Prefix, motions: Ints) -> dict[str, Floats]:
+def samples_of(
+    shield: Shield, history: Floats, signals: Mapping[str, Floats], motions: Ints
+) -> dict[str, Floats]:
     """What the formula reads along x_0..x_t and each row of motions [n, m]: {name: [n, t + 1 + m]}."""
-    poses = np.empty((len(motions), len(prefix.poses) + motions.shape[1], 3))
-    poses[:, : len(prefix.poses)] = prefix.poses
+    poses = np.empty((len(motions), len(history) + motions.shape[1], 3))
+    poses[:, : len(history)] = history
     for row, joined in zip(motions, poses, strict=True):
-        simulate(
-            shield.body, prefix.poses[-1], np.ascontiguousarray(row, np.int64), joined[len(prefix.poses) :]
-        )
-    return prefix.task.samples(poses, prefix.signals)
+        simulate(shield.body, history[-1], np.ascontiguousarray(row, np.int64), joined[len(history) :])
+    return shield.task.samples(poses, signals)
 
 
-def _values(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
+def values_of(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
     """rho along each trajectory, -inf on all where the formula's arithmetic is not finite on one of them."""
     some = next(iter(samples.values()))
     try:
@@ -176,7 +176,7 @@ def _values(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
         return np.full(some.shape[:-1], -np.inf)
 
 
-def _late_by(part: Formula, samples: Mapping[str, Floats], above: float) -> int | None:
+def late_by(part: Formula, samples: Mapping[str, Floats], above: float) -> int | None:
     """The fewest steps later that the window of an F or U would have to end for its rho to be above `above`;
     None where no later end that the samples [m] reach would do.
     """
@@ -184,7 +184,7 @@ def _late_by(part: Formula, samples: Mapping[str, Floats], above: float) -> int 
         return None
 
     def kept(late: int) -> bool:
-        return float(_values(replace(part, b=part.b + late), samples)) > above
+        return float(values_of(replace(part, b=part.b + late), samples)) > above
 
     low, high = 0, min(len(values) for values in samples.values()) - 1 - part.horizon
     if high < 1 or not kept(high):

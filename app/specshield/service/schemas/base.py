@@ -53,6 +53,18 @@ class FieldError(Answer):
     expected: str = Field(description="What is valid.")
 
 
+class ProblemConjunct(Answer):
+    formula: str = Field(description="The part.")
+    feasible_alone: bool = Field(description="Whether a future was found that keeps this part by itself.")
+    robustness: float | None = Field(
+        description="The highest found of it beside the other parts, or alone where those cannot be kept [m]."
+    )
+    late_by: int | None = Field(
+        description="How many steps later its window would have to end: for this part alone where it is not "
+        "feasible alone, else for the whole rule. Null where no later end was found to do."
+    )
+
+
 class Problem(Answer):
     """An error, as RFC 9457 has it. Other members may follow, such as `position` or `expected_t`."""
 
@@ -67,6 +79,12 @@ class Problem(Answer):
     expected: str | None = Field(None, description="What is valid there.")
     errors: list[FieldError] | None = Field(
         None, description="Every field that failed, where there are several."
+    )
+    proved: bool | None = Field(
+        None, description="Of an infeasible rule: true where no future exists, false where none was found."
+    )
+    conjuncts: list[ProblemConjunct] | None = Field(
+        None, description="Of an infeasible rule: what is wrong with each part that `and` joins."
     )
 
 

@@ -1,0 +1,1 @@
+"""Why an answer is no: what cannot be kept, by how much, and whether that is proved."""

@@ -1,0 +1,168 @@
+"""Whether it can be shown that no future satisfies the formula, whatever the robot does.
+
+Two things are joined. The first steps are followed exactly: every pose that some list of motions leads to.
+From there on the robot is given more than it can do: it turns at no cost, its way is as short as the floor
+allows (ground.py), and it has only to be somewhere in the places that the formula needs (needs.py), in some
+order. Where not even that can be in time, there is no future; else nothing is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from specshield.arrays import Floats, Ints
+from specshield.reasons.course import Goal, course
+from specshield.reasons.ground import Ground, make_ground
+from specshield.reasons.known import Known, spread
+from specshield.reasons.needs import Need, Reader
+from specshield.robot.dynamics import Body, in_collision, motion_count
+from specshield.task import Task
+
+# Chosen by hand: what is looked at stays within a second.
+MOST_POSES = 10_000  # that one more of the first steps leads to
+MOST_STEPS = 12  # that are followed exactly
+MOST_GOALS = 6  # whose order is looked at
+EDGE = 1e-6  # [m] a point this near an edge is on both sides of it
+SAME = 1e7  # poses that agree when multiplied by this are one
+
+
+def proof(task: Task, body: Body, history: Floats, signals: Mapping[str, Floats]) -> str | None:
+    """Why no future of x_0..x_t, history [t + 1, 3], satisfies the task's formula; None where that is open.
+
+    signals {name: [t + 1]}. They are taken to hold their last values.
+    """
+    if in_collision(
+        body, *history[-1]
+    ):  # f lets the robot out of an obstacle by ways that no free floor shows
+        return None
+    known = Known(task, history, signals)
+    ways = Reader(known.now, known.constant).alternatives(task.formula)
+    if not ways:
+        return "the values that the signals hold rule it out"
+    ground, said = make_ground(task, body, known.held), ""
+    for needs in ways:
+        refuted = _refuted(needs, known, ground, body)
+        if refuted is None:
+            return None
+        said = said or refuted
+    return said if len(ways) == 1 else f"{said}; and its {len(ways) - 1} other ways are ruled out likewise"
+
+
+def _refuted(needs: Sequence[Need], known: Known, ground: Ground, body: Body) -> str | None:
+    """Why these needs cannot all be met, None where that is open."""
+    asked = course(needs, known, ground)
+    if isinstance(asked, str):
+        return asked
+    return _Ahead(known, ground, body, asked.guards, asked.goals[:MOST_GOALS]).refuted()
+
+
+@dataclass(frozen=True)
+class _Ahead:
+    known: Known
+    ground: Ground
+    body: Body
+    guards: Sequence[Need]
+    goals: Sequence[Goal]
+
+    def refuted(self) -> str | None:
+        now, horizon = self.known.now, max((need.end for need in self.guards), default=0)
+        horizon = max([horizon, *(goal.need.end for goal in self.goals)])
+        poses, met = self.known.history[-1:], np.zeros(1, np.int64)
+        step = now
+        while step < min(now + MOST_STEPS, horizon) and len(poses) * motion_count(self.body) <= MOST_POSES:
+            further, also = self._onward(poses, met, step + 1)
+            if not len(further):
+                asked = ", ".join(str(g.formula) for g in self.guards if g.first <= step + 1 <= g.end)
+                return f"whatever the robot does, it breaks {asked} by step {step + 1}"
+            poses, met, step = further, also, step + 1
+        if step == now:
+            return None
+        return self._too_late(poses, met, step)
+
+    def _onward(self, poses: Floats, met: Ints, step: int) -> tuple[Floats, Ints]:
+        """The poses that one more motion leads to and that keep the guards at that step, each with the goals
+        that were met on the way, one bit a goal.
+        """
+        count = motion_count(self.body)
+        nexts = np.empty((len(poses), count, 3))
+        spread(self.body, poses, nexts)
+        further, also = nexts.reshape(-1, 3), np.repeat(met, count)
+        keys = np.column_stack(
+            [np.round(SAME * further[:, :2]), np.round(SAME * np.cos(further[:, 2])),
+             np.round(SAME * np.sin(further[:, 2])), also]
+        )  # fmt: skip
+        _, first = np.unique(keys, axis=0, return_index=True)
+        further, also = further[np.sort(first)], also[np.sort(first)]
+        keeps = np.ones(len(further), np.bool_)
+        for guard in self.guards:
+            if guard.first <= step <= guard.end:
+                keeps &= self.known.at(guard.predicate, further)
+        further, also = further[keeps], also[keeps].copy()
+        for bit, goal in enumerate(self.goals):
+            if goal.need.first <= step <= goal.need.last and len(further):
+                also[self.known.at(goal.need.predicate, further)] |= 1 << bit
+        return further, also
+
+    def _too_late(self, poses: Floats, met: Ints, step: int) -> str | None:
+        """Why from none of these poses all goals can be met in time."""
+        apart = [[self._between(a, b) for b in self.goals] for a in self.goals]
+        steps = np.column_stack(
+            [np.empty((len(poses), 0)), *(self._nearest(goal, poses) for goal in self.goals)]
+        )
+        if any(
+            self._in_some_order(int(bits), row, apart, step) for bits, row in zip(met, steps, strict=True)
+        ):
+            return None
+        for bit, goal in enumerate(self.goals):
+            need, least = goal.need, float(np.where(met >> bit & 1 == 0, steps[:, bit], 0.0).min())
+            if least == math.inf:
+                return f"no way leads to where {need.formula} can be met"
+            if step + least > need.last:
+                sooner = f"at least {step + int(least) - self.known.now} steps"
+                return f"{need.formula} is out of reach: {sooner}, and {need.last - self.known.now} are left"
+        return "not all of these can be reached in time, in whatever order: " + ", ".join(
+            str(goal.need.formula) for goal in self.goals
+        )
+
+    def _nearest(self, goal: Goal, poses: Floats) -> Floats:
+        """The fewest steps to a goal from each pose, inf where no way leads there. A centre on an edge is in
+        the squares on both sides.
+        """
+        moved = [poses + np.array([dx, dy, 0.0]) for dx in (-EDGE, EDGE) for dy in (-EDGE, EDGE)]
+        ways = np.min([goal.far[self.ground.squares(each)] for each in moved], axis=0)
+        return np.array([self._steps(way) for way in ways.tolist()])
+
+    def _between(self, a: Goal, b: Goal) -> float:
+        """The fewest steps from a place where one is met to one where the other is."""
+        return self._steps(float(b.far[a.where].min()))
+
+    def _steps(self, way: float) -> float:
+        if way <= 0.0 or way == math.inf:
+            return way
+        return float(math.ceil(way / self.ground.travel - 1e-9)) if self.ground.travel > 0.0 else math.inf
+
+    def _in_some_order(self, met: int, first: Floats, apart: Sequence[Sequence[float]], step: int) -> bool:
+        """Whether the goals that are not met yet can be, one after the other (Held and Karp, 1962)."""
+        every = (1 << len(self.goals)) - 1
+        soonest: dict[tuple[int, int], float] = {(met, -1): float(step)}
+        for done in range(met, every + 1):
+            for last in [-1, *range(len(self.goals))]:
+                begun = soonest.get((done, last))
+                if begun is None:
+                    continue
+                if done == every:
+                    return True
+                for bit, goal in enumerate(self.goals):
+                    if done >> bit & 1:
+                        continue
+                    way = float(first[bit]) if last < 0 else apart[last][bit]
+                    stay = self.goals[last].need.stay if last >= 0 and way > 0.0 else 0
+                    at = max(begun + stay + way, float(goal.need.first))
+                    key = (done | 1 << bit, bit)
+                    if at <= goal.need.last and at < soonest.get(key, math.inf):
+                        soonest[key] = at
+        return False

@@ -1,0 +1,98 @@
+"""What is still to be done: the places to reach, in which windows, and what has to hold all the while."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats
+from specshield.reasons.ground import Ground
+from specshield.reasons.known import Known
+from specshield.reasons.needs import Need
+from specshield.stl import SATISFIED_ABOVE, And, Formula
+
+MOST_NEEDS = 24  # that are looked at; each is held against the others
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A need, the squares where it may be met, and how far [m] each square is from them at least."""
+
+    need: Need
+    where: Bools
+    far: Floats
+
+
+@dataclass(frozen=True)
+class Course:
+    """guards: the needs that have to hold at every step of a window. goals: the needs that some way has to
+    lead to, the smallest places first; a guard whose window is still to come is one of them.
+    """
+
+    guards: tuple[Need, ...]
+    goals: tuple[Goal, ...]
+
+
+def course(needs: Sequence[Need], known: Known, ground: Ground) -> Course | str:
+    """What these needs leave to be done, or why they cannot all be met."""
+    pending: list[Need] = []
+    for need in needs[:MOST_NEEDS]:
+        left = _left(need, known.past(need.predicate), known.now)
+        if left is False:
+            return f"{need.formula} is broken already"
+        if isinstance(left, Need):
+            pending.append(left)
+    guards = tuple(need for need in pending if need.first == need.last)
+    found: list[tuple[Need, Bools]] = []
+    for need in pending:
+        for asked in (need.predicate, _together(need, guards, need.last)):
+            if not _possible(asked, ground).any():
+                return f"{need.formula} asks for '{asked}', which holds nowhere that the robot fits"
+        where = _possible(_together(need, guards, need.end), ground)
+        begun = need.first == need.last == known.now + 1
+        if not begun and not np.array_equal(where, ground.free):
+            found.append((need, where))
+    found = sorted(found, key=lambda goal: int(goal[1].sum()))
+    goals = (Goal(need, where, _far(need, where, guards, known.now, ground)) for need, where in found)
+    return Course(guards, tuple(goals))
+
+
+def _possible(predicate: Formula, ground: Ground) -> Bools:
+    """The squares where a predicate may hold."""
+    possible: Bools = (ground.highest(predicate) > SATISFIED_ABOVE) & ground.free
+    return possible
+
+
+def _left(need: Need, past: Bools, now: int) -> Need | bool:
+    """What of a need is still to come; True where it is met, or may be; False: it is broken."""
+    if need.first > now:
+        return need
+    later, part = max(need.first, now + 1), need.formula
+    if need.first == need.last:
+        if not past[need.first : need.end + 1].all():
+            return False
+        return need.end < later or replace(need, first=later, last=later, stay=need.end - later, part=part)
+    begun = any(past[s : s + need.stay + 1].all() for s in range(need.first, min(need.last, now) + 1))
+    return begun or (later <= need.last and replace(need, first=later, part=part))
+
+
+def _together(need: Need, guards: Sequence[Need], until: int) -> Formula:
+    """The need's predicate and those of the guards that hold from its first step to step `until`."""
+    parts: dict[Formula, None] = {}
+    for each in [need, *(g for g in guards if g.first <= need.first and g.end >= until)]:
+        inner = each.predicate
+        parts |= dict.fromkeys(inner.children if isinstance(inner, And) else (inner,))
+    return And(tuple(parts)) if len(parts) > 1 else next(iter(parts))
+
+
+def _far(need: Need, where: Bools, guards: Sequence[Need], now: int, ground: Ground) -> Floats:
+    """The ways to a goal keep every guard that holds from the next step until the goal is reached. They may
+    lead through squares near those that keep it: between two steps nothing is asked.
+    """
+    free = ground.free
+    for guard in guards:
+        if guard.first <= now + 1 and guard.end >= need.last:
+            free = free & (ground.highest(guard.predicate, ground.travel / 2.0) > SATISFIED_ABOVE)
+    return ground.ways_to(where, free)

@@ -1,0 +1,64 @@
+"""What has been driven, what the signals hold, where predicates hold by that, and where motions lead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats
+from specshield.compiled import kernel
+from specshield.robot.dynamics import Body, successors
+from specshield.stl import Formula, robustness
+from specshield.task import Task
+
+ROUNDING = 1e-9  # robustness above minus this counts as positive: f's own code may round otherwise
+
+
+@dataclass(frozen=True)
+class Known:
+    """What has been driven, and what the signals hold."""
+
+    task: Task
+    history: Floats
+    signals: Mapping[str, Floats]
+
+    @property
+    def now(self) -> int:
+        return len(self.history) - 1
+
+    @property
+    def held(self) -> dict[str, float]:
+        return {
+            name: float(self.task.signal(name, self.signals, self.now + 1)[-1]) for name in self.task.signals
+        }
+
+    def constant(self, predicate: Formula, step: int) -> bool | None:
+        """As `needs.Reader` has it."""
+        if not predicate.names or not set(predicate.names) <= set(self.task.signals):
+            return None
+        truths = self.past(predicate)[min(step, self.now) :]
+        return bool(truths[0]) if (truths == truths[0]).all() else None
+
+    def past(self, predicate: Formula) -> Bools:
+        """Whether a predicate held at each of the steps 0 to t."""
+        return self._holds(predicate, self.task.samples(self.history, self.signals))
+
+    def at(self, predicate: Formula, poses: Floats) -> Bools:
+        """Whether a predicate holds at poses [n, 3] to come."""
+        held = {name: np.array([value]) for name, value in self.held.items()}
+        return self._holds(predicate, self.task.samples(poses, held))
+
+    def _holds(self, predicate: Formula, samples: Mapping[str, Floats]) -> Bools:
+        if not predicate.names:
+            return np.ones(1, np.bool_)
+        each = {name: samples[name][:, None] for name in predicate.names}  # every step is a trajectory of one
+        return np.asarray(robustness(predicate, each) > -ROUNDING)
+
+
+@kernel
+def spread(body: Body, poses: Floats, out: Floats) -> None:
+    """Where each motion leads from each pose: poses (n, 3), out (n, M, 3)."""
+    for i in range(poses.shape[0]):
+        successors(body, poses[i], out[i])

@@ -1,0 +1,89 @@
+"""What is said of a rule that no policy can keep from here: "none was found", or "none exists" and why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from specshield.arrays import Floats
+from specshield.reasons.bound import proof
+from specshield.reasons.relaxation import Conjunct, relaxations
+from specshield.shield.decision import Shield
+
+MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST
+LONGEST = 400
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """message: for people. proved: no future exists, whatever the robot does; else none was found."""
+
+    message: str
+    proved: bool
+    conjuncts: tuple[Conjunct, ...]
+
+    @property
+    def details(self) -> dict[str, Any]:
+        """The extra members of the problem document."""
+        shown = [
+            {
+                "formula": str(each.formula)[:LONGEST],
+                "feasible_alone": each.feasible_alone,
+                "robustness": each.robustness if math.isfinite(each.robustness) else None,
+                "late_by": each.late_by,
+            }
+            for each in self.conjuncts[:MOST_SHOWN]
+        ]
+        return {"proved": self.proved, "conjuncts": shown}
+
+
+def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Refusal:
+    """Why the shield's rule cannot be kept after x_0..x_t, or was not found to be.
+
+    history [t + 1, 3], signals {name: [t + 1]}, which are taken to hold their last values.
+    """
+    bound = proof(shield.task, shield.body, history, signals)
+    relaxed = relaxations(shield, history, signals)
+    if relaxed.kept:  # what was simulated is right, whatever a bound says
+        return Refusal(
+            f"the policies found no future from here that satisfies the formula, though a search found one "
+            f"among {relaxed.tried}: policies of another method, or with finer options, may find it too",
+            False,
+            relaxed.conjuncts,
+        )
+    if bound is not None:
+        return Refusal(f"no future from here satisfies the formula: {bound}", True, relaxed.conjuncts)
+    message = (
+        f"no future from here that satisfies the formula was found among {relaxed.tried} of the policies "
+        f"and of a search; {_wrong(relaxed.conjuncts)}"
+    )
+    return Refusal(message, False, relaxed.conjuncts)
+
+
+def _wrong(conjuncts: Sequence[Conjunct]) -> str:
+    """What the conjuncts say of it, in words."""
+    failing = [each for each in conjuncts if not each.feasible_alone]
+    if failing:
+        return "; ".join(map(_fails, failing))
+    late = [each for each in conjuncts if each.late_by is not None]
+    if late:
+        return f"each part can be kept alone, and all can if {' or '.join(map(_ends_later, late))}"
+    return "each part can be kept alone"
+
+
+def _fails(conjunct: Conjunct) -> str:
+    told = f"{_shown(conjunct)} was not found to be kept even alone"
+    if conjunct.late_by is None:
+        return f"{told}: its robustness is {conjunct.robustness:.3g} at most"
+    return f"{told}, but would be if {_ends_later(conjunct)}"
+
+
+def _ends_later(conjunct: Conjunct) -> str:
+    late = conjunct.late_by
+    return f"the window of {_shown(conjunct)} ended {late} step{'s' if late != 1 else ''} later"
+
+
+def _shown(conjunct: Conjunct) -> str:
+    return str(conjunct.formula)[:LONGEST]

@@ -1,0 +1,177 @@
+"""What is wrong with a rule that cannot be kept from here: its conjuncts, each alone and beside the others.
+
+Futures are gathered from the policies and from a search (search.py): for each conjunct alone, and for all of
+them where one may be late. They are simulated with f and measured; what is said of a conjunct is what some
+future shows of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats, Ints
+from specshield.reasons.course import Course, course
+from specshield.reasons.ground import Ground, make_ground
+from specshield.reasons.known import Known
+from specshield.reasons.needs import Alternatives, Need, Reader
+from specshield.reasons.search import Wanted, search
+from specshield.robot.dynamics import calmest_motion
+from specshield.rule.residual import joined
+from specshield.shield.decision import Shield
+from specshield.shield.explanation import late_by, samples_of, values_of
+from specshield.shield.feasibility import futures, prefix_of
+from specshield.stl import SATISFIED_ABOVE, Eventually, Formula, Until, conjuncts
+
+MOST_LATE = 150  # [steps] that a window is tried to end later, at most. Chosen by hand
+MOST_TRIED = 3  # alternatives of one conjunct, or of all, that are searched for
+MOST_CONJUNCTS = 8  # that are searched for; of further ones the policies' futures alone tell
+
+
+@dataclass(frozen=True)
+class Conjunct:
+    """One conjunct of a rule that cannot be kept.
+
+    feasible_alone: whether a future was found that keeps it, whatever becomes of the others. robustness: the
+    highest found beside the others, where these can be kept without it, else of it alone [m]; -inf where
+    nothing was tried. late_by: how many steps later its window would have to end, for it alone where it is
+    not feasible alone, else for the whole rule; None where no later end of it was found to do.
+    """
+
+    formula: Formula
+    feasible_alone: bool
+    robustness: float
+    late_by: int | None
+
+
+@dataclass(frozen=True)
+class Relaxed:
+    """conjuncts: of the rule. tried: how many futures were judged. kept: whether one of them keeps the rule,
+    which the policies did not find.
+    """
+
+    conjuncts: tuple[Conjunct, ...]
+    tried: int
+    kept: bool
+
+
+def relaxations(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Relaxed:
+    """What of the rule cannot be kept after x_0..x_t, history [t + 1, 3], signals {name: [t + 1]}."""
+    parts = conjuncts(shield.task.formula)
+    gathered = _Gathered(shield, Known(shield.task, history, signals), parts)
+    _gather(gathered)
+    rho, late = np.concatenate(gathered.rho, axis=1), np.concatenate(gathered.late, axis=1)
+    keeps = rho > SATISFIED_ABOVE
+    told = tuple(_told(part, i, rho, late, keeps) for i, part in enumerate(parts))
+    return Relaxed(told, rho.shape[1], bool(keeps.all(axis=0).any()))
+
+
+def _told(part: Formula, i: int, rho: Floats, late: Floats, keeps: Bools) -> Conjunct:
+    """rho, late, keeps [conjuncts, futures]."""
+    beside = np.delete(keeps, i, axis=0).all(axis=0)
+    alone = bool(keeps[i].any())
+    soonest = float(late[i][beside].min(initial=np.inf) if alone else late[i].min())
+    highest = float(rho[i][beside].max() if beside.any() else rho[i].max())
+    return Conjunct(part, alone, highest, int(soonest) if 0.0 < soonest < np.inf else None)
+
+
+@dataclass
+class _Gathered:
+    """Futures, by what each of them says of the conjuncts.
+
+    rho: [conjuncts, n] of n futures each [m]. late: likewise, the steps by which each comes too late: 0 where
+    it keeps the conjunct, inf where no later end of the window would do.
+    """
+
+    shield: Shield
+    known: Known
+    parts: tuple[Formula, ...]
+    rho: list[Floats] = field(default_factory=list)
+    late: list[Floats] = field(default_factory=list)
+
+    def judge(self, motions: Ints) -> None:
+        """motions [n, m]: from x_t to the horizon, or to some steps after it."""
+        samples = samples_of(self.shield, self.known.history, self.known.signals, motions)
+        rows = [{name: values[n] for name, values in samples.items()} for n in range(len(motions))]
+        self.rho.append(np.array([values_of(part, samples) for part in self.parts]))
+        self.late.append(np.array([[_late(part, row) for row in rows] for part in self.parts]))
+
+    def kept(self, i: int) -> bool:
+        return any(bool((rho[i] > SATISFIED_ABOVE).any()) for rho in self.rho)
+
+    def all_kept(self) -> bool:
+        return any(bool((rho > SATISFIED_ABOVE).all(axis=0).any()) for rho in self.rho)
+
+
+def _late(part: Formula, samples: Mapping[str, Floats]) -> float:
+    if float(values_of(part, samples)) > SATISFIED_ABOVE:
+        return 0.0
+    late = late_by(part, samples, SATISFIED_ABOVE)
+    return np.inf if late is None else float(late)
+
+
+def _gather(gathered: _Gathered) -> None:
+    """The policies' futures; then, as far as these leave it open, a search for the whole rule, for each
+    conjunct alone, and for all where one of them may be late or is left out.
+    """
+    shield, known, parts = gathered.shield, gathered.known, gathered.parts
+    prefix = prefix_of(shield.task, shield.task.formula, shield.view, known.history, known.signals)
+    gathered.judge(futures(prefix, shield.body, shield.proposers, None, 0.0).motions)
+    gathered.judge(np.full((1, prefix.steps), calmest_motion(shield.body)))
+    ground = make_ground(shield.task, shield.body, known.held)
+    reader = Reader(known.now, known.constant)
+
+    def look_for(ways: Alternatives, late: Alternatives = ()) -> None:
+        for found in _found(shield, known, ground, ways, late):
+            gathered.judge(found)
+
+    if not gathered.all_kept():
+        look_for(reader.alternatives(shield.task.formula))
+    if gathered.all_kept():
+        return
+    some = range(min(len(parts), MOST_CONJUNCTS))
+    each = [reader.alternatives(parts[i]) for i in some]
+    timed = [isinstance(parts[i], (Eventually, Until)) for i in some]
+    for i in some:
+        if not gathered.kept(i):
+            look_for(each[i])
+        if not gathered.kept(i) and timed[i]:
+            look_for(each[i], each[i])
+    if len(parts) > 1 and all(gathered.kept(i) for i in range(len(parts))):
+        for i in some:
+            if timed[i]:
+                look_for(reader.alternatives(shield.task.formula), each[i])
+            else:
+                look_for(reader.alternatives(joined([other for other in parts if other != parts[i]])))
+
+
+def _found(
+    shield: Shield, known: Known, ground: Ground, ways: Alternatives, may_be_late: Alternatives
+) -> Iterator[Ints]:
+    """Futures [1, m] that meet the needs of some alternative; those of `may_be_late` may begin later."""
+    late = {need.formula for way in may_be_late for need in way if need.first < need.last or not need.stay}
+    for needs in ways[:MOST_TRIED]:
+        relaxed = [
+            replace(need, last=need.last + MOST_LATE, part=need.formula) if need.formula in late else need
+            for need in needs
+        ]
+        asked = course(relaxed, known, ground)
+        if isinstance(asked, str):
+            continue
+        until = shield.task.horizon + (MOST_LATE if late else 0)
+        found = search(known, ground, shield.body, asked.guards, _wanted(asked, late), until)
+        if found is not None:
+            yield found[None]
+
+
+def _wanted(asked: Course, late: set[Formula]) -> list[Wanted]:
+    """A guard whose window is to come is wanted at its first step; being kept then, it is kept on."""
+    return [_want(goal.need, goal.far, goal.need.formula in late) for goal in asked.goals[:MOST_CONJUNCTS]]
+
+
+def _want(need: Need, far: Floats, late: bool) -> Wanted:
+    if need.first == need.last:
+        return Wanted(replace(need, stay=0), far, need.last)
+    return Wanted(replace(need, last=need.last - MOST_LATE) if late else need, far, need.last)

@@ -1,0 +1,162 @@
+"""A search for a future that meets given needs, whatever policies there are: step by step, in simulation.
+
+It begins with every pose that one motion leads to, and goes on from those that leave the most steps to spare
+on the way to the goals (ground.py). A place is searched from once, when it is first reached, and again when
+some window opens or closes. What it finds is simulated with f and can be judged like any other future. That
+it finds nothing proves nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats, Ints
+from specshield.reasons.ground import Ground
+from specshield.reasons.known import Known, spread
+from specshield.reasons.needs import Need
+from specshield.robot.dynamics import Body, calmest_motion, motion_count
+
+# Chosen by hand: a search takes a second at most.
+MOST_NODES = 60_000
+WIDTH = 120  # poses that one step goes on from, for each set of goals that are met,
+MOST_MOTIONS = 1_500  # and motions from all of these
+BEHIND = 8.0  # [steps] to spare by which these may fall behind the best: what it takes to turn round
+TINY = 1e-9  # [m] a step of a robot that does not move
+CELL, HEADINGS = 0.05, 120  # [m] and per turn: poses that are one place
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a way has to meet: `far` [m] of the ground's squares from where that may be, and the last step to
+    begin it by, which is later than the need has it where it may be late.
+    """
+
+    need: Need
+    far: Floats
+    due: int
+
+
+@dataclass
+class _Tree:
+    """What was reached: of each node its pose, step, parent and the motion that led there."""
+
+    pose: list[Floats] = field(default_factory=list)
+    step: list[Ints] = field(default_factory=list)
+    parent: list[Ints] = field(default_factory=list)
+    motion: list[Ints] = field(default_factory=list)
+    size: int = 0
+
+    def add(self, pose: Floats, step: int, parent: Ints, motion: Ints) -> Ints:
+        self.pose.append(pose)
+        self.step.append(np.full(len(pose), step))
+        self.parent.append(parent)
+        self.motion.append(motion)
+        self.size += len(pose)
+        return np.arange(self.size - len(pose), self.size)
+
+    def way(self, node: int, wait: int) -> list[int]:
+        """The motions to a node; where time passed between two nodes the robot waited."""
+        step, parent, motion = (np.concatenate(each) for each in (self.step, self.parent, self.motion))
+        back: list[int] = []
+        while parent[node] >= 0:
+            before = int(parent[node])
+            back += [int(motion[node]), *[wait] * int(step[node] - step[before] - 1)]
+            node = before
+        return back[::-1]
+
+
+def search(
+    known: Known, ground: Ground, body: Body, guards: Sequence[Need], goals: Sequence[Wanted], until: int
+) -> Ints | None:
+    """Motions from x_t up to step `until` that meet the goals and keep the guards at every step of their
+    windows; None where none were found.
+    """
+    wait, now, tree = calmest_motion(body), known.now, _Tree()
+    waits = known.task.robot.wait_motion >= 0
+    count, every = motion_count(body), (1 << len(goals)) - 1
+    width = max(1, min(WIDTH, MOST_MOTIONS // count))
+    stays = [k for k, goal in enumerate(goals) if goal.need.stay > 0]
+    events = {goal.need.first for goal in goals} | {s for g in guards for s in (g.first, g.end + 1)}
+    ids = tree.add(known.history[-1:], now, np.array([-1]), np.array([-1]))
+    poses, met, run = known.history[-1:], np.zeros(1, np.int64), np.zeros((1, len(goals)), np.int64)
+    pool: list[tuple[Ints, Floats, Ints]] = []
+    seen = np.empty(0, np.int64)
+    for step in range(now + 1, until + 1):
+        if step in events and waits and pool:  # who waited somewhere may go on from there
+            ids, poses, met = (np.concatenate(each) for each in zip(*pool, strict=True))
+            run, seen = np.zeros((len(ids), len(goals)), np.int64), np.empty(0, np.int64)
+            chosen = _best(goals, ground, poses, met, run, step - 1, width)
+            ids, poses, met, run = ids[chosen], poses[chosen], met[chosen], run[chosen]
+        nexts = np.empty((len(poses), count, 3))
+        spread(body, poses, nexts)
+        parent, motion = np.repeat(ids, count), np.tile(np.arange(count), len(ids))
+        poses, met, run = nexts.reshape(-1, 3), np.repeat(met, count), np.repeat(run, count, axis=0)
+        keep = _kept(known, guards, poses, step)
+        poses, met, run, parent, motion = poses[keep], met[keep].copy(), run[keep], parent[keep], motion[keep]
+        waiting = np.zeros(len(poses), np.bool_)
+        for k, goal in enumerate(goals):
+            holds = known.at(goal.need.predicate, poses) & (met >> k & 1 == 0)
+            run[:, k] = np.where(holds & (step >= goal.need.first), run[:, k] + 1, 0)
+            met[run[:, k] > goal.need.stay] |= 1 << k
+            waiting |= holds & (step < goal.need.first)
+        if (met == every).any():
+            node = int(tree.add(poses, step, parent, motion)[np.argmax(met == every)])
+            return np.array(tree.way(node, wait) + [wait] * (until - step), np.int64)
+        key = _key(poses, met, run[:, stays])
+        _, first = np.unique(key, return_index=True)
+        fresh = ~np.isin(key[first], seen) | waiting[first] if waits else np.ones(len(first), np.bool_)
+        chosen = first[fresh]
+        chosen = chosen[_best(goals, ground, poses[chosen], met[chosen], run[chosen], step, width)]
+        if not len(chosen) and not any(event > step for event in events):
+            return None
+        poses, met, run = poses[chosen], met[chosen], run[chosen]
+        ids = tree.add(poses, step, parent[chosen], motion[chosen])
+        pool.append((ids, poses, met))
+        seen = np.concatenate([seen, key[chosen]])
+        if tree.size > MOST_NODES:
+            return None
+    return None
+
+
+def _kept(known: Known, guards: Sequence[Need], poses: Floats, step: int) -> Bools:
+    keep = np.ones(len(poses), np.bool_)
+    for guard in guards:
+        if guard.first <= step <= guard.end:
+            keep &= known.at(guard.predicate, poses)
+    return keep
+
+
+def _key(poses: Floats, met: Ints, run: Ints) -> Ints:
+    """One number for each place, with what is met there."""
+    cells = np.floor(poses[:, :2] / CELL).astype(np.int64) & 0xFFFF
+    heading = np.round(poses[:, 2] * HEADINGS / (2.0 * math.pi)).astype(np.int64) % HEADINGS
+    key = ((cells[:, 0] << 16 | cells[:, 1]) * HEADINGS + heading) << 8 | met
+    for column in run.T:
+        key = key * 1031 + column
+    return key
+
+
+def _best(
+    goals: Sequence[Wanted], ground: Ground, poses: Floats, met: Ints, run: Ints, step: int, width: int
+) -> Ints:
+    """Which of the poses to go on from: those with the most steps to spare, of each set of goals met."""
+    at = ground.squares(poses)
+    spare, hopeless = np.full(len(poses), np.inf), np.zeros(len(poses), np.bool_)
+    for k, goal in enumerate(goals):
+        ahead = np.ceil(goal.far[at] / ground.travel - 1e-9) if ground.travel > 0.0 else goal.far[at]
+        ahead = np.where(run[:, k] > 0, -run[:, k], ahead)  # what is being met was begun in time
+        is_open = met >> k & 1 == 0
+        hopeless |= is_open & (step + ahead > goal.due)
+        spare = np.where(is_open, np.minimum(spare, goal.need.last - step - ahead), spare)
+    order = np.argsort(-spare, kind="stable")
+    order = order[~hopeless[order]]
+    chosen = []
+    for one in np.unique(met[order]):
+        same = order[met[order] == one]
+        near = same[spare[same] >= spare[same[0]] - BEHIND]
+        chosen.append(near[:width])
+    return np.concatenate(chosen) if chosen else np.empty(0, np.int64)

@@ -1,0 +1,92 @@
+"""What is said of the conjuncts of a rule that cannot be kept is true: held against every future on cells."""
+
+import numpy as np
+
+from specshield.reasons.refusal import refusal
+from specshield.reasons.relaxation import relaxations
+from specshield.shield.episode import make_shield
+from tests.oracles.cells import Cells, Scripted, waits
+
+PLACES = {"A": (2, 0), "B": (0, 2), "C": (4, 4), "D": (1, 0)}
+
+
+def cells_of(parts):
+    """parts: (operator, from, to, place): F reaches a place, G keeps out of it."""
+
+    def keeps(inside):
+        kept = True
+        for op, a, b, place in parts:
+            window = inside[place][..., a : b + 1]
+            kept = kept & (window.any(axis=-1) if op == "F" else ~window.any(axis=-1))
+        return kept
+
+    text = " and ".join(f"{op}[{a},{b}] {'' if op == 'F' else 'not '}{place}" for op, a, b, place in parts)
+    return Cells(text, keeps, {place: PLACES[place] for *_, place in parts})
+
+
+def exists(parts, history):
+    return bool(cells_of(parts).feasible(history).any())
+
+
+def test_each_conjunct_alone_and_how_late_it_is():
+    random, seen = np.random.default_rng(3), {"alone": 0, "beside": 0, "unknown": 0}
+    for _ in range(60):
+        a, b, c = (int(v) for v in random.integers(1, 5, 3))
+        parts = [("F", 0, a, "A"), ("F", min(b, c), max(b, c), "B"), ("G", 0, 4, "D")]
+        parts = [parts[i] for i in sorted(random.permutation(3)[: random.integers(1, 4)])]
+        cells = cells_of(parts)
+        history = np.array([cells.pose(int(random.integers(0, 3)), 0, int(random.integers(4)))])
+        if exists(parts, history):
+            continue
+        relaxed = relaxations(make_shield([Scripted(cells, waits)]), history, {})
+        assert not relaxed.kept
+        for part, told in zip(parts, relaxed.conjuncts, strict=True):
+            op, start, end, place = part
+            others = [other for other in parts if other != part]
+            assert told.feasible_alone == exists([part], history)
+            assert (told.robustness > 0.0) <= told.feasible_alone
+            if told.late_by is None:
+                seen["unknown"] += 1
+                continue
+            beside = others if told.feasible_alone else []
+            seen["beside" if beside else "alone"] += 1
+            assert end + told.late_by > 6 or exists(
+                [*beside, (op, start, end + told.late_by, place)], history
+            )
+            assert not exists([*beside, (op, start, min(end + told.late_by - 1, 6), place)], history)
+    assert min(seen.values()) >= 3, seen
+
+
+def shield(parts):
+    return make_shield([Scripted(cells_of(parts), waits)])
+
+
+def test_a_refusal_says_which_of_both_it_is():
+    history = np.array([cells_of([("F", 0, 9, "A")]).pose(0, 0, 0)])
+    sealed = refusal(shield([("F", 0, 1, "A")]), history, {})
+    assert sealed.proved
+    assert sealed.message.startswith(
+        "no future from here satisfies the formula: whatever the robot does, it breaks"
+    )
+    (told,) = sealed.details["conjuncts"]
+    assert (told["formula"], told["feasible_alone"], told["late_by"]) == ("F[0,1] A", False, 1)
+    assert np.isclose(told["robustness"], -0.1)  # the middle of the next cell of 0.2 m
+
+
+def test_a_way_that_the_policies_missed_is_not_denied():
+    history = np.array([cells_of([("F", 0, 9, "A")]).pose(0, 0, 0)])
+    missed = refusal(shield([("F", 0, 4, "A")]), history, {})
+    assert not missed.proved
+    assert "a search found one" in missed.message
+
+
+def test_what_was_not_found_is_not_called_impossible_and_a_later_end_that_would_do_is_named():
+    parts = [("F", 0, 3, "A"), ("F", 0, 6, "B")]
+    history = np.array([cells_of(parts).pose(0, 0, 0)])
+    if exists(parts, history):
+        parts = [("F", 0, 2, "A"), ("F", 0, 5, "B")]
+    told = refusal(shield(parts), history, {})
+    assert [each["feasible_alone"] for each in told.details["conjuncts"]] == [True, True]
+    late = [each["late_by"] for each in told.details["conjuncts"]]
+    assert any(late), late
+    assert told.proved or "each part can be kept alone, and all can if the window of" in told.message
