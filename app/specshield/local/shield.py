@@ -13,11 +13,12 @@ import numpy as np
 
 from specshield.client.models import SessionInfo
 from specshield.client.wire import pose_values
-from specshield.errors import InfeasibleStart, MapError, NotFound, PolicyError
+from specshield.errors import MapError, NotFound, PolicyError
 from specshield.local.session import LocalSession
 from specshield.lookahead.preferences import PROJECTION, check_shaping, prepare
 from specshield.policy.methods import DEFAULT, METHODS, Run, load_policy
 from specshield.policy.options import read_options
+from specshield.reasons import refusal
 from specshield.robot import Robot, robot_from_json
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
@@ -156,13 +157,7 @@ class LocalShield:
         if shaping != PROJECTION:
             check_preferring(shield.config)
             shield = replace(shield, preference=self._preference(shaping))
-        feasible = True
-        try:
-            episode.start(shield, pose)
-        except InfeasibleStart:
-            if not allowed:
-                raise
-            feasible = False
+        feasible = refusal.begin(shield, pose, allowed)
         status, _ = episode.close(shield, [pose])
         task = self.task
         info = SessionInfo(

@@ -7,10 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from specshield.arrays import Floats
+from specshield.errors import InfeasibleStart, InputError
 from specshield.reasons.bound import proof
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.shield.decision import Shield
+from specshield.shield.episode import start
 
 MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST
 LONGEST = 400
@@ -37,6 +41,30 @@ class Refusal:
             for each in self.conjuncts[:MOST_SHOWN]
         ]
         return {"proved": self.proved, "conjuncts": shown}
+
+
+def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> bool:
+    """Whether a session can begin at `pose` (x, y, theta) with a future that satisfies the rule.
+
+    Raises InputError for a session that would end before its rule is decided, PoseError, and InfeasibleStart
+    unless `allow_infeasible`.
+    """
+    steps, horizon = shield.config.max_steps, shield.task.horizon
+    if steps is not None and steps < horizon:
+        raise InputError(
+            f"a session of {steps} steps ends before its rule is decided", path="max_steps", got=steps,
+            expected=f"at least {horizon}, the rule's last step",
+        )  # fmt: skip
+    try:
+        start(shield, pose)
+    except InfeasibleStart as error:
+        if allow_infeasible:
+            return False
+        told = refusal(shield, np.array([pose], np.float64), {})
+        raise InfeasibleStart(
+            told.message, path=error.path, got=error.got, expected=error.expected, **told.details
+        ) from None
+    return True
 
 
 def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Refusal:

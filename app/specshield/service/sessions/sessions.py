@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import FragmentError, InfeasibleStart, InputError, LimitReached, SpecshieldError
+from specshield.errors import FragmentError, InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
-from specshield.reasons.refusal import refusal
+from specshield.reasons import refusal
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.access.owners import scoped
 from specshield.service.heavy.heavy import Heavy
@@ -243,21 +243,7 @@ def begin(
     records = [policies.find(key, owner) for key in request.policies]
     ids = [record.id for record in records]
     shield = replace(shields.get(ids, settings), preference=preference)
-    if settings.max_steps is not None and settings.max_steps < shield.task.horizon:
-        raise InputError(
-            f"a session of {settings.max_steps} steps ends before its rule is decided", path="max_steps",
-            got=settings.max_steps, expected=f"at least {shield.task.horizon}, the rule's last step",
-        )  # fmt: skip
-    feasible = True
-    try:
-        episode.start(shield, request.initial_pose)
-    except InfeasibleStart as error:
-        if not request.allow_infeasible:
-            told = refusal(shield, np.array([request.initial_pose], np.float64), {})
-            raise InfeasibleStart(
-                told.message, path=error.path, got=error.got, expected=error.expected, **told.details
-            ) from None
-        feasible = False
+    feasible = refusal.begin(shield, request.initial_pose, request.allow_infeasible)
     task, about = shield.task, records[0].about
     signals = dict(sorted(task.signals.items()))
     rows = np.array([[*request.initial_pose, *signals.values()]])
