@@ -42,6 +42,9 @@ def switch(client):
     return switch
 
 
+CONJUNCT = {"formula", "feasible_alone", "robustness", "late_by"}
+
+
 def driven(step, session, poses, since=0):
     """The contents of the answers to a step a pose."""
     answers = [step(session, since + i, [pose], logits=AHEAD) for i, pose in enumerate(poses)]
@@ -119,7 +122,9 @@ def test_a_history_that_counts_and_one_that_does_not(begin, step, switch):
     """BOTH asks to be at the start first: it has been there, if that counts."""
     session, poses = begin(), ahead(6)
     driven(step, session, poses[:5])
-    problem(switch(session, 5, BOTH, clock="restart"), 422, "infeasible-switch")
+    refused = problem(switch(session, 5, BOTH, clock="restart"), 422, "infeasible-switch")
+    assert isinstance(refused["proved"], bool)
+    assert [set(part) for part in refused["conjuncts"]] == [CONJUNCT] * len(refused["conjuncts"]) != []
     shown = switch(session, 5, BOTH, clock="keep").json()
     assert (shown["rules"][1]["from"], shown["rules"][1]["origin"]) == (5, 0)
     assert step(session, 5, poses[5:6]).json()["mode"] == "shaped"

@@ -128,15 +128,15 @@ class Ground:
 
 
 def make_ground(task: Task, body: Body, values: dict[str, float]) -> Ground:
-    """values: what the signals are held at."""
+    """body: on the map as it is known by now. values: what the signals are held at."""
     grid = task.grid
-    room = grid.clearance + grid.resolution * math.sqrt(0.5) >= task.robot.radius - SPARE
+    room = body.clearance + grid.resolution * math.sqrt(0.5) >= task.robot.radius - SPARE
     numbers = pack_areas(list(task.areas.values())).data.size
     most = min(MOST_SQUARES, MOST_WORK // max(numbers, 1))
     many = max(1, math.ceil(math.sqrt(grid.height * grid.width / max(most, 1))))
     ny, nx = -(-grid.height // many), -(-grid.width // many)
     padded = np.zeros((ny * many, nx * many), np.bool_)
-    padded[: grid.height, : grid.width] = room & ~grid.occupied
+    padded[: grid.height, : grid.width] = room & (body.occupied == 0)
     free: Bools = np.any(padded.reshape(ny, many, nx, many), axis=(1, 3))
     side = many * grid.resolution
     columns, rows = np.meshgrid(np.arange(nx) + 0.5, np.arange(ny) + 0.5)

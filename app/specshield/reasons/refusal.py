@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import InfeasibleStart, InputError
+from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
 from specshield.reasons.bound import proof
 from specshield.reasons.relaxation import Conjunct, relaxations
-from specshield.shield.decision import Shield
-from specshield.shield.episode import start
+from specshield.shield import switching
+from specshield.shield.decision import Carry, Shield
+from specshield.shield.episode import Signals, start
+from specshield.shield.taught import on_map, teach
 
 MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST
 LONGEST = 400
@@ -65,6 +67,21 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> bool
             told.message, path=error.path, got=error.got, expected=error.expected, **told.details
         ) from None
     return True
+
+
+def switch(
+    shield: Shield, history: Floats, signals: Signals | None, carry: Carry | None, elsewhere: bool
+) -> None:
+    """As in shield/switching.py; the InfeasibleSwitch that is raised says what is wrong with the rule."""
+    try:
+        switching.switch(shield, history, signals, carry, elsewhere)
+    except InfeasibleSwitch as error:
+        taught, _ = teach(shield, carry, history, None, None)
+        told = refusal(on_map(shield, taught.map), history, signals or {})
+        raise InfeasibleSwitch(
+            f"the new rule cannot be kept from here: {told.message}",
+            path=error.path, got=error.got, expected=error.expected, **told.details,
+        ) from None  # fmt: skip
 
 
 def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Refusal:

@@ -18,6 +18,7 @@ from specshield.arrays import Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, LogitsError, PoseError
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
+from specshield.robot.oddity import oddities
 from specshield.shield import shaping
 from specshield.shield.caution.experience import learn, remember
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
@@ -32,7 +33,6 @@ from specshield.shield.judgement import (
     robustness_of,
     witnesses_of,
 )
-from specshield.shield.oddity import oddities
 from specshield.shield.taught import handed_on, on_map, teach
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
@@ -116,7 +116,7 @@ def decide(
     t, signals = len(poses) - 1, signals or {}
     log_prior = _log_prior(shield, logits, main_task_done)
     taught, said = teach(shield, carry, poses, occupied, free)
-    said = (*oddities(shield, np.asarray(history, np.float64)), *said)
+    said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)), *said)
     shield = on_map(shield, taught.map)
     nexts = np.empty((len(robot.motions), 3))
     touches = _look_around(shield.body, poses[-1], nexts)

@@ -22,6 +22,7 @@ from specshield.errors import (
     StepConflict,
 )
 from specshield.lookahead.preferences import PROJECTION
+from specshield.reasons import refusal
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
 from specshield.service.library.policies import Policies
@@ -44,7 +45,6 @@ from specshield.service.settings import Settings
 from specshield.service.storage.store import Change, Store
 from specshield.shield import episode
 from specshield.shield.decision import Config
-from specshield.shield.switching import switch
 
 R = TypeVar("R")
 
@@ -221,7 +221,7 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
     elsewhere = any(old[name] != config[name] for name in ("map_id", "robot"))
-    switch(shield, seen[:, :3], columns(seen, names), carry, elsewhere)
+    refusal.switch(shield, seen[:, :3], columns(seen, names), carry, elsewhere)
     known = made.since
     status = episode.close(shield, known[:, :3], columns(known, names))[0] if len(known) else "pending"
     state = msgspec.structs.replace(

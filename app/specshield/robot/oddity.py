@@ -6,24 +6,24 @@ import math
 from collections.abc import Iterator
 
 from specshield.arrays import Floats
-from specshield.robot.dynamics import longest_motions
-from specshield.shield.decision import Shield
+from specshield.robot.dynamics import Body, longest_motions
+from specshield.world.occupancy import OccupancyGrid
 
 FULL_TURN = 2.0 * math.pi + 1e-6  # [rad] some count headings up to here; nobody counts on
 JUMP = 1.0  # [m] beyond the longest motion: more than robots slip. Chosen by hand
 
 
-def oddities(shield: Shield, poses: Floats) -> Iterator[str]:
+def oddities(grid: OccupancyGrid, body: Body, poses: Floats) -> Iterator[str]:
     """What looks odd of x_t, one sentence each. poses [t + 1, 3]: as they were sent, headings not wrapped."""
     x, y, theta = poses[-1].tolist()
     if abs(theta) > FULL_TURN:
         meant = math.radians(theta)
         yield f"theta is in radians, and {theta:g} looks like degrees, which would be {meant:.4g} radians"
-    low_x, low_y, high_x, high_y = shield.task.grid.bounds
+    low_x, low_y, high_x, high_y = grid.bounds
     if not (low_x <= x <= high_x and low_y <= y <= high_y):
         spans = f"({low_x:g}, {low_y:g}) to ({high_x:g}, {high_y:g})"
         yield f"the pose ({x:g}, {y:g}) is off the map, which spans {spans} in metres"
     if len(poses) > 1:
-        moved, most = math.hypot(*(poses[-1, :2] - poses[-2, :2])), longest_motions(shield.body)[0]
+        moved, most = math.hypot(*(poses[-1, :2] - poses[-2, :2])), longest_motions(body)[0]
         if moved > most + JUMP:
             yield f"the pose is {moved:.3g} m from the one before; the robot's longest motion is {most:g} m"
