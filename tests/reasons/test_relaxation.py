@@ -90,3 +90,12 @@ def test_what_was_not_found_is_not_called_impossible_and_a_later_end_that_would_
     late = [each["late_by"] for each in told.details["conjuncts"]]
     assert any(late), late
     assert told.proved or "each part can be kept alone, and all can if the window of" in told.message
+
+
+def test_a_rule_that_is_over_and_was_not_kept_could_still_be_kept_later():
+    parts = [("F", 0, 1, "A")]
+    history = np.array([cells_of(parts).pose(0, 0, 0)] * 4)
+    told = refusal(shield(parts), history, {})
+    assert told.proved
+    assert "F[0,1] A is broken already" in told.message or "breaks" in told.message
+    assert told.conjuncts[0].late_by == 4  # at step 5

@@ -9,6 +9,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel
+from specshield.errors import SampleError
 from specshield.robot.dynamics import Body, successors
 from specshield.stl import Formula, robustness
 from specshield.task import Task
@@ -51,10 +52,13 @@ class Known:
         return self._holds(predicate, self.task.samples(poses, held))
 
     def _holds(self, predicate: Formula, samples: Mapping[str, Floats]) -> Bools:
-        if not predicate.names:
-            return np.ones(1, np.bool_)
+        """True, too, where the predicate's arithmetic is not finite on some of them."""
         each = {name: samples[name][:, None] for name in predicate.names}  # every step is a trajectory of one
-        return np.asarray(robustness(predicate, each) > -ROUNDING)
+        count = len(next(iter(each.values()))) if each else 1
+        try:
+            return np.asarray(robustness(predicate, each) > -ROUNDING) if each else np.ones(1, np.bool_)
+        except SampleError:
+            return np.ones(count, np.bool_)
 
 
 @kernel

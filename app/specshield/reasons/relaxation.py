@@ -60,6 +60,8 @@ class Relaxed:
 def relaxations(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Relaxed:
     """What of the rule cannot be kept after x_0..x_t, history [t + 1, 3], signals {name: [t + 1]}."""
     parts = conjuncts(shield.task.formula)
+    if not shield.task.formula.names:  # it reads nothing that any future could change
+        return Relaxed((), 0, False)
     gathered = _Gathered(shield, Known(shield.task, history, signals), parts)
     _gather(gathered)
     rho, late = np.concatenate(gathered.rho, axis=1), np.concatenate(gathered.late, axis=1)
@@ -118,8 +120,9 @@ def _gather(gathered: _Gathered) -> None:
     """
     shield, known, parts = gathered.shield, gathered.known, gathered.parts
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, known.history, known.signals)
-    gathered.judge(futures(prefix, shield.body, shield.proposers, None, 0.0).motions)
-    gathered.judge(np.full((1, prefix.steps), calmest_motion(shield.body)))
+    if prefix.steps > 0:
+        gathered.judge(futures(prefix, shield.body, shield.proposers, None, 0.0).motions)
+    gathered.judge(np.full((1, max(prefix.steps, 1)), calmest_motion(shield.body)))
     ground = make_ground(shield.task, shield.body, known.held)
     reader = Reader(known.now, known.constant)
 
