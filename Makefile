@@ -24,7 +24,7 @@ install: .venv/.dev
 	touch $@ .venv/.server
 
 demo: .venv/.server
-	$(BIN)/specshield demo
+	$(BIN)/specshield demo $(ARGS)
 
 run: .venv/.server
 	$(BIN)/specshield serve

@@ -185,11 +185,12 @@ def demo(
     runs: Annotated[int, typer.Option(help="Episodes a case.", min=1)] = 20,
     seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
+    stay: Annotated[bool, typer.Option("--open", help="Leave the service up, and its page.")] = False,
 ) -> None:
     """The paper's two cases with and without the shield: a table, and a picture of each."""
     from specshield.sim.demo import run_demo
 
-    raise typer.Exit(run_demo(runs, seed, out))
+    raise typer.Exit(run_demo(runs, seed, out, stay))
 
 
 def train(
