@@ -72,7 +72,10 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
 
 def _commands() -> Iterator[Callable[..., None]]:
     """The commands below, and those that other packages register as entry points."""
-    yield from (serve, demo, train, worker, verify, openapi)
+    from specshield.commands.check_drive import check_drive
+    from specshield.commands.export import export
+
+    yield from (serve, demo, train, worker, verify, openapi, export, check_drive)
     yield _keys()
     for registered in entry_points(group="specshield.commands"):
         yield registered.load()
