@@ -6,14 +6,17 @@ Each is drawn in the small worlds of benchmarks/worlds.py: a robot drives for so
 model being noise; then comes another rule, another map or both, with either clock. From the pose and the
 history that there are, `keepable` tries every future, with nothing of the shield but f. Where one keeps the
 new rule, the switch has to be taken and the rule has to be kept to its end, by benchmarks/judge.py. Where
-none does, it has to be refused, and the session has to be as it was, to the byte.
+none does, it has to be refused, and the session has to be as it was; where the refusal says by how much later
+one window would have to end, that rule has to be taken, and kept.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +25,7 @@ from numpy.typing import NDArray
 
 from benchmarks.judge import Judge, distance
 from benchmarks.worlds import KINDS, SHAPES, Kind, World, explore, make_world
-from specshield.client import ShieldClient
+from specshield.client import Session, ShieldClient
 from specshield.errors import InfeasibleSwitch, PoseError
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.robot.dynamics import in_collision, make_body, motion_count, successors
@@ -141,26 +144,57 @@ def one(service: Service, number: int, seed: int) -> tuple[str, str]:
             return what, "too large to search"
         before = service.client.sessions.get(session.id).info
         with_pose = {"pose": pose} if random.random() < 0.5 else {}
+        how = ""
         try:
             session.switch(service.policy(new), clock=clock, **with_pose)
-        except (InfeasibleSwitch, PoseError):
-            now = service.client.sessions.get(session.id).info
-            session.step(pose, random.normal(0.0, 2.0, len(robot.actions)))
-            if now != before:
+        except (InfeasibleSwitch, PoseError) as error:
+            if service.client.sessions.get(session.id).info != before:
                 return what, "REFUSED, and something changed"
-            return what, "REFUSED, a way was there" if possible else "refused, no way was there"
-        if not possible:
-            return what, "TAKEN, no way was there"
-        driven = [pose]
-        while session.spec_status == "pending":
-            decision = session.step(pose, random.normal(0.0, 2.0, len(robot.actions)))
-            pose = np.array(decision.next_poses[decision.execute])
-            driven.append(pose)
-        whole = np.array([*([] if clock == "restart" else poses), *driven])
+            if possible:
+                return what, "REFUSED, a way was there"
+            looser = relaxed(new, error.details.get("conjuncts", ()))
+            if looser is None:
+                session.step(pose, random.normal(0.0, 2.0, len(robot.actions)))
+                return what, "refused, no way was there"
+            how, new = "refused, no way was there; its relaxation: ", looser
+            try:
+                session.switch(service.policy(new), clock=clock, **with_pose)
+            except InfeasibleSwitch:
+                return what, how + "REFUSED"
+        else:
+            if not possible:
+                return what, "TAKEN, no way was there"
+        states = [*([] if clock == "restart" else poses), *drive(session, pose, random)]
         horizon = new.task.horizon
-        whole = np.vstack([whole, np.repeat(whole[-1:], horizon, axis=0)])[: horizon + 1]
+        whole = np.vstack([states, np.repeat(states[-1:], horizon, axis=0)])[: horizon + 1]
         kept = bool(Judge(str(new.task.formula), new.regions).keeps(whole[None])[0])
-        return what, "kept" if kept else "BROKEN"
+        return what, how + ("kept" if kept else "BROKEN")
+
+
+def drive(session: Session, pose: Floats, random: np.random.Generator) -> list[Floats]:
+    """The poses from x_t until the rule is decided."""
+    driven = [pose]
+    while session.spec_status == "pending":
+        decision = session.step(pose, random.normal(0.0, 2.0, len(session.info.actions)))
+        pose = np.array(decision.next_poses[decision.execute])
+        driven.append(pose)
+    return driven
+
+
+def relaxed(world: World, conjuncts: Sequence[Mapping[str, Any]]) -> World | None:
+    """The world with the later end of one window that a refusal names as enough; None where it names none."""
+    if len(conjuncts) != len(world.parts) or not all(each["feasible_alone"] for each in conjuncts):
+        return None
+    late = [(each["late_by"], i) for i, each in enumerate(conjuncts) if each["late_by"] is not None]
+    if not late:
+        return None
+    steps, i = min(late)
+    part, parts = world.parts[i], list(world.parts)
+    dwells = part.kind == "FG"
+    parts[i] = replace(part, c1=part.c1 + steps) if dwells else replace(part, b=part.b + steps)
+    formula = " and ".join(part.text for part in parts)
+    task = make_task(world.task.grid, world.task.robot, formula, world.regions)
+    return replace(world, parts=parts, task=task)
 
 
 def main() -> None:
@@ -172,7 +206,9 @@ def main() -> None:
     with own_server() as url, ShieldClient(url, timeout=30.0) as client:
         service = Service(client)
         for number in range(args.switches):
-            found[one(service, number, args.seed)] += 1
+            what, how = one(service, number, args.seed)
+            found[what, how] += 1
+            print(f"{number}: {what}, {how}", file=sys.stderr)
     print(f"{args.switches} switches, seed {args.seed}\n")
     print("| | " + " | ".join(WHAT) + " | all |\n|---|" + "--:|" * 4)
     for how in sorted({how for _, how in found}):

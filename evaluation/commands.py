@@ -54,6 +54,17 @@ def evaluate(
     raise typer.Exit(status)
 
 
+def mujoco(
+    case: Annotated[str, typer.Option(help="Cases, as 1,2,drawn_3.")] = "1,2,drawn_3",
+    runs: Annotated[int, typer.Option(help="Runs of each case.", min=1)] = 20,
+    seed: Annotated[int, typer.Option(help="Decides starts, model, draws and wheels.", min=0)] = 0,
+) -> None:
+    """Drive a wheeled base in MuJoCo, of the extra `mujoco`: its residuals, and what is kept."""
+    from evaluation.worlds import physical
+
+    typer.echo(physical.report(physical.named_cases(case), runs, seed))
+
+
 def report(
     results: Annotated[Path, typer.Argument(help="Folder that evaluate has kept results in.")],
     out: Annotated[Path, typer.Option(help="The page to write; figures go into a folder beside it.")] = Path(

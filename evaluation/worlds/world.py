@@ -72,6 +72,11 @@ def look(body: Body, pose: Pose) -> tuple[Floats, Floats]:
     """What a scanner at the robot's origin sees: points [n, 2] that are occupied, and that are free."""
     ranges = np.empty(RAYS)
     _scan(body, *pose, ranges)
+    return points_of(pose, ranges)
+
+
+def points_of(pose: Pose, ranges: Floats) -> tuple[Floats, Floats]:
+    """The points [n, 2] that ranges (RAYS,) show: what is occupied, and what is free before it."""
     angles = pose[2] + np.linspace(-SCAN / 2, SCAN / 2, RAYS)
     towards = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     hit = ranges < REACH

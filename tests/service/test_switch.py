@@ -245,7 +245,7 @@ def test_the_sdk_switches_awaiting(server, client, begin):
 
 
 def test_what_the_map_has_learned_goes_on_with_its_age(server, client, begin, step, switch, capsys, tmp_path):
-    """A point that is remembered for 4 steps was seen at step 1: it still counts at step 5, by either clock."""
+    """A point that is remembered for 4 steps was seen at step 1: it counts to step 5, by either clock."""
     for clock in ("restart", "keep"):
         session, poses = begin(map_memory=4, learn_map=False), ahead(9)
         for t in range(7):

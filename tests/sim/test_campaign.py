@@ -8,7 +8,6 @@ import pytest
 from PIL import Image, ImageColor
 
 from specshield.client import ShieldClient
-from specshield.drawing import colors
 from specshield.sim import canvas, picture, report
 from specshield.sim.campaign import run
 from specshield.stl import parse
@@ -113,7 +112,7 @@ def test_the_picture_shows_both_ways(campaign, case, tmp_path):
 
 
 def color(name):
-    return ImageColor.getrgb(getattr(colors, name))
+    return ImageColor.getrgb(getattr(canvas, name))
 
 
 @pytest.mark.parametrize(
@@ -127,4 +126,4 @@ def color(name):
     ],
 )
 def test_names_below_an_odd_number_of_negations_are_to_be_avoided(formula, names):
-    assert colors.avoided(parse(formula)) == names
+    assert canvas.avoided(parse(formula)) == names

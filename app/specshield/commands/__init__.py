@@ -1,1 +1,0 @@
-"""The commands of `specshield` that have a module of their own."""

@@ -1,1 +1,0 @@
-"""Floor plans as pictures: the colours that all of them share, and SVG."""

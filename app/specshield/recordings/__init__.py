@@ -1,1 +1,0 @@
-"""Sessions as files that other tools open, and drives of others judged by a rule."""
