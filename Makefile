@@ -24,7 +24,7 @@ install: .venv/.dev
 	touch $@ .venv/.server
 
 demo: .venv/.server
-	$(BIN)/specshield demo
+	$(BIN)/specshield demo $(ARGS)
 
 run: .venv/.server
 	$(BIN)/specshield serve
@@ -37,8 +37,8 @@ wheel-check: .venv/bin/python
 	$(BIN)/python .ci/wheel.py
 
 lint: .venv/.dev
-	$(BIN)/ruff check app evaluation tests benchmarks examples
-	$(BIN)/ruff format --check app evaluation tests benchmarks examples
+	$(BIN)/ruff check app evaluation tests benchmarks examples ros2
+	$(BIN)/ruff format --check app evaluation tests benchmarks examples ros2
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m benchmarks.lines

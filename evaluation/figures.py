@@ -15,7 +15,8 @@ from PIL import Image
 from evaluation.experiment import METHODS, split
 from evaluation.runs import Record
 from evaluation.statistics import MODES
-from specshield.sim.canvas import AVOID, BLUE, FAINT, GREY, INK, ORANGE, PAPER, TARGET, VISIT, Canvas
+from specshield.drawing.colors import AVOID, BLUE, FAINT, GREY, INK, ORANGE, PAPER, TARGET, VISIT
+from specshield.sim.canvas import Canvas
 from specshield.sim.cases import Case
 from specshield.stl import robustness
 

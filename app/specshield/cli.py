@@ -72,7 +72,10 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
 
 def _commands() -> Iterator[Callable[..., None]]:
     """The commands below, and those that other packages register as entry points."""
-    yield from (serve, demo, train, worker, verify, openapi)
+    from specshield.commands.check_drive import check_drive
+    from specshield.commands.export import export
+
+    yield from (serve, demo, train, worker, verify, openapi, export, check_drive)
     yield _keys()
     for registered in entry_points(group="specshield.commands"):
         yield registered.load()
@@ -185,11 +188,12 @@ def demo(
     runs: Annotated[int, typer.Option(help="Episodes a case.", min=1)] = 20,
     seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out"),
+    stay: Annotated[bool, typer.Option("--open", help="Leave the service up, and its page.")] = False,
 ) -> None:
     """The paper's two cases with and without the shield: a table, and a picture of each."""
     from specshield.sim.demo import run_demo
 
-    raise typer.Exit(run_demo(runs, seed, out))
+    raise typer.Exit(run_demo(runs, seed, out, stay))
 
 
 def train(

@@ -26,6 +26,7 @@ SpecshieldError
 │   ├── StepConflict            a step already decided, sent again with other content
 │   ├── SessionFinished         a step after the end
 │   ├── SessionExists           a session id already taken
+│   ├── NameTaken               a name that another map or policy has
 │   └── InUse                   a policy that sessions still use
 ├── Unauthorized                a missing or wrong API key
 ├── CrossSite                   a request that a page of another origin made
@@ -193,6 +194,10 @@ class SessionFinished(Conflict):
 
 class SessionExists(Conflict):
     type = "session-exists"
+
+
+class NameTaken(Conflict):
+    type = "name-taken"
 
 
 class InUse(Conflict):

@@ -43,7 +43,7 @@ def test_a_server_decides_the_same_to_the_bit(server: RunningServer, settings: d
     with ShieldClient(server.url, timeout=30.0) as client:
         remote = client.sessions.create(policy_id="case1", **options)
         local = LocalShield.shipped("case1").session(**options)
-        assert replace(remote.info, id="", expires_at="", map_id="", spec={}) == replace(
+        assert replace(remote.info, id="", expires_at="", map_id="", spec={}, rules=()) == replace(
             local.info, id="", expires_at="", map_id="", spec={}
         )
         pose = START

@@ -68,9 +68,12 @@ ORDER = [  # the way the description says: each example is sent as it stands
     ("get", "/v1/maps/{map_id}", 200),
     ("get", "/v1/maps/{map_id}/image.png", 200),
     ("delete", "/v1/maps/{map_id}", 409),  # it came with the server
+    ("get", "/v1/robots", 200),
+    ("get", "/v1/robots/{name}", 200),
     ("post", "/v1/policies", 503),  # no worker here; with one it is 202
     ("get", "/v1/policies", 200),
     ("get", "/v1/policies/{policy_id}", 200),
+    ("get", "/v1/policies/{policy_id}/image.svg", 200),
     ("delete", "/v1/policies/{policy_id}", 409),  # it came with the server
     ("post", "/v1/sessions", 201),
     ("get", "/v1/sessions", 200),
@@ -81,6 +84,8 @@ ORDER = [  # the way the description says: each example is sent as it stands
     ("get", "/v1/sessions/{session_id}/trajectory", 200),
     ("get", "/v1/sessions/{session_id}/record", 200),
     ("get", "/v1/sessions/{session_id}/events", 204),  # it is over: nothing follows
+    ("get", "/v1/sessions/{session_id}/image.svg", 200),
+    ("get", "/v1/events", 200),
     ("delete", "/v1/sessions/{session_id}", 204),
     ("get", "/livez", 200),
     ("get", "/readyz", 200),
@@ -94,7 +99,8 @@ def test_the_examples_work_as_they_stand(server, description):
         for method, path, status in ORDER:
             operation = description["paths"][path][method]
             filled = path.format(**examples_of(operation))
-            response = client.request(method, filled, json=body_of(operation, description))
+            asked = examples_of(operation, "query")
+            response = client.request(method, filled, params=asked, json=body_of(operation, description))
             assert response.status_code == status, (method, path, response.text)
             if status == 200 and response.headers["content-type"] == "application/json":
                 documented = operation["responses"]["200"]["content"]["application/json"]["schema"]["$ref"]
@@ -102,12 +108,12 @@ def test_the_examples_work_as_they_stand(server, description):
                 assert set(response.json()) <= set(fields)
 
 
-def examples_of(operation):
-    """Of the parameters in the path."""
+def examples_of(operation, place="path"):
+    """Of the parameters in the path, or of those of a query that have some."""
     return {
         parameter["name"]: next(iter(parameter["examples"].values()))["value"]
         for parameter in operation.get("parameters", [])
-        if parameter["in"] == "path"
+        if parameter["in"] == place and (place == "path" or "examples" in parameter)
     }
 
 

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image, ImageColor
 
 from specshield.client import ShieldClient
+from specshield.drawing import colors
 from specshield.sim import canvas, picture, report
 from specshield.sim.campaign import run
 from specshield.stl import parse
@@ -112,7 +113,7 @@ def test_the_picture_shows_both_ways(campaign, case, tmp_path):
 
 
 def color(name):
-    return ImageColor.getrgb(getattr(canvas, name))
+    return ImageColor.getrgb(getattr(colors, name))
 
 
 @pytest.mark.parametrize(
@@ -126,4 +127,4 @@ def color(name):
     ],
 )
 def test_names_below_an_odd_number_of_negations_are_to_be_avoided(formula, names):
-    assert canvas.avoided(parse(formula)) == names
+    assert colors.avoided(parse(formula)) == names

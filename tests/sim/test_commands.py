@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import httpx
 import pytest
 
 from specshield.policy.methods import load_policy
@@ -52,6 +54,27 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     assert done.stdout.count("1 of 1") >= 4
     assert sorted(path.name for path in tmp_path.iterdir()) == ["case1.png", "case2.png"]
     assert "starting the service" in done.stderr
+    assert re.search(
+        r"page of both: http://127\.0\.0\.1:\d+/#/floor\?sessions=[\w.-]+,[\w.-]+\n", done.stdout
+    )
+
+
+def test_demo_leaves_its_page_up_when_asked(tmp_path):
+    command = [*SPECSHIELD, "demo", "--runs", "1", "--seed", "4", "--open", "--out", str(tmp_path)]
+    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        page = next(line for line in running.stdout if line.startswith("page of both")).split(": ", 1)[1]
+        url, _, ids = page.strip().partition("/#/floor?sessions=")
+        told = [httpx.get(f"{url}/v1/sessions/{id}/trajectory").json()["items"] for id in ids.split(",")]
+        assert all(told)
+        assert told[0][0]["pose"] == told[1][0]["pose"], "from the same start, with the shield and without"
+        assert told[0][0]["decision"] is not None
+        assert told[1][0]["decision"] is None
+        assert "specshield" in httpx.get(url).text
+        running.send_signal(signal.SIGINT)
+        assert running.wait(60) == 0
+    finally:
+        running.kill()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

@@ -27,7 +27,7 @@ from specshield.robot.dynamics import wrap
 from specshield.shield import decision as core
 from specshield.shield import episode
 from specshield.shield.decision import Carry, Shield
-from specshield.task import check_signals
+from specshield.task import Task, check_signals
 
 OWN = ("execute", "timings", "source", "action_names")  # what the SDK adds to the answer of the contract
 ASKED = ("witnesses", "explanations")  # what an answer has where it was asked for
@@ -50,6 +50,11 @@ class LocalSession:
     @property
     def id(self) -> str:
         return self.info.id
+
+    @property
+    def task(self) -> Task:
+        """The map, the robot and the rule."""
+        return self._shield.task
 
     def __enter__(self) -> LocalSession:
         return self

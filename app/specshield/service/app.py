@@ -17,7 +17,7 @@ from fastapi_offline import FastAPIOffline
 
 from specshield import __version__
 from specshield.errors import SpecshieldError, StoreError
-from specshield.service import problems
+from specshield.service import pages, problems
 from specshield.service.access.keys import Keys
 from specshield.service.bounds import body
 from specshield.service.bounds.bodies import Bodies
@@ -27,7 +27,7 @@ from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.middleware import Guard, Observe, guarded
-from specshield.service.routes import events, maps, policies, sessions, specs, system
+from specshield.service.routes import events, maps, pictures, policies, robots, sessions, specs, system
 from specshield.service.routes.steps import StepRoute
 from specshield.service.routes.stream import StreamRoute
 from specshield.service.schemas.base import Problem
@@ -60,6 +60,7 @@ order: check a formula, send a map, begin a session, decide a step, close, read 
 TAGS = [
     {"name": "specifications", "description": "Formulas of Signal Temporal Logic."},
     {"name": "maps", "description": "Occupancy grids with named areas."},
+    {"name": "robots", "description": "What the robots that came with the server can do."},
     {"name": "policies", "description": "What certifies that an action still has a satisfying future."},
     {"name": "sessions", "description": "Episodes: one robot, one specification, one decision a step."},
     {"name": "system", "description": "Life, readiness, metrics."},
@@ -91,8 +92,9 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
         generate_unique_id_function=lambda route: "_".join([*map(str, route.tags), route.name]),
         swagger_ui_parameters={"defaultModelsExpandDepth": 0, "tryItOutEnabled": True},
     )
-    for module in (specs, maps, policies, sessions, events, system):
+    for module in (pages, specs, maps, robots, policies, sessions, pictures, events, system):
         app.include_router(module.router)
+    app.include_router(events.overview)
     problems.install(app)
     app.add_middleware(StepRoute)  # the innermost
     app.add_middleware(StreamRoute, max_message=settings.max_body_bytes)

@@ -10,6 +10,7 @@ from fastapi import Depends, Query, Request
 from specshield.service.access.keys import Keys
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library.claims import Claims
+from specshield.service.library.files import Recent
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions.sessions import Sessions
@@ -21,6 +22,8 @@ from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
+
+PICTURES = 32  # kept in memory, of 5 to 500 kB each
 
 
 @dataclass
@@ -40,6 +43,7 @@ class Server:
     heavy: Heavy
     keys: Keys
     claims: Claims
+    pictures: Recent[bytes] = field(default_factory=lambda: Recent[bytes](PICTURES))  # of policies, by id
     streams: Streams = field(default_factory=Streams)
 
 

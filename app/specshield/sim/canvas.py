@@ -1,4 +1,4 @@
-"""A floor plan to draw on, with Pillow: the palette, walls, regions, ways, marks and text.
+"""A floor plan to draw on, with Pillow: walls, regions, ways, marks and text.
 
 Points are in metres of the map frame, sizes in pixels of the finished picture. Everything is drawn FINE times
 as large and reduced at the end, which smooths the edges.
@@ -12,16 +12,11 @@ import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from specshield.arrays import Bools, Singles
+from specshield.drawing.colors import AVOID, GREY, INK, PAPER, TINT, VISIT, WALL, is_avoided
 from specshield.sim.robot import Pose
-from specshield.stl import BODY_WORDS, Formula, Implies, Not, body_name
 from specshield.task import Task
 from specshield.world.regions import signed_distance
 
-PAPER, WALL, INK, FAINT = "#faf9f6", "#343840", "#282b32", "#9ea0a5"
-VISIT, AVOID = "#2b8a5a", "#c63c3c"  # regions
-TARGET = "#f6be28"  # what the model looks for
-BLUE, ORANGE, GREY = "#2563c8", "#e27d22", "#b4b4b4"  # ways; grey: after the rule's horizon
-TINT = 0.16  # opacity of a region
 FINE = 3
 BORDER = 14
 
@@ -52,9 +47,8 @@ class Canvas:
 
     def regions(self, size: float) -> None:
         """Every region of the task with its name in letters of `size` below it."""
-        bad = avoided(self.task.formula)
         for name, region in self.task.regions.items():
-            color = AVOID if bad & {name, *(body_name(how, name) for how in BODY_WORDS)} else VISIT
+            color = AVOID if is_avoided(self.task.formula, name) else VISIT
             coarse = signed_distance(region, self._points).astype(np.float32)
             depth = self._refined(coarse, Image.Resampling.BILINEAR)
             self._paint(depth > 0.0, color, TINT)
@@ -129,15 +123,3 @@ class Canvas:
         mask = Image.fromarray((where * round(255 * opacity)).astype(np.uint8))
         place = BORDER * FINE, (BORDER + self._above) * FINE
         self._image.paste(ImageColor.getrgb(color), place, mask)
-
-
-def avoided(formula: Formula, negated: bool = False) -> set[str]:
-    """The names that the formula asks not to hold: those below an odd number of negations."""
-    if isinstance(formula, Not):
-        return avoided(formula.child, not negated)
-    if isinstance(formula, Implies):
-        return avoided(formula.left, not negated) | avoided(formula.right, negated)
-    below = [part for part in formula.parts if isinstance(part, Formula)]
-    if not below:
-        return set(formula.names) if negated else set()
-    return set().union(*(avoided(part, negated) for part in below))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from specshield.client import ShieldClient
@@ -16,32 +19,50 @@ from specshield.sim.service import own_server
 PATIENCE = 10.0  # [s] for one decision: other work may share the machine
 
 
-def run_demo(runs: int, seed: int, out: Path) -> int:
+def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
     """Runs every case with and without the shield, and writes the pictures into the folder `out`.
 
-    Returns the exit status: 1 if an episode with the shield broke its rule.
+    stay: whether the service stays up, with its page, until it is interrupted. Returns the exit status: 1 if
+    an episode with the shield broke its rule.
     """
     began, status = time.monotonic(), StatusLine()
     status.say("starting the service ...")
-    with own_server(say=status.say) as url, ShieldClient(url, timeout=PATIENCE) as client:
-        campaigns = [_campaign(client, load_case(name), runs, seed, status) for name in case_names()]
-    for campaign in campaigns:
-        first, beside = campaign.shielded[0], campaign.unshielded[0]
-        picture.draw(campaign.case, first, beside, out / f"{campaign.case.name}.png")
-    status.clear()
+    with own_server(say=status.say) as url:
+        with ShieldClient(url, timeout=PATIENCE) as client:
+            campaigns = [_campaign(client, load_case(name), runs, seed, status) for name in case_names()]
+        status.clear()
+        _tell(campaigns, runs, seed, out)
+        print(f"{time.monotonic() - began:.0f} s")
+        for campaign in campaigns:
+            print(f"page of both: {_page(url, campaign)}")
+        if stay:
+            print("The service stays up for it; Ctrl-C ends both.", flush=True)
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.pause()
+        else:
+            print("The service has ended with the demo. To see the page: make demo ARGS=--open")
+    broken = [episode for campaign in campaigns for episode in campaign.broken]
+    for episode in broken:
+        where = f"{episode.case} from {episode.start}, seed {episode.seed}"
+        print(f"BROKEN: {where}: {episode.spec_status}", file=sys.stderr)
+    return 1 if broken else 0
+
+
+def _tell(campaigns: Sequence[Campaign], runs: int, seed: int, out: Path) -> None:
     print(f"{runs} episodes a case, seed {seed}, over HTTP\n")
     for campaign in campaigns:
         case = campaign.case
         print(f'{case.name}  {case.task.formula}\n       model: "{case.instruction}"')
     print(f"\n{report.table(campaigns)}\n")
     for campaign in campaigns:
-        print(f"picture: {out / campaign.case.name}.png")
-    print(f"{time.monotonic() - began:.0f} s")
-    broken = [episode for campaign in campaigns for episode in campaign.broken]
-    for episode in broken:
-        where = f"{episode.case} from {episode.start}, seed {episode.seed}"
-        print(f"BROKEN: {where}: {episode.spec_status}", file=sys.stderr)
-    return 1 if broken else 0
+        path = out / f"{campaign.case.name}.png"
+        picture.draw(campaign.case, campaign.shielded[0], campaign.unshielded[0], path)
+        print(f"picture: {path}")
+
+
+def _page(url: str, campaign: Campaign) -> str:
+    """Where the case's first episode is seen, with the shield and without it, on one floor."""
+    return f"{url}/#/floor?sessions={campaign.shielded[0].session},{campaign.unshielded[0].session}"
 
 
 def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: StatusLine) -> Campaign:

@@ -25,7 +25,7 @@ class Episode:
     None if never. modes: decisions by mode. asked: decisions made while the rule was pending and the main
     task ran; spread: how many of them were `shaped` and left the model more than one action. kl: of each
     decision from the model's own distribution [nats]. round_trip_ms, server_ms: of each decision.
-    poses: x_0 ... x_t.
+    poses: x_0 ... x_t. session: the id of the session that holds them.
     """
 
     case: str
@@ -43,6 +43,7 @@ class Episode:
     round_trip_ms: list[float] = field(default_factory=list)
     server_ms: list[float] = field(default_factory=list)
     poses: list[Pose] = field(default_factory=list)
+    session: str = ""
 
     def judged(self, verdict: Verdict) -> Episode:
         self.spec_status, self.robustness = verdict.spec_status, verdict.robustness_bounds
@@ -68,6 +69,7 @@ class Episode:
 def with_shield(session: Session, case: Case, model: FoundationModel, start: Pose, seed: int) -> Episode:
     """The model proposes, the service decides, the robot executes; `session` has just begun at `start`."""
     episode, robot = Episode(case.name, seed, True, start), SimulatedRobot(case, start)
+    episode.session = session.id
     model.reset(np.random.default_rng([seed, 0]))
     with session:
         while not session.finished:
@@ -106,6 +108,7 @@ def without_shield(
     still = case.task.horizon + 1 - len(episode.poses)
     episode.poses += [robot.pose] * max(still, 0)
     session = client.sessions.create(policy_id=case.name, initial_pose=start, allow_infeasible=True)
+    episode.session = session.id
     for pose in episode.poses[:-1]:
         session.record(pose)
     return episode.judged(session.close(episode.poses[-1]))

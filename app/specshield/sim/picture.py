@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from specshield.drawing import colors
 from specshield.sim import canvas
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode
@@ -16,7 +17,7 @@ from specshield.world.regions import signed_distance
 
 SCALE = 110  # pixels a metre
 LEGEND = 86  # pixels
-SHIELDED, UNSHIELDED = canvas.BLUE, canvas.ORANGE
+SHIELDED, UNSHIELDED = colors.BLUE, colors.ORANGE
 
 
 def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None:
@@ -30,10 +31,10 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
     plan.way(unshielded.poses, UNSHIELDED, 2.2)
     plan.way(shielded.poses, SHIELDED, 3.0)
     for t, pose in _visits(case, shielded.poses):
-        plan.dot(pose, 5.0, SHIELDED, canvas.PAPER)
+        plan.dot(pose, 5.0, SHIELDED, colors.PAPER)
         plan.text(pose, f"t={t}", 12, SHIELDED, shift=(9, -9), anchor="ls")
     plan.start(shielded.start)
-    plan.dot(case.target, 8.0, canvas.TARGET, canvas.INK)
+    plan.dot(case.target, 8.0, colors.TARGET, colors.INK)
     plan.text(case.target, case.instruction.split()[-1], 14, shift=(0, 12), anchor="mt")
     _legend(plan, case, shielded, unshielded)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +49,7 @@ def _rooms(plan: canvas.Canvas, case: Case) -> None:
     for name, room in case.rooms.items():
         roomy = np.minimum(signed_distance(room, grid.centres), grid.clearance)
         free = np.where(np.any(taken, axis=0), -1.0, roomy)
-        plan.text(grid.centres[np.unravel_index(np.argmax(free), free.shape)], name, 13, canvas.FAINT)
+        plan.text(grid.centres[np.unravel_index(np.argmax(free), free.shape)], name, 13, colors.FAINT)
 
 
 def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
@@ -67,7 +68,7 @@ def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
 def _legend(plan: canvas.Canvas, case: Case, shielded: Episode, unshielded: Episode) -> None:
     """Below the map; what is said of a way or of regions has their colour."""
 
-    def write(right: float, down: float, said: str, size: float = 14, color: str = canvas.INK) -> None:
+    def write(right: float, down: float, said: str, size: float = 14, color: str = colors.INK) -> None:
         plan.text(plan.bottom, said, size, color, (right, canvas.BORDER + down), anchor="lt")
 
     def outcome(episode: Episode) -> str:
@@ -77,8 +78,8 @@ def _legend(plan: canvas.Canvas, case: Case, shielded: Episode, unshielded: Epis
     write(0, 0, str(case.task.formula), 15)
     write(0, 26, f"with the shield: {outcome(shielded)}", color=SHIELDED)
     write(0, 50, f"without: {outcome(unshielded)}", color=UNSHIELDED)
-    write(560, 26, "to visit", color=canvas.VISIT)
-    if canvas.avoided(case.task.formula):
-        write(640, 26, "to avoid", color=canvas.AVOID)
-    write(730, 26, f"after t={case.task.horizon}, the rule's last", color=canvas.GREY)
+    write(560, 26, "to visit", color=colors.VISIT)
+    if colors.avoided(case.task.formula):
+        write(640, 26, "to avoid", color=colors.AVOID)
+    write(730, 26, f"after t={case.task.horizon}, the rule's last", color=colors.GREY)
     write(560, 50, f'"{case.instruction}"')

@@ -36,14 +36,16 @@ class Heavy:
         )  # fmt: skip
 
     async def run(self, request: Request, function: str, *arguments: Any) -> Any:
-        """What a function of heavy/uploads.py returns, its first argument the settings; see `Pool.run`.
+        """What a function of heavy/uploads.py returns, or "pictures:function" of the module beside it. Its
+        first argument is the settings. See `Pool.run`.
 
         Raises ClientGone, and ends the work, when the caller closes its connection.
         """
         owner = str(request.scope["state"].get("owner", ""))
+        module, _, name = function.rpartition(":")
         work = asyncio.ensure_future(
             self.tasks.run(
-                f"specshield.service.heavy.uploads:{function}", self._settings, *arguments,
+                f"specshield.service.heavy.{module or 'uploads'}:{name}", self._settings, *arguments,
                 seconds=self._settings.heavy_timeout, owner=owner,
             )
         )  # fmt: skip

@@ -6,7 +6,9 @@ Every function takes the settings first, and gives what the server needs for its
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +19,8 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import create_form_parser
 
 from specshield import stl
+from specshield.drawing.colors import avoided
+from specshield.drawing.windows import windows
 from specshield.errors import BodyTooLarge, FormulaError, FragmentError, InputError, PolicyError
 from specshield.policy.methods import METHODS
 from specshield.policy.options import options_to_json, read_options
@@ -25,6 +29,7 @@ from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Description, Policies, Record, describe
 from specshield.service.problems import from_validation
+from specshield.service.schemas.base import ID
 from specshield.service.schemas.policies import Card, PolicyRequest
 from specshield.service.schemas.specs import SpecRequest
 from specshield.service.settings import Settings
@@ -39,6 +44,7 @@ Content = bytes | Path  # a body, or the file that it is in
 FILES = "map_server"  # the format of a map sent as files that do not say which it is
 PARTS = {"weights": "policy.safetensors", "card": "card.json"}
 MOST_PARTS = 16  # of a multipart body
+MOST_WINDOWS = 100  # shown of a formula
 REQUEST = TypeAdapter(PolicyRequest)
 CARD = TypeAdapter(Card)
 SPEC = TypeAdapter(SpecRequest)
@@ -67,11 +73,21 @@ def add_map(settings: Settings, content_type: str, content: Content, key: Key) -
     if is_multipart(content_type):
         members: dict[str, Any] = dict(_parts(content_type, content))
         name = members.pop("format", FILES.encode()).decode(errors="replace")
+        named = members.pop("name", b"").decode(errors="replace") or None
         made = read_map(name, members, files=True)
     else:
         members = _object(_bytes(content))
+        named = members.pop("name", None)
         made = read_map(members.pop("format", None), members)
-    return _maps(settings).add(*made, key).to_json()
+    return _maps(settings).add(*made, key, _named(named)).to_json()
+
+
+def _named(name: Any) -> str | None:
+    """The name that an upload asks for. Raises InputError for one that cannot be an id."""
+    if name is not None and not (isinstance(name, str) and re.fullmatch(ID, name)):
+        expected = "1 to 64 letters, digits, '_', '.' or '-', the first a letter or digit"
+        raise InputError("this is no name", path="name", got=name, expected=expected)
+    return name
 
 
 def draw_map(settings: Settings, key: str, owner: str) -> bytes:
@@ -81,6 +97,7 @@ def draw_map(settings: Settings, key: str, owner: str) -> bytes:
 def add_policy(settings: Settings, content_type: str, content: Content, key: Key) -> Record:
     """Keeps a policy that was made elsewhere."""
     files = _parts(content_type, content)
+    name = _named(files.pop("name").decode(errors="replace")) if "name" in files else None
     if files.keys() != PARTS.keys():
         expected = " and ".join(PARTS)
         raise InputError("these are not a policy's parts", path="body", got=sorted(files), expected=expected)
@@ -91,7 +108,8 @@ def add_policy(settings: Settings, content_type: str, content: Content, key: Key
     for path, number in _numbers(card, "card"):
         if not math.isfinite(number):
             raise PolicyError("not a finite number", path=path, got=number, expected="a finite number")
-    return policies_of(settings).add_card(describe(card), card, files["weights"], key)
+    policies = policies_of(settings)
+    return policies.add_card(describe(card), card, files["weights"], key, name)
 
 
 def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
@@ -106,8 +124,8 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
             yield from _numbers(item, f"{path}[{i}]")
 
 
-def check_policy(settings: Settings, content: Content, owner: str) -> Record:
-    """What is asked for, once it is checked; nothing is kept."""
+def check_policy(settings: Settings, content: Content, owner: str) -> tuple[Record, str | None]:
+    """What is asked for, once it is checked, and what it is to be called; nothing is kept."""
     body = parse(REQUEST, _bytes(content)).model_dump(exclude_unset=True)
     asked = PolicyRequest(**body)
     method = METHODS.get(asked.method)
@@ -121,7 +139,10 @@ def check_policy(settings: Settings, content: Content, owner: str) -> Record:
         method.check(task, options)
     except FragmentError as error:
         raise (error if error.path == "robot" else error.at("spec.formula")) from None
-    return policies.described(about, task)
+    record = policies.described(about, task)
+    if asked.name is not None:
+        policies.check_name(record, owner, asked.name)
+    return record, asked.name
 
 
 def check_spec(settings: Settings, content: bytes, owner: str) -> dict[str, Any]:
@@ -141,7 +162,13 @@ def explain(maps: Maps, settings: Settings, content: bytes, owner: str) -> dict[
         formula = stl.parse(request.formula, names=names, max_horizon=settings.max_horizon)
     except FormulaError as error:
         raise error.at("formula") from None
-    return {"formula": str(formula), "horizon": formula.horizon, "names": list(formula.names)}
+    return {
+        "formula": str(formula),
+        "horizon": formula.horizon,
+        "names": list(formula.names),
+        "windows": [asdict(window) for window in windows(formula)][:MOST_WINDOWS],
+        "avoided": sorted(avoided(formula)),
+    }
 
 
 def is_multipart(content_type: str) -> bool:

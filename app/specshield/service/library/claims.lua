@@ -1,9 +1,10 @@
 -- Whose the maps and policies are: ids on the disk, claimed by owners. All keys are of one slot.
 -- KEYS: 1 what the owner claims of this kind {id: bytes}; 2 the owners of this id; 3 sums {o:owner | all: bytes,
 -- kind: how many}; 4 the mark of an id that is being deleted; 5 the owner's policies on the map concerned
--- (this id, if it is a map); for a policy also 6 what the owner claims of maps; 7 the mark of its map.
+-- (this id, if it is a map); for a policy also 6 what the owner claims of maps; 7 the mark of its map;
+-- 8 the owner's names of this kind {name: id}; 9 the same the other way round {id: name}.
 -- ARGV: 1 what to do, 2 kind, 3 id, 4 owner, 5 token of a deletion, and for a claim 6 bytes, 7 most ids,
--- 8 most bytes of an owner, 9 most bytes of all, 10 the map's id ('' where it is everybody's).
+-- 8 most bytes of an owner, 9 most bytes of all, 10 the map's id ('' where it is everybody's); for a name 6 the name.
 local what, kind, id, owner, token = ARGV[1], ARGV[2], ARGV[3], ARGV[4], ARGV[5]
 local mine, held = 'o:' .. owner, tonumber(redis.call('HGET', KEYS[1], id))
 
@@ -32,6 +33,16 @@ if what == 'claim' then
   return 'made'
 end
 
+if what == 'name' then
+  local bearer, former = redis.call('HGET', KEYS[8], ARGV[6]), redis.call('HGET', KEYS[9], id)
+  if not held then return 'none' end
+  if bearer and bearer ~= id then return bearer end
+  if former and former ~= ARGV[6] then redis.call('HDEL', KEYS[8], former) end
+  redis.call('HSET', KEYS[8], ARGV[6], id)
+  redis.call('HSET', KEYS[9], id, ARGV[6])
+  return 'named'
+end
+
 if what == 'mark' then
   if not held then return 'none' end
   if kind == 'maps' then
@@ -47,6 +58,11 @@ if what == 'free' then -- the mark of a last claim stays until the files are gon
   redis.call('SREM', KEYS[2], owner)
   redis.call('HINCRBY', KEYS[3], mine, -held)
   if kind == 'policies' then redis.call('SREM', KEYS[5], id) end
+  local name = redis.call('HGET', KEYS[9], id)
+  if name then
+    redis.call('HDEL', KEYS[8], name)
+    redis.call('HDEL', KEYS[9], id)
+  end
   if redis.call('SCARD', KEYS[2]) > 0 then
     redis.call('DEL', KEYS[4])
     return 'shared'

@@ -10,13 +10,21 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from specshield.errors import Conflict, InsufficientStorage, LimitReached, NotFound, StoreError
+from specshield.errors import (
+    Conflict,
+    InputError,
+    InsufficientStorage,
+    LimitReached,
+    NameTaken,
+    NotFound,
+    StoreError,
+)
 from specshield.service.access.keys import Key
 from specshield.service.library import files
 from specshield.service.settings import Settings
@@ -58,6 +66,41 @@ class Claims:
                 return False
             time.sleep(WAIT)
         return self.holds(kind, id, owner)
+
+    def named(self, kind: str, name: str, owner: str) -> str | None:
+        """The id of what this owner calls by that name."""
+        found = _reached(lambda: self._store.hget(_names(kind, owner), name))
+        return None if found is None else str(found.decode())
+
+    def name_of(self, kind: str, id: str, owner: str) -> str | None:
+        found = _reached(lambda: self._store.hget(_named(kind, owner), id))
+        return None if found is None else str(found.decode())
+
+    def names(self, kind: str, owner: str) -> dict[str, str]:
+        """{id: name} of everything that this owner has named."""
+        found = _reached(lambda: self._store.hgetall(_named(kind, owner)))
+        return {id.decode(): name.decode() for id, name in found.items()}
+
+    def check_name(self, kind: str, name: str, id: str, owner: str, shipped: Mapping[str, str]) -> None:
+        """Raises NameTaken where something else than `id` has the name, and InputError for one that nothing
+        can have. shipped: {name: id} of what came with the server.
+        """
+        if files.HASH.fullmatch(name) or (id in shipped.values() and shipped.get(name) != id):
+            raise InputError(
+                "this cannot be named so", path="name", got=name,
+                expected="a name that does not look like an id, for what did not come with the server",
+            )  # fmt: skip
+        bearer = shipped.get(name) or self.named(kind, name, owner)
+        if bearer not in (None, id):
+            raise taken(name, str(bearer))
+
+    def name(self, kind: str, id: str, owner: str, name: str) -> None:
+        """Names what an owner has; a former name of it is free again. Raises NameTaken and NotFound."""
+        said = self._run("name", kind, id, owner, "", name)
+        if said == "none":
+            raise NotFound(f"there is no {id!r} to name", path="name", got=name)
+        if said != "named":
+            raise taken(name, said)
 
     @contextmanager
     def adding(self, kind: str, id: str, key: Key, size: int, map_id: str = "") -> Iterator[None]:
@@ -147,7 +190,7 @@ class Claims:
     ) -> str:
         about = id if kind == "maps" else (more[-1] if what == "claim" else map_id)
         keys = [_owned(kind, owner), _owners(kind, id), SUMS, _mark(kind, id), _uses(about, owner)]
-        keys += [_owned("maps", owner), _mark("maps", about)]
+        keys += [_owned("maps", owner), _mark("maps", about), _names(kind, owner), _named(kind, owner)]
         said = _reached(lambda: self._script(keys=keys, args=[what, kind, id, owner, token, *more]))
         return str(said.decode())
 
@@ -169,6 +212,20 @@ def _mark(kind: str, id: str) -> str:
 
 def _uses(map_id: str, owner: str) -> str:
     return f"specshield:{{library}}:uses:{map_id}:{owner}"
+
+
+def _names(kind: str, owner: str) -> str:
+    return f"specshield:{{library}}:names:{kind}:{owner}"
+
+
+def _named(kind: str, owner: str) -> str:
+    return f"specshield:{{library}}:named:{kind}:{owner}"
+
+
+def taken(name: str, id: str) -> NameTaken:
+    return NameTaken(
+        f"the name {name!r} is taken", path="name", got=name, expected="a name that nothing else has", id=id
+    )
 
 
 def _reached(action: Any) -> Any:

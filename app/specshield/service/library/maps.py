@@ -11,7 +11,7 @@ import io
 import logging
 import secrets
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +90,7 @@ class Maps:
         found = self.shipped(key)
         if found is not None:
             return found
+        key = self._id_of(key, owner)
         if files.HASH.fullmatch(key):
             if self._claims.holds("maps", key, owner):
                 return self.get(key)
@@ -102,15 +103,23 @@ class Maps:
     def show(self, key: str, owner: str) -> dict[str, Any]:
         """The map as JSON, which can be had without reading the cells. Raises NotFound."""
         assert self._claims is not None
-        if self.shipped(key) is None and self._claims.holds("maps", key, owner):
-            return self._shown(key)
-        return self.find(key, owner).to_json()
+        if self.shipped(key) is not None:
+            return self.find(key, owner).to_json()
+        id = self._id_of(key, owner)
+        shown = self._shown(id) if self._claims.holds("maps", id, owner) else self.find(id, owner).to_json()
+        return {**shown, "name": self._claims.name_of("maps", shown["id"], owner)}
 
-    def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region], key: Key) -> Map:
-        """Keeps a map for an owner, its content once. Raises LimitReached and InsufficientStorage."""
+    def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region], key: Key, name: str | None = None) -> Map:
+        """Keeps a map for an owner, its content once, under a name if one is given. Raises
+        LimitReached, InsufficientStorage and NameTaken.
+        """
         assert self._claims is not None
         id = _id(grid, rooms)
         found = self.shipped(id)
+        if name is not None:
+            self._claims.check_name(
+                "maps", name, id, key.name, {each: m.id for each, m in self._named.items()}
+            )
         if found is not None:
             return found
         if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
@@ -124,7 +133,10 @@ class Maps:
         with self._claims.adding("maps", id, key, files.weight(content)):
             if not files.there(folder):
                 files.write_folder(folder, content)
-        return self._recent.get(id, lambda: made)
+        if name is not None:
+            self._claims.name("maps", id, key.name, name)
+        kept = self._recent.get(id, lambda: made)
+        return replace(kept, name=self._claims.name_of("maps", id, key.name))
 
     def delete(self, key: str, owner: str) -> None:
         """Takes an owner's map; its content goes with the last owner. Raises NotFound, InUse and Conflict."""
@@ -135,7 +147,7 @@ class Maps:
                 f"map {found.name!r} came with the server and cannot be deleted",
                 path="map_id", got=key, expected="a map that was sent here",
             )  # fmt: skip
-        token = secrets.token_hex(8)
+        key, token = self._id_of(key, owner), secrets.token_hex(8)
         user = self._claims.mark("maps", key, owner, token)
         if user is not None:
             raise InUse(
@@ -155,7 +167,8 @@ class Maps:
             [*self._named, *self._own(owner)], after, limit,
             lambda key: files.size(self._folder / key / "map.json"),
         )  # fmt: skip
-        return [self._shown(key) for key in keys], following
+        names = self._claims.names("maps", owner) if self._claims is not None else {}
+        return [self._shown(key) | ({"name": names[key]} if key in names else {}) for key in keys], following
 
     def adopt(self) -> None:
         """Gives the maps that nobody has, of a time before owners, to the owner without a name."""
@@ -164,6 +177,11 @@ class Maps:
             if self._claims.unowned("maps", id):
                 with self._claims.adding("maps", id, OPEN, files.weight_of(self._folder / id)):
                     pass
+
+    def _id_of(self, key: str, owner: str) -> str:
+        """The id of what an owner calls `key`; `key` itself where that is no name of theirs."""
+        assert self._claims is not None
+        return key if files.HASH.fullmatch(key) else self._claims.named("maps", key, owner) or key
 
     def _own(self, owner: str) -> list[str]:
         """Ids that the owner has; one whose files are not there was not written to the end."""

@@ -80,6 +80,8 @@ class Policies:
     def find(self, key: str, owner: str) -> Record:
         """One that this owner may see. Raises NotFound."""
         assert self._claims is not None
+        if not files.HASH.fullmatch(key) and key not in self._named:
+            key = self._claims.named("policies", key, owner) or key
         found = self.record(key)
         if found.name is None and not self._claims.holds("policies", found.id, owner):
             raise _missing(key)
@@ -151,6 +153,27 @@ class Policies:
             )  # fmt: skip
         return Record(_id(about, task), replace(about, spec=spec), task.horizon)
 
+    def check_name(self, record: Record, owner: str, name: str) -> None:
+        """Raises NameTaken, and InputError for a name that this policy cannot have."""
+        assert self._claims is not None
+        shipped = {each: known.id for each, known in self._named.items()}
+        self._claims.check_name("policies", name, record.id, owner, shipped)
+
+    def name(self, record: Record, owner: str, name: str) -> None:
+        """Names an owner's policy. Raises NameTaken."""
+        assert self._claims is not None
+        if record.name is None:
+            self._claims.name("policies", record.id, owner, name)
+
+    def name_of(self, record: Record, owner: str) -> str | None:
+        assert self._claims is not None
+        return record.name or self._claims.name_of("policies", record.id, owner)
+
+    def names(self, owner: str) -> dict[str, str]:
+        """{id: name} of the policies that this owner has named."""
+        assert self._claims is not None
+        return self._claims.names("policies", owner)
+
     def made_here(self, id: str) -> Record | None:
         """The policy of this id, if anybody asked for it."""
         try:
@@ -164,7 +187,9 @@ class Policies:
         """
         return self._add(record, {}, key)
 
-    def add_card(self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key) -> Record:
+    def add_card(
+        self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key, name: str | None = None
+    ) -> Record:
         """Keeps a policy that was made elsewhere, once all of it is checked. Its id covers all that was sent,
         so that it cannot take the place of another one, or of one that is made here. Raises PolicyError.
         """
@@ -180,11 +205,13 @@ class Policies:
         id = sent_id(record.id, card, weights)
         card["id"] = id  # never the sender's
         load_policy(weights, card, task)
-        return self._add(
-            replace(record, id=id, card=card),
-            {"policy.safetensors": weights, "card.json": files.to_json(card)},
-            key,
-        )
+        record = replace(record, id=id, card=card)
+        if name is not None:
+            self.check_name(record, key.name, name)
+        added = self._add(record, {"policy.safetensors": weights, "card.json": files.to_json(card)}, key)
+        if name is not None:
+            self.name(added, key.name, name)
+        return added
 
     def _add(self, record: Record, trained: Mapping[str, bytes], key: Key) -> Record:
         assert self._claims is not None

@@ -9,15 +9,20 @@ from typing import Annotated
 
 import anyio
 from fastapi import APIRouter, Header, Query, Response
+from pydantic import Field
 from starlette.types import Receive, Scope, Send
 
+from specshield.service import examples
+from specshield.service.access.owners import Owner, scoped
 from specshield.service.routes.sessions import GONE, PathId, SessionKey
+from specshield.service.schemas.base import ID
 from specshield.service.sessions import chain
 from specshield.service.state import ServerState, problems
 
 SLOWEST = 10.0  # [s] that a reader may take for what was sent; chosen by hand
 EVENTS = "text/event-stream"
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
+overview = APIRouter(tags=["sessions"])
 
 
 class EventStream(Response):
@@ -91,6 +96,41 @@ async def events(
     """
     stream = await server.watchers.open(key, after if last_event_id is None else last_event_id)
     return Response(status_code=204) if stream is None else EventStream(stream)
+
+
+MOST_SESSIONS = 64  # of one stream; chosen by hand: a page of more is not read
+PLACE = rf"^{ID}(:(-1|[0-9]{{1,7}}))?$"
+Places = Annotated[
+    list[Annotated[str, Field(pattern=PLACE)]],
+    Query(
+        min_length=1, max_length=MOST_SESSIONS,
+        openapi_examples={"example": {"value": [f"{examples.SESSION['id']}:-1"]}},
+        description="Ids of sessions; `id:41` begins after step 41, `id:-1` with the first, `id` now.",
+    ),
+]  # fmt: skip
+
+
+@overview.get(
+    "/v1/events",
+    response_class=Response,
+    summary="Watch several sessions",
+    responses={
+        200: {
+            "content": {EVENTS: {"schema": EVENT}},
+            "description": "Server-sent events: `data` is `session`, `t`, `pose`, `logits`, `decision`, as "
+            "in a trajectory; the last one of a session is `session`, `finished` and `spec_status`.",
+        },
+        **problems(_429="The server has no room for more streams."),
+    },
+)
+async def several(server: ServerState, owner: Owner, session: Places) -> Response:
+    """What several robots do, in one stream: what a page needs to show them on one floor.
+
+    Sessions that are not there are left out. The stream ends when all of them are over.
+    """
+    asked = (place.partition(":") for place in session)
+    after = {scoped(owner, id): int(t) if t else None for id, _, t in asked}
+    return EventStream(await server.watchers.open_all(after))
 
 
 @router.get(

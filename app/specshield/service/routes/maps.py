@@ -32,6 +32,10 @@ def _described() -> dict[str, Any]:
         required = format.required
         if name != FILES:
             properties["format"], required = {"const": name}, [*required, "format"]
+        properties["name"] = {
+            "type": "string",
+            "description": "A name of your own, accepted wherever an id is.",
+        }
         about = {"title": name, "description": format.about, "required": required}
         schemas[format.files].append({"type": "object", **about, "properties": properties})
         if format.example is not None and not format.files:
@@ -49,7 +53,12 @@ def _described() -> dict[str, Any]:
     status_code=201,
     response_model=MapResponse,
     summary="Send a map",
-    responses=problems(_429="The server keeps no more maps.", _507=FULL, **TOO_MUCH),
+    responses=problems(
+        _409="`name-taken`: something else of yours has the name.",
+        _429="The server keeps no more maps.",
+        _507=FULL,
+        **TOO_MUCH,
+    ),
     openapi_extra=_described(),
 )
 async def create(request: Request, server: ServerState, caller: Caller) -> Any:

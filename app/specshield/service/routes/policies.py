@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
@@ -35,6 +36,7 @@ PolicyId = Annotated[
     summary="Ask for a policy, or send one",
     responses=problems(
         _404="No such map.",
+        _409="`name-taken`: something else of yours has the name.",
         _429="The server keeps no more policies.",
         _503=f"`training-unavailable`: no worker is there to train; the store is away; or {TOO_MUCH['_503']}",
         _507="`insufficient-storage`: the disk is full, or what you may keep there.",
@@ -72,15 +74,15 @@ async def create(request: Request, server: ServerState, caller: Caller) -> Any:
     body = received(request)
     if is_multipart(body.content_type):
         kept = await server.heavy.run(request, "add_policy", body.content_type, body.content, caller)
-        return await asyncio.to_thread(_show, server, kept)
-    asked = await server.heavy.run(request, "check_policy", body.content, caller.name)
-    return await asyncio.to_thread(_ask, server, caller, asked)
+        return await asyncio.to_thread(_show, server, kept, caller.name)
+    asked, name = await server.heavy.run(request, "check_policy", body.content, caller.name)
+    return await asyncio.to_thread(_ask, server, caller, asked, name)
 
 
-def _ask(server: Server, caller: Key, asked: Record) -> dict[str, Any]:
+def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict[str, Any]:
     record = server.policies.made_here(asked.id)
     if record is not None and _training(server, record).status != "failed":
-        return _show(server, server.policies.add(asked, caller))
+        return _called(server, caller, server.policies.add(asked, caller), called)
     name = asked.about.method
     own = [] if server.worker is None else server.worker.methods
     if name not in own and not server.jobs.worker_there(name):
@@ -94,23 +96,33 @@ def _ask(server: Server, caller: Key, asked: Record) -> dict[str, Any]:
         )
     record = server.policies.add(asked, caller)
     server.jobs.start(record.id, name)
-    return _show(server, record)
+    return _called(server, caller, record, called)
+
+
+def _called(server: Server, caller: Key, record: Record, called: str | None) -> dict[str, Any]:
+    if called is not None:
+        server.policies.name(record, caller.name, called)
+    return _show(server, record, caller.name)
 
 
 def _training(server: Server, record: Record) -> Training:
     return Training("ready", 1.0) if record.card is not None else server.jobs.get(record.id)
 
 
-def _listed(server: Server, record: Record) -> dict[str, Any]:
-    shown = _show(server, record)
+def _listed(server: Server, record: Record, names: Mapping[str, str]) -> dict[str, Any]:
+    shown = _shown(server, record, record.name or names.get(record.id))
     return {**shown, "spec": {name: held for name, held in shown["spec"].items() if name != "regions"}}
 
 
-def _show(server: Server, record: Record) -> dict[str, Any]:
+def _show(server: Server, record: Record, owner: str) -> dict[str, Any]:
+    return _shown(server, record, server.policies.name_of(record, owner))
+
+
+def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
     training, about = _training(server, record), record.about
     return {
         "id": record.id,
-        "name": record.name,
+        "name": name,
         "status": training.status,
         "progress": training.progress,
         "eta_s": training.eta_s,
@@ -137,7 +149,8 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
 
     def show() -> dict[str, Any]:
         found, following = server.policies.page(owner, cursor, limit)
-        return {"items": [_listed(server, record) for record in found], "next": following}
+        names = server.policies.names(owner)
+        return {"items": [_listed(server, record, names) for record in found], "next": following}
 
     return await asyncio.to_thread(show)
 
@@ -150,7 +163,7 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
 )
 async def read(policy_id: PolicyId, server: ServerState, owner: Owner) -> Any:
     """How far it is, and what was measured."""
-    return await asyncio.to_thread(lambda: _show(server, server.policies.find(policy_id, owner)))
+    return await asyncio.to_thread(lambda: _show(server, server.policies.find(policy_id, owner), owner))
 
 
 @router.delete(

@@ -68,7 +68,7 @@ async def create(request: SessionRequest, server: ServerState, caller: Caller) -
 async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, limit: Limit = 100) -> Any:
     """The sessions, in order of id; ids that the server makes up are in order of time.
 
-    Their `spec` is without `regions` here, and a page may be shorter than `limit`.
+    Their `spec` is without `regions` here, and `robot` is left out; a page may be shorter than `limit`.
     """
     found, following = await server.sessions.page(owner, cursor, limit)
     return {"items": found, "next": following}

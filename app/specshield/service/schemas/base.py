@@ -10,7 +10,8 @@ from pydantic_core import PydanticCustomError
 from specshield.service import examples
 
 SpecStatus = Literal["pending", "satisfied", "violated"]
-Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+ID = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
+Id = Annotated[str, Field(pattern=f"^{ID}$")]
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 Pose = Annotated[
     list[Coordinate],

@@ -10,7 +10,7 @@ from specshield.service.schemas.specs import Region
 
 class MapResponse(Answer):
     id: str = Field(description="Hash of the content.")
-    name: str | None = Field(description="Its name, if it came with the server; accepted wherever an id is.")
+    name: str | None = Field(description="Its name, if it has one; accepted wherever an id is.")
     resolution: float = Field(description="Side of a cell [m].")
     width: int = Field(description="Cells along x.")
     height: int = Field(description="Cells along y.")

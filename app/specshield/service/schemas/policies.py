@@ -1,4 +1,4 @@
-"""Robots and policies."""
+"""Policies."""
 
 from __future__ import annotations
 
@@ -10,35 +10,8 @@ from specshield.policy.methods import DEFAULT, METHODS
 from specshield.policy.options import options_schema
 from specshield.service import examples
 from specshield.service.schemas.base import Answer, Id, Name, Strict
+from specshield.service.schemas.robots import RobotSpec
 from specshield.service.schemas.specs import Spec
-
-
-class Footprint(Strict):
-    """A disc."""
-
-    radius: float = Field(gt=0, le=5, description="In metres.")
-    offset: list[float] = Field(
-        default_factory=lambda: [0.0, 0.0],
-        min_length=2,
-        max_length=2,
-        description="Of its centre in the robot's frame: [ahead, to the left] in metres.",
-    )
-
-
-class ActionSpec(Strict):
-    name: Name = Field(description="Unlike the others'.")
-    translate: float = Field(0.0, description="Along the heading [m].")
-    rotate: float = Field(0.0, description="Counter-clockwise, after the translation [rad].")
-    terminal: bool = Field(False, description="Ends the main task: moves nothing, consumes no step.")
-
-
-class RobotSpec(Strict):
-    footprint: Footprint
-    on_contact: Literal["stay", "stop"] = Field(
-        "stay", description="What a move that would touch something does."
-    )
-    actions: list[ActionSpec] = Field(min_length=1, max_length=256, fail_fast=True)
-
 
 RobotChoice = Annotated[
     Annotated[Name, Tag("name")] | Annotated[RobotSpec, Tag("robot")],
@@ -71,6 +44,7 @@ class PolicyRequest(Strict):
     method: Name = Field(DEFAULT, json_schema_extra=_describe_methods)
     seed: int = Field(0, ge=0, lt=2**63, description="Of everything random in the training.")
     options: Options = Field(default_factory=dict, json_schema_extra=_describe_options)
+    name: Id | None = Field(None, description="A name of your own for it, accepted wherever its id is.")
 
 
 class Card(BaseModel):
@@ -90,7 +64,7 @@ class Card(BaseModel):
 
 class PolicyResponse(Answer):
     id: str = Field(description="Hash of task, method, options and seed.")
-    name: str | None = Field(description="Its name, if it came with the server; accepted wherever an id is.")
+    name: str | None = Field(description="Its name, if it has one; accepted wherever an id is.")
     status: Literal["queued", "training", "ready", "failed"] = Field(description="Sessions need `ready`.")
     progress: float = Field(description="0 to 1.")
     eta_s: float | None = Field(description="Estimate of the time left [s]; null where there is none.")

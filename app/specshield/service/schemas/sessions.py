@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, JsonValue, model_validator
 from specshield.lookahead.preferences import PREFERENCES, PROJECTION
 from specshield.service import examples
 from specshield.service.schemas.base import Answer, Id, Name, Pose, SpecStatus, Strict
+from specshield.service.schemas.robots import RobotResponse
 from specshield.shield.uncertainty import MOST_TRANSLATION
 
 
@@ -164,6 +165,7 @@ class SessionResponse(Answer):
     spec: dict[str, JsonValue] = Field(
         description="`formula`, `signals` and, where one session is read, `regions`."
     )
+    robot: RobotResponse | None = Field(None, description="Its robot, in full; not in lists.")
     horizon: int = Field(description="The horizon T in steps; the last shaped decision is at T - 1.")
     actions: list[str] = Field(description="Names, in the order of the logits.")
     terminal_actions: list[int] = Field(description="Indices of the actions that end the main task.")

@@ -84,10 +84,20 @@ class SpecRequest(Strict):
     map_id: Id | None = Field(None, description="A map, whose rooms are then names too.")
 
 
+class Window(Answer):
+    operator: Literal["G", "F", "U"] = Field(description="Always, eventually or until.")
+    formula: str = Field(description="The operator with what it is about.")
+    begin: int = Field(description="The first step that it looks at.")
+    end: int = Field(description="The last step that it looks at, wherever the windows around it begin.")
+    depth: int = Field(description="How many other windows it lies in.")
+
+
 class SpecResponse(Answer):
     formula: str = Field(description="Canonical text; it parses back to an equal formula.")
     horizon: int = Field(description="The horizon T in steps: T + 1 states decide the formula.")
     names: list[str] = Field(description="The names it uses, sorted.")
+    windows: list[Window] = Field(description="When each temporal operator is looked at, outermost first.")
+    avoided: list[str] = Field(description="Those of the names that it asks not to hold.")
 
 
 class Spec(Strict):

@@ -179,6 +179,7 @@ class TrajectoryItem(Answer):
     pose: Pose
     signals: dict[str, float] = Field(description="The samples held at t.")
     rule: int = Field(description="Which of `rules` decides, or decided, this step.")
+    logits: list[float | None] | None = Field(description="Those that the step was asked with.")
     decision: StepResponse | None = Field(
         description="The answer given; null for a pose sent later or by close."
     )

@@ -102,6 +102,12 @@ _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(StepRecord)
 
 
+def logits_json(record: StepRecord) -> list[float | None] | None:
+    """The logits as they were sent: null is minus infinity."""
+    sent = record.logits_sent()
+    return None if sent is None else [None if value == -np.inf else value for value in sent.tolist()]
+
+
 def encode(record: StepRecord) -> bytes:
     return _encoder.encode(record)
 

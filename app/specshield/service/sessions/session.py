@@ -11,8 +11,10 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
+from specshield.robot import robot_from_json
 from specshield.service.access.owners import shown
 from specshield.service.library import files
+from specshield.service.schemas import robots
 from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import history, record
@@ -88,6 +90,7 @@ def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]
     names = ("next_t", "feasible", "spec_status", "main_task_done", "finished")
     return {
         **shown,
+        "robot": robots.describe(robot_from_json(rules[-1]["robot"])),
         **{name: getattr(state, name) for name in names},
         "expires_at": files.rfc3339(state.expires_at),
         "rules": ruled.told(rules, [*state.verdicts, state.spec_status]),
@@ -161,15 +164,17 @@ def _equal(a: Floats | None, b: Floats | None) -> bool:
 
 
 def lines(session: Session, steps: Sequence[bytes]) -> Iterator[bytes]:
-    """One JSON object a step: t, pose, signals, which rule held, and the answer that was given."""
+    """One JSON object a step: t, pose, signals, which rule held, the logits sent, and the answer given."""
     for t, row in enumerate(session.rows):
         held, rule = row.tolist(), ruled.at(session.rules, t)
         config, values = session.rules[rule], dict(zip(session.signal_names, held[3:], strict=True))
         signals = {name: values[name] for name in sorted(config["spec"]["signals"])}
         head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals, "rule": rule})
         step = steps[t] if t < len(steps) else b""
-        told = to_json(record.answer(record.decode(step), row, config["actions"])) if step else b"null"
-        yield head[:-1] + b',"decision":' + told + b"}"
+        kept = record.decode(step) if step else None
+        logits = msgspec.json.encode(None if kept is None else record.logits_json(kept))
+        told = b"null" if kept is None else to_json(record.answer(kept, row, config["actions"]))
+        yield head[:-1] + b',"logits":' + logits + b',"decision":' + told + b"}"
 
 
 def columns(rows: Floats, names: Iterable[str]) -> dict[str, Floats]:

@@ -128,6 +128,7 @@ class Sessions:
         shown = [describe(rules.read(config), State.of(state)) for config, state in found]
         for item in shown:  # they can be long, and whoever wants them reads the session
             item["spec"] = {name: held for name, held in item["spec"].items() if name != "regions"}
+            del item["robot"]
         return shown, following
 
     async def delete(self, id: str) -> None:
@@ -183,6 +184,13 @@ class Sessions:
         found = await self._dump(id)
         rows = Session.of(found).rows
         return await self._run(chain.pack, found.config, pack(rows), found.steps)
+
+    async def last(self, id: str) -> tuple[dict[str, Any], Floats, bytes]:
+        """The session's config, its rows, and the record of the last one, empty where that has none."""
+        found = await self._dump(id)
+        session = Session.of(found)
+        t = len(session.rows) - 1
+        return dict(session.config), session.rows, found.steps[t] if t < len(found.steps) else b""
 
     async def _dump(self, id: str) -> Dump:
         found = await self._store.dump(id)

@@ -8,15 +8,18 @@ A watcher who is behind reads the stored steps itself, a few at a time.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
+import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from specshield.errors import LimitReached, SpecshieldError
+from specshield.errors import LimitReached, NotFound, SpecshieldError
 from specshield.service import metrics
+from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import to_json
 from specshield.service.sessions import record, rules
 from specshield.service.sessions.session import Session, describe, missing
@@ -31,13 +34,33 @@ FIRST = b"retry: 1000\n\n"
 log = logging.getLogger("specshield")
 
 
+@dataclass(frozen=True)
+class Told:
+    """A decision as it is told. switch: events that come before it. asked: x_t, which of the session's rules
+    held, and the logits, as members of a JSON object. answer: what was answered.
+    """
+
+    t: int
+    switch: bytes
+    asked: bytes
+    answer: bytes
+
+    def event(self) -> bytes:
+        return b"%sid: %d\ndata: %s\n\n" % (self.switch, self.t, self.answer)
+
+    def event_of(self, session: str) -> bytes:
+        """For a stream of several sessions."""
+        head = b'{"session":"%s","t":%d,%s' % (session.encode(), self.t, self.asked)
+        return b'data: %s,"decision":%s}\n\n' % (head, self.answer)
+
+
 @dataclass(eq=False)
 class Feed:
     """A session that is watched here. rules: those that it has had, `told` as the contract shows them. width:
     bytes of a row.
 
-    recent: the events of the steps from `start` to before `end`. version: the one that was read; None for a
-    session that is not in the store.
+    recent: the decisions of the steps from `start` to before `end`. version: the one that was read; None for
+    a session that is not in the store.
     """
 
     id: str
@@ -50,14 +73,14 @@ class Feed:
     over: bool
     status: str
     watchers: int = 0
-    recent: deque[tuple[int, bytes]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    recent: deque[Told] = field(default_factory=lambda: deque(maxlen=KEPT))
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def add(self, state: State, found: list[tuple[int, bytes]], end: int) -> None:
-        for event in found:
+    def add(self, state: State, found: list[Told], end: int) -> None:
+        for each in found:
             if len(self.recent) == KEPT:
-                self.start = self.recent[0][0] + 1
-            self.recent.append(event)
+                self.start = self.recent[0].t + 1
+            self.recent.append(each)
         self.end, self.over, self.status = end, state.finished and end >= state.next_t, state.spec_status
         self.wake()
 
@@ -95,16 +118,69 @@ class Watchers:
 
         Raises NotFound, LimitReached.
         """
-        if self._open >= self._limit:
-            raise LimitReached(
-                f"this server has {self._limit} open streams of events",
-                expected="room for one more: close one, or ask another server",
-            )
+        self._check_room()
         feed = self._feeds.get(id) or await self._begin(id)
         t = feed.end if after is None else after + 1
         if feed.over and t >= feed.end:
             return None
         return self._stream(feed, t)
+
+    async def open_all(self, after: Mapping[str, int | None]) -> AsyncIterator[bytes]:
+        """One stream of what follows in several sessions, each after its own step; those that are not there
+        are left out. Raises LimitReached.
+        """
+        self._check_room()
+        places = {}
+        for id, t in after.items():
+            with contextlib.suppress(NotFound):
+                feed = self._feeds.get(id) or await self._begin(id)
+                places[feed] = feed.end if t is None else t + 1
+        return self._together(places)
+
+    def _check_room(self) -> None:
+        if self._open >= self._limit:
+            raise LimitReached(
+                f"this server has {self._limit} open streams of events",
+                expected="room for one more: close one, or ask another server",
+            )
+
+    async def _together(self, after: dict[Feed, int]) -> AsyncIterator[bytes]:
+        places = {self._feeds.setdefault(feed.id, feed): t for feed, t in after.items()}
+        feeds, told_at = list(places), time.monotonic()
+        with self._watching(feeds):
+            yield FIRST
+            while places and not self._stopping():
+                told = []
+                for feed, t in list(places.items()):
+                    if t < feed.start:
+                        found, t = await self._older(feed, t)
+                    else:
+                        found, t = [each for each in feed.recent if each.t >= t], max(t, feed.end)
+                    told += [each.event_of(shown(feed.id)) for each in found]
+                    places[feed] = t
+                    if feed.over and t >= feed.end:
+                        told.append(_end_of(feed))
+                        del places[feed]
+                if told or time.monotonic() - told_at > HEARTBEAT:
+                    told_at = time.monotonic()
+                    yield b"".join(told) or b": alive\n\n"
+                await asyncio.sleep(EVERY)
+
+    @contextlib.contextmanager
+    def _watching(self, feeds: Sequence[Feed]) -> Iterator[None]:
+        for feed in feeds:
+            feed.watchers += 1
+        self._open += 1
+        metrics.watchers.inc()
+        try:
+            yield
+        finally:
+            metrics.watchers.dec()
+            self._open -= 1
+            for feed in feeds:
+                feed.watchers -= 1
+                if not feed.watchers and self._feeds.get(feed.id) is feed:
+                    del self._feeds[feed.id]
 
     async def _begin(self, id: str) -> Feed:
         found = await self._store.load(id)
@@ -118,19 +194,16 @@ class Watchers:
 
     async def _stream(self, feed: Feed, t: int) -> AsyncIterator[bytes]:
         feed = self._feeds.setdefault(feed.id, feed)
-        feed.watchers += 1
-        self._open += 1
-        metrics.watchers.inc()
-        try:
+        with self._watching([feed]):
             yield FIRST
             while not self._stopping():
                 changed = feed.changed
                 if t < feed.start:
                     found, t = await self._older(feed, t)
                 else:
-                    found, t = [event for event in feed.recent if event[0] >= t], max(t, feed.end)
+                    found, t = [each for each in feed.recent if each.t >= t], max(t, feed.end)
                 if found:
-                    yield b"".join(event for _, event in found)
+                    yield b"".join(each.event() for each in found)
                 if t < feed.end:
                     continue
                 if feed.over:
@@ -140,12 +213,6 @@ class Watchers:
                     await asyncio.wait_for(changed.wait(), HEARTBEAT)
                 except TimeoutError:
                     yield b": alive\n\n"
-        finally:
-            metrics.watchers.dec()
-            self._open -= 1
-            feed.watchers -= 1
-            if not feed.watchers and self._feeds.get(feed.id) is feed:
-                del self._feeds[feed.id]
 
     async def _look(self, feeds: list[Feed]) -> None:
         if not feeds:
@@ -193,8 +260,8 @@ class Watchers:
             feed.add(State.of(dump.state), *_events(feed, feed.end, new))
         feed.version = None
 
-    async def _older(self, feed: Feed, t: int) -> tuple[list[tuple[int, bytes]], int]:
-        """Events from step t on, and the step that follows them."""
+    async def _older(self, feed: Feed, t: int) -> tuple[list[Told], int]:
+        """Decisions from step t on, and the step that follows them."""
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
         if new is None:
             dump = await self._store.dump(feed.id)
@@ -208,8 +275,8 @@ class Watchers:
         return found, end if end > t else feed.end
 
 
-def _events(feed: Feed, t: int, new: News) -> tuple[list[tuple[int, bytes]], int]:
-    """The events of the steps from t on that `new` has, and the step that follows them. The first decision
+def _events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
+    """The decisions of the steps from t on that `new` has, and the step that follows them. The first one
     after a switch brings the switch.
     """
     found = []
@@ -217,12 +284,14 @@ def _events(feed: Feed, t: int, new: News) -> tuple[list[tuple[int, bytes]], int
     for i, step in enumerate(new.steps):
         if step:
             row = record.row_of(new.rows[i * feed.width : (i + 1) * feed.width])
-            actions = feed.rules[rules.at(feed.rules, t + i)]["actions"]
-            answer = to_json(record.answer(record.decode(step), row, actions))
-            event = b"id: %d\ndata: %s\n\n" % (t + i, answer)
+            rule = rules.at(feed.rules, t + i)
+            kept = record.decode(step)
+            answer = to_json(record.answer(kept, row, feed.rules[rule]["actions"]))
+            asked = {"pose": row[:3].tolist(), "rule": rule, "logits": record.logits_json(kept)}
+            switch = b""
             while switched and switched[0]["from"] <= t + i:
-                event = b"event: switch\ndata: %s\n\n%s" % (json.dumps(switched.pop(0)).encode(), event)
-            found.append((t + i, event))
+                switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
+            found.append(Told(t + i, switch, json.dumps(asked)[1:-1].encode(), answer))
     return found, t + len(new.steps)
 
 
@@ -235,6 +304,12 @@ def _ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str
     """`Feed.rules`, `told` and `width`."""
     told = describe(session.rules, session.state)["rules"]
     return session.rules, told, 8 * session.rows.shape[1]
+
+
+def _end_of(feed: Feed) -> bytes:
+    """In a stream of several sessions."""
+    told = {"session": shown(feed.id), "next_t": feed.end, "spec_status": feed.status, "finished": True}
+    return b"data: %s\n\n" % json.dumps(told).encode()
 
 
 def _end(feed: Feed) -> bytes:

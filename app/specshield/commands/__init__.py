@@ -1,0 +1,1 @@
+"""The commands of `specshield` that have a module of their own."""

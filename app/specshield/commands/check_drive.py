@@ -1,0 +1,42 @@
+"""`specshield check-drive`: a recorded drive judged by a rule."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from specshield.errors import InputError
+
+
+def check_drive(
+    bag: Annotated[Path, typer.Argument(help="A rosbag2: its folder.", show_default=False)],
+    policy: Annotated[str, typer.Option(help="A policy that came with specshield, or the folder of one.")],
+    step_seconds: Annotated[
+        float, typer.Option(help="How long a step of the rule is [s].", min=1e-3, show_default=False)
+    ],
+    topic: Annotated[
+        str | None, typer.Option(help="Poses in the map's frame. [default: the only one]")
+    ] = None,
+) -> None:
+    """Say whether a drive from a rosbag2 kept the rule of a policy, and from where it could not any more.
+
+    The exit status is 0 where the rule is kept or open, 1 where it is broken or no way was left to keep it.
+    """
+    try:
+        import rosbags  # noqa: F401
+    except ModuleNotFoundError:
+        raise InputError(
+            "reading bags needs rosbags, which is not installed",
+            expected="pip install 'specshield[recordings]'",
+        ) from None
+    from specshield.local import LocalShield
+    from specshield.recordings import drive
+
+    folder = Path(policy)
+    shield = LocalShield.load(folder) if (folder / "card.json").is_file() else LocalShield.shipped(policy)
+    judged = drive.check_drive(shield, drive.read_drive(bag, step_seconds, topic))
+    for line in drive.told(shield, judged, step_seconds):
+        typer.echo(line)
+    raise typer.Exit(1 if judged.lost is not None else 0)

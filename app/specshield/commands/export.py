@@ -1,0 +1,70 @@
+"""`specshield export`: a session as a file that other tools open."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from specshield.errors import InputError, NotFound
+from specshield.world.regions import Region
+
+
+def export(
+    session: Annotated[
+        str, typer.Argument(help="A session's id, or the file of its record.", show_default=False)
+    ],
+    to: Annotated[
+        Literal["mcap", "csv", "parquet", "rrd"], typer.Option(help="mcap opens in Foxglove, rrd in Rerun.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="[default: the session's id with the ending]")] = None,
+    url: Annotated[str, typer.Option(help="The server that keeps the session.")] = "http://127.0.0.1:8000",
+    api_key: Annotated[
+        str | None, typer.Option(envvar="SPECSHIELD_API_KEY", help="Where it asks for one.")
+    ] = None,
+    step_seconds: Annotated[float, typer.Option(help="How long a step took [s].", min=1e-3)] = 1.0,
+) -> None:
+    """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun: needs specshield[recordings]."""
+    from specshield.client import ShieldClient
+    from specshield.recordings.recording import map_of_service, of_record
+    from specshield.service.library.maps import Maps
+    from specshield.service.sessions import chain
+    from specshield.service.settings import read_settings
+
+    file, grid = Path(session), None
+    rooms: Mapping[str, Region] = {}
+    if file.is_file():
+        found = chain.read(file.read_bytes())
+        try:
+            known = Maps(read_settings()).get(found.configs[0].map_id)
+            grid, rooms = known.grid, known.rooms
+        except NotFound:
+            typer.echo("the map is not at hand: it is left out, and so are the ways ahead", err=True)
+    else:
+        with ShieldClient(url, api_key, timeout=30.0) as client, tempfile.TemporaryDirectory() as folder:
+            client.sessions.get(session).save_record(Path(folder) / "record")
+            found = chain.read((Path(folder) / "record").read_bytes())
+            grid, rooms = map_of_service(client, found.configs[0].map_id)
+    recording = of_record(found, grid, rooms, step_seconds)
+    path = out or Path(f"{recording.id}.{to}")
+    try:
+        if to == "mcap":
+            from specshield.recordings.foxglove import write_mcap as write
+        elif to == "rrd":
+            from specshield.recordings.rerun import write_rrd as write
+        elif to == "parquet":
+            from specshield.recordings.tables import write_parquet as write
+        else:
+            from specshield.recordings.tables import write_csv as write
+        write(recording, path)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{to} needs {error.name}, which is not installed",
+            path="--to",
+            got=to,
+            expected="pip install 'specshield[recordings]'",
+        ) from None
+    typer.echo(f"{path}: {len(recording.items)} steps")

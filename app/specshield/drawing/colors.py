@@ -1,0 +1,28 @@
+"""The colours of every picture of a floor, and what a rule says of its regions: to visit, or to avoid."""
+
+from __future__ import annotations
+
+from specshield.stl import BODY_WORDS, Formula, Implies, Not, body_name
+
+PAPER, WALL, INK, FAINT = "#faf9f6", "#343840", "#282b32", "#9ea0a5"
+VISIT, AVOID = "#2b8a5a", "#c63c3c"  # regions
+TARGET = "#f6be28"  # what the model looks for
+BLUE, ORANGE, GREY = "#2563c8", "#e27d22", "#b4b4b4"  # ways; grey: after the rule's horizon
+TINT = 0.16  # opacity of a region
+
+
+def is_avoided(formula: Formula, region: str) -> bool:
+    """Whether the formula asks that the robot be not in this region, or not touch it."""
+    return bool(avoided(formula) & {region, *(body_name(how, region) for how in BODY_WORDS)})
+
+
+def avoided(formula: Formula, negated: bool = False) -> set[str]:
+    """The names that the formula asks not to hold: those below an odd number of negations."""
+    if isinstance(formula, Not):
+        return avoided(formula.child, not negated)
+    if isinstance(formula, Implies):
+        return avoided(formula.left, not negated) | avoided(formula.right, negated)
+    below = [part for part in formula.parts if isinstance(part, Formula)]
+    if not below:
+        return set(formula.names) if negated else set()
+    return set().union(*(avoided(part, negated) for part in below))

@@ -1,0 +1,166 @@
+"""A floor plan as SVG: walls, a heat map, regions, ways, robots, text. Points are in metres, map frame.
+
+The picture stands alone: no script, no font or image from elsewhere. It is dark where its reader's screen is.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+from PIL import Image
+
+from specshield.arrays import Bytes, Floats
+from specshield.drawing.colors import is_avoided
+from specshield.task import Task
+from specshield.world.regions import Circle, Polygon, Rectangle, Region, Union
+
+# Widths are in thousandths of the longer side of the map, so that every map looks alike.
+STYLE = """
+.paper{fill:#faf9f6}.ink{fill:#282b32}.faint{fill:#6d7078}
+.visit{fill:#2b8a5a;stroke:#2b8a5a}.avoid{fill:#c63c3c;stroke:#c63c3c}
+.region{fill-opacity:.16}
+.way{fill:none;stroke:#2563c8;stroke-linejoin:round;stroke-linecap:round}
+.next{fill:none;stroke:#2563c8;stroke-linejoin:round}.robot{fill:#2563c8;fill-opacity:.25;stroke:#2563c8}
+text{font-family:system-ui,sans-serif}.formula{font-family:ui-monospace,monospace}
+@media (prefers-color-scheme:dark){.paper{fill:#16181d}.ink{fill:#e8e9ec}.faint{fill:#9a9da6}
+.walls{filter:brightness(1.75)}.visit{fill:#57c48f;stroke:#57c48f}.avoid{fill:#f07a72;stroke:#f07a72}
+.way,.next{stroke:#78a8ff}.robot{fill:#78a8ff;stroke:#78a8ff}}
+.name{stroke:none;font-weight:600}
+"""
+
+
+class Plan:
+    """Collects the parts of a picture; `svg` gives it. title: for those who cannot see it."""
+
+    def __init__(self, task: Task, title: str) -> None:
+        self._task, self._title = task, title
+        self._xmin, self._ymin, self._xmax, self._ymax = task.grid.bounds
+        self._unit = max(self._xmax - self._xmin, self._ymax - self._ymin) / 1000
+        self._parts: list[str] = []
+        self._lines: list[tuple[str, str]] = []  # (kind, text)
+
+    def walls(self) -> None:
+        """One pixel a cell, turned as the map's origin is."""
+        grid = self._task.grid
+        pixels = np.zeros((*grid.occupied.shape, 4), np.uint8)
+        pixels[grid.occupied[::-1]] = (0x34, 0x38, 0x40, 0xFF)
+        x, y, yaw = grid.origin
+        wide, high = grid.width * grid.resolution, grid.height * grid.resolution
+        turn = f"translate({x:g} {-y:g}) rotate({-math.degrees(yaw):g})"
+        self._image(pixels, (0.0, -high, wide, high), f'class="walls" transform="{turn}"')
+
+    def heat(self, share: Floats) -> None:
+        """share [rows, columns], the first row at the highest y: 0 to 1, NaN where nothing is known."""
+        known = np.isfinite(share)
+        value = np.where(known, share, 0.0)[..., None]
+        none, all_ = np.array([214.0, 84, 66]), np.array([43.0, 138, 90])
+        pixels = np.zeros((*share.shape, 4), np.uint8)
+        pixels[..., :3] = none + (all_ - none) * value
+        pixels[..., 3] = known * 105
+        box = (self._xmin, -self._ymax, self._xmax - self._xmin, self._ymax - self._ymin)
+        self._image(pixels, box, 'preserveAspectRatio="none"')
+
+    def regions(self) -> None:
+        """Those that the rule names, each with its name."""
+        for name, region in self._task.regions.items():
+            kind = "avoid" if is_avoided(self._task.formula, name) else "visit"
+            self._parts.append(f'<g class="region {kind}" stroke-width="{2 * self._unit:g}">')
+            self._parts += [_shape(member) for member in _members(region)]
+            x, y = _below(region)
+            self._parts.append(
+                f"</g>{self._text(x, -y + 26 * self._unit, name, 22, f'name {kind}', 'middle')}"
+            )
+
+    def way(self, poses: Floats, kind: str = "way") -> None:
+        """kind: `way` for what was driven, `next` for what would follow."""
+        points = " ".join(f"{x:.3f},{-y:.3f}" for x, y in np.asarray(poses)[:, :2].tolist())
+        dashes = f' stroke-dasharray="{6 * self._unit:g} {6 * self._unit:g}"' if kind == "next" else ""
+        wide = (6 if kind == "way" else 3) * self._unit
+        self._parts.append(f'<polyline class="{kind}" points="{points}" stroke-width="{wide:g}"{dashes}/>')
+
+    def robot(self, pose: Sequence[float]) -> None:
+        """Its footprint, and a line from its origin to where it looks."""
+        (x, y, theta), robot = pose, self._task.robot
+        cos, sin, (ahead, left) = math.cos(theta), math.sin(theta), robot.offset
+        cx, cy = x + cos * ahead - sin * left, y + sin * ahead + cos * left
+        self._parts.append(
+            f'<g class="robot" stroke-width="{3 * self._unit:g}">'
+            f'<circle cx="{cx:.3f}" cy="{-cy:.3f}" r="{robot.radius:g}"/><line x1="{x:.3f}" y1="{-y:.3f}" '
+            f'x2="{x + cos * robot.radius:.3f}" y2="{-y - sin * robot.radius:.3f}"/></g>'
+        )
+
+    def line(self, said: str, kind: str = "ink") -> None:
+        """A line of text below the map; a long one goes on in the next."""
+        most = int((self._xmax - self._xmin) / self._unit / (0.62 * 24))
+        while said:
+            cut = len(said) if len(said) <= most else said.rfind(" ", 0, most)
+            cut = cut if cut > 0 else most
+            self._lines.append((kind, said[:cut]))
+            said = said[cut:].lstrip()
+
+    def svg(self) -> bytes:
+        unit, edge = self._unit, 20 * self._unit
+        wide, high = self._xmax - self._xmin + 2 * edge, self._ymax - self._ymin + 2 * edge
+        foot = high + 36 * unit * len(self._lines)
+        box = f"{self._xmin - edge:g} {-self._ymax - edge:g} {wide:g} {foot:g}"
+        told = []
+        for i, (kind, said) in enumerate(self._lines):
+            down = -self._ymin + edge / 2 + 36 * unit * (i + 0.8)
+            told.append(self._text(self._xmin, down, said, 24, kind, "start"))
+        size = f'width="800" height="{800 * foot / wide:.0f}"'
+        return "\n".join([
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" {size} role="img">',
+            f"<title>{escape(self._title)}</title><style>{STYLE}</style>",
+            f'<rect class="paper" x="{self._xmin - edge:g}" y="{-self._ymax - edge:g}" width="{wide:g}" '
+            f'height="{foot:g}"/>',
+            *self._parts, *told, "</svg>\n",
+        ]).encode()  # fmt: skip
+
+    def _text(self, x: float, y: float, said: str, size: float, kind: str, anchor: str) -> str:
+        return (
+            f'<text class="{kind}" x="{x:.3f}" y="{y:.3f}" font-size="{size * self._unit:g}" '
+            f'text-anchor="{anchor}">{escape(said)}</text>'
+        )
+
+    def _image(self, pixels: Bytes, box: tuple[float, float, float, float], more: str) -> None:
+        buffer = io.BytesIO()
+        Image.fromarray(pixels).save(buffer, "PNG", optimize=True)
+        data = base64.b64encode(buffer.getvalue()).decode()
+        x, y, wide, high = box
+        self._parts.append(
+            f'<image x="{x:g}" y="{y:g}" width="{wide:g}" height="{high:g}" {more} '
+            f'style="image-rendering:pixelated" href="data:image/png;base64,{data}"/>'
+        )
+
+
+def _members(region: Region) -> Sequence[Region]:
+    return region.members if isinstance(region, Union) else (region,)
+
+
+def _shape(region: Region) -> str:
+    if isinstance(region, Circle):
+        return f'<circle cx="{region.center[0]:g}" cy="{-region.center[1]:g}" r="{region.radius:g}"/>'
+    points = " ".join(f"{x:g},{-y:g}" for x, y in _corners(region))
+    return f'<polygon points="{points}"/>'
+
+
+def _corners(region: Region) -> list[tuple[float, float]]:
+    if isinstance(region, Rectangle):
+        (x0, y0), (x1, y1) = region.min, region.max
+        return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    assert isinstance(region, Polygon)
+    return [(x, y) for x, y in region.vertices]
+
+
+def _below(region: Region) -> tuple[float, float]:
+    """The lowest point of a region's first part, at the middle of its width."""
+    first = _members(region)[0]
+    if isinstance(first, Circle):
+        return first.center[0], first.center[1] - first.radius
+    xs, ys = zip(*_corners(first), strict=True)
+    return (min(xs) + max(xs)) / 2, min(ys)

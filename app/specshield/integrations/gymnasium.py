@@ -1,0 +1,113 @@
+"""A gymnasium environment with discrete actions that is kept inside a rule.
+
+    env = ShieldWrapper(gymnasium.make(...), shield, pose_of)
+    observation, info = env.reset(seed=0)
+    action = rng.choice(env.action_space.n, p=info["distribution"])
+    observation, reward, terminated, truncated, info = env.step(action)
+
+`info["action_mask"]` says which actions can be followed by a way to keep the rule, and `info["distribution"]`
+is the model's own, shaped. An action that has no probability there is not executed: the one that the shield
+drew is, and `info["executed"]` says which. A rule often looks further than the task. So where the environment
+terminates while the rule is pending, the episode goes on, without reward, along the certified continuation,
+until the rule is decided; the environment has to take steps after it has terminated, and its time limit has
+to lie beyond the rule's horizon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike
+
+from specshield.client.models import Decision, Pose
+from specshield.errors import RobotError
+from specshield.local import LocalSession, LocalShield
+
+Environment = gymnasium.Env[Any, Any]
+Step = tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]
+
+
+class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+    """`env` inside the rule of a shield.
+
+    shield: one, or what makes one for an environment that was just reset, where each episode has a map of its
+    own. pose_of: (x, y, theta) in the map's frame. logits: the model's, one an action, for an observation and
+    the action that was executed before it (None at first), which many models are fed; by default every action
+    is alike. possible: which actions may be taken at all, [A] booleans, where the dynamics
+    that the shield knows do not tell all. settings: of the session, as of `LocalShield.session`; by default
+    the environment is taken to move exactly as the robot of the shield does.
+
+    Raises RobotError at `reset` where the actions are not as many as the robot's, InfeasibleStart there where
+    the rule cannot be kept.
+    """
+
+    def __init__(
+        self,
+        env: Environment,
+        shield: LocalShield | Callable[[Environment], LocalShield],
+        pose_of: Callable[[Environment], Pose],
+        *,
+        logits: Callable[[Any, int | None], ArrayLike] | None = None,
+        possible: Callable[[Environment], ArrayLike] | None = None,
+        **settings: Any,
+    ) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(
+            self, shield=shield, pose_of=pose_of, logits=logits, possible=possible,
+            _disable_deepcopy=True, **settings,
+        )  # fmt: skip
+        gymnasium.Wrapper.__init__(self, env)
+        self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
+        self._settings = {"uncertainty": "none", "learn_map": False, **settings}
+        self.session: LocalSession | None = None
+        self.decision: Decision | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        observation, info = self.env.reset(seed=seed, options=options)
+        shield = self._shield if isinstance(self._shield, LocalShield) else self._shield(self.env)
+        actions = getattr(self.env.action_space, "n", None)
+        if actions != len(shield.task.robot.actions):
+            raise RobotError(
+                "the environment's actions are not the robot's", path="action_space",
+                got=str(self.env.action_space), expected=f"Discrete({len(shield.task.robot.actions)})",
+            )  # fmt: skip
+        self.session = shield.session(initial_pose=self._pose_of(self.env), **self._settings)
+        return observation, {**info, **self._decide(self.session, observation, None, False)}
+
+    def step(self, action: Any) -> Step:
+        assert self.session is not None, "reset comes before step"
+        assert self.decision is not None
+        decision, session, over = self.decision, self.session, self.session.main_task_done
+        executed, terminal = int(action), session.info.terminal_actions
+        ends = executed in terminal and decision.distribution[executed] > 0.0 and not over
+        if ends and decision.completion_action is not None:
+            executed = decision.completion_action
+        elif over or not decision.distribution[executed] > 0.0:
+            executed = decision.execute
+        observation, reward, terminated, truncated, info = self.env.step(executed)
+        told = self._decide(session, observation, executed, over or ends or bool(terminated))
+        settled = session.spec_status != "pending"
+        terminated = session.main_task_done and settled
+        truncated = not terminated and (bool(truncated) or session.finished)
+        told |= {"executed": executed, "overruled": executed != int(action)}
+        if terminated or truncated:
+            told["verdict"] = session.close()
+        return observation, 0.0 if over else reward, terminated, truncated, {**info, **told}
+
+    def _decide(
+        self, session: LocalSession, observation: Any, executed: int | None, over: bool
+    ) -> dict[str, Any]:
+        """Ask the shield about the state that the environment is in; what of it goes into `info`."""
+        logits = np.zeros(len(session.info.actions))
+        if self._logits is not None and not over:
+            logits = np.array(self._logits(observation, executed), dtype=np.float64)
+        if self._possible is not None:
+            logits[~np.asarray(self._possible(self.env), bool)] = -np.inf
+        decision = session.step(self._pose_of(self.env), None if over else logits, main_task_done=over)
+        self.decision = decision
+        distribution = np.array(decision.distribution)
+        return {"action_mask": (distribution > 0.0).astype(np.int8), "distribution": distribution}

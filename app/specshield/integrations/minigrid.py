@@ -1,0 +1,93 @@
+"""MiniGrid and BabyAI inside a rule over their rooms.
+
+    env = shielded(gymnasium.make("BabyAI-GoToObjMazeOpen-v0"), "F[0,100] Room_0_0 and F[100,200] Room_2_2")
+
+A cell is 1 m. x is the column, y counts rows from the lowest, so that theta turns counter-clockwise as ours
+do; `Room_c_r` is the inside of the room in column c and row r of MiniGrid's own count, from the top left.
+The map is what the grid holds after `reset`: walls, things and closed doors are occupied. Actions that would
+change it (`toggle`, and `drop` with something in hand) are not possible: the robot that the shield knows
+moves and turns, and no more. What is picked up leaves a cell that stays occupied for the shield.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from minigrid.core.actions import Actions
+from minigrid.core.roomgrid import RoomGrid
+
+from specshield.arrays import Bools
+from specshield.client.models import Pose
+from specshield.integrations.gymnasium import Environment, ShieldWrapper
+from specshield.local import LocalShield
+from specshield.robot import Action, Robot
+from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Rectangle, Region
+
+TURNS = {"left": math.pi / 2, "right": -math.pi / 2}  # [rad]
+MOVES = {"forward": 1.0}  # [m]
+ROBOT = Robot(
+    "minigrid",
+    radius=0.3,  # [m] any below half a cell will do
+    offset=(0.0, 0.0),
+    on_contact="stay",
+    actions=tuple(Action(a.name, MOVES.get(a.name, 0.0), TURNS.get(a.name, 0.0)) for a in Actions),
+)
+
+
+def shielded(
+    env: Environment, rule: str, regions: Mapping[str, Any] | None = None, **options: Any
+) -> ShieldWrapper:
+    """`env`, a MiniGrid environment, inside a rule over its rooms and `regions`. options: of ShieldWrapper.
+
+    Each `reset` makes a policy for the map that it finds, in about a second.
+    """
+
+    def made(env: Environment) -> LocalShield:
+        return LocalShield.make(
+            grid_of(env), rule, regions, rooms=rooms_of(env), robot=ROBOT, options={"pitch": 1.0}
+        )
+
+    return ShieldWrapper(env, made, pose_of, possible=possible, **options)
+
+
+def pose_of(env: Environment) -> Pose:
+    inner: Any = env.unwrapped
+    column, row = (int(value) for value in inner.agent_pos)
+    theta = math.remainder(-inner.agent_dir * math.pi / 2, 2.0 * math.pi)
+    return column + 0.5, inner.height - row - 0.5, theta
+
+
+def grid_of(env: Environment) -> OccupancyGrid:
+    """The cells that cannot be entered now."""
+    inner: Any = env.unwrapped
+    cells = [inner.grid.get(column, row) for row in range(inner.height) for column in range(inner.width)]
+    occupied = np.array([cell is not None and not cell.can_overlap() for cell in cells])
+    return OccupancyGrid(occupied.reshape(inner.height, inner.width)[::-1], 1.0)
+
+
+def rooms_of(env: Environment) -> dict[str, Region]:
+    """The rooms of a RoomGrid, without their walls; {} for other environments."""
+    inner = env.unwrapped
+    if not isinstance(inner, RoomGrid):
+        return {}
+    found: dict[str, Region] = {}
+    for r, line in enumerate(inner.room_grid):
+        for c, room in enumerate(line):
+            (left, top), (width, height) = room.top, room.size
+            low = (left + 1.0, inner.height - (top + height - 1.0))
+            high = (left + width - 1.0, inner.height - (top + 1.0))
+            found[f"Room_{c}_{r}"] = Rectangle(low, high)
+    return found
+
+
+def possible(env: Environment) -> Bools:
+    """[7]: the actions after which the map is as it was."""
+    inner: Any = env.unwrapped
+    allowed = np.ones(len(Actions), bool)
+    allowed[Actions.toggle] = inner.grid.get(*inner.front_pos) is None
+    allowed[Actions.drop] = inner.carrying is None
+    return allowed

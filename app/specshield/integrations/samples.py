@@ -1,0 +1,75 @@
+"""Policies that answer with samples of continuous actions, inside a rule.
+
+A shield chooses among a robot's actions. A policy such as pi0 offers samples instead: so each sample is read
+as the action that is nearest to its motion, and how many samples each action has is the model's distribution.
+The sample that is run is one of those of the action that the shield drew, as it came from the model.
+
+What this cannot do: a policy that gives the same sample each time has one action, and where that is forbidden
+the certified continuation is run instead; only the first row of a chunk is run and judged; between the
+sample and its nearest action there is a gap, which the session sees as a residual (`uncertainty="learned"`
+keeps a margin for it, and the guarantee is then no better than that).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.client.models import Decision, Pose
+from specshield.errors import InputError
+from specshield.robot import Robot
+
+
+class Session(Protocol):
+    """What a LocalSession and a session of the SDK have in common, as far as it is needed here."""
+
+    main_task_done: bool
+
+    def step(self, pose: Any, logits: Any = None, *, main_task_done: bool | None = None) -> Any: ...
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """sample: the index of the sample to run, None where none is allowed and the robot's `action` is run."""
+
+    action: int
+    sample: int | None
+    decision: Decision
+
+
+@dataclass(frozen=True)
+class SampleShield:
+    """Chooses among samples.
+
+    robot: the one that the session's policy was made for. pose_of: (x, y, theta) in the map's frame, from an
+    observation. command_of: how far a sample's first row moves [m] and turns [rad] the robot in one step.
+    """
+
+    session: Session
+    robot: Robot
+    pose_of: Callable[[Any], Pose]
+    command_of: Callable[[Floats], tuple[float, float]]
+
+    def choose(self, rows: Sequence[Floats], observation: Any) -> Chosen:
+        """rows: the first row of each sample. One decision of the session. Raises InputError for none."""
+        if not len(rows):
+            raise InputError("no samples", path="rows", got=0, expected="at least one")
+        meant = np.array([nearest_action(self.robot, *self.command_of(row)) for row in rows])
+        shares = np.bincount(meant, minlength=len(self.robot.actions)) / len(meant)
+        with np.errstate(divide="ignore"):
+            decision = self.session.step(
+                self.pose_of(observation), np.log(shares), main_task_done=self.session.main_task_done
+            )
+        own = np.flatnonzero(meant == decision.execute)
+        return Chosen(decision.execute, int(own[0]) if len(own) else None, decision)
+
+
+def nearest_action(robot: Robot, translate: float, rotate: float) -> int:
+    """The action whose motion is nearest to [m], [rad]; a turn counts as its arc at the footprint's edge."""
+    motions = np.array(robot.motions) - (translate, rotate)
+    gap = np.hypot(motions[:, 0], robot.radius * motions[:, 1])
+    return int(robot.representative[int(np.argmin(gap))])

@@ -1,0 +1,121 @@
+"""Somebody's drive from a rosbag2, judged by a rule: would it have been kept, and from where not any more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.client.models import Pose, Verdict
+from specshield.errors import InputError
+from specshield.local import LocalShield
+
+POSES = {  # message types that hold a pose in one frame, and where in them
+    "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
+    "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
+}
+
+
+@dataclass(frozen=True)
+class Judged:
+    """lost: the first step from which no future was found that keeps the rule, None where there always was
+    one. last: the pose before it. left: the steps that the drive lacks to the horizon.
+    """
+
+    verdict: Verdict
+    steps: int
+    lost: int | None
+    last: Pose | None
+    left: int
+
+
+def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floats:
+    """Poses [n, 3], one every `step_seconds` from the first on, each the newest there is by then.
+
+    bag: a folder of rosbag2 (or a rosbag1 file). topic: one with poses in the map's frame; None: the only
+    one there is. Raises InputError.
+    """
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            known = {c.topic: c for c in reader.connections if c.msgtype in POSES}
+            if topic is None and len(known) == 1:
+                topic = next(iter(known))
+            if topic not in known:
+                raise InputError(
+                    "the bag does not say which poses are meant" if topic is None else "no poses there",
+                    path="--topic",
+                    got=topic,
+                    expected=f"one of {', '.join(sorted(known)) or 'none in this bag'}",
+                )
+            found = [
+                (at * 1e-9, *_planar(POSES[c.msgtype](reader.deserialize(raw, c.msgtype))))
+                for c, at, raw in reader.messages(connections=[known[topic]])
+            ]
+    except (AnyReaderError, OSError) as error:
+        raise InputError(f"the bag cannot be read: {error}", path="BAG", got=str(bag)) from None
+    if not found:
+        raise InputError("no poses on this topic", path="--topic", got=topic, expected="at least one")
+    samples = np.array(found)
+    wanted = np.arange(samples[0, 0], samples[-1, 0] + 1e-9, step_seconds)
+    newest = np.searchsorted(samples[:, 0], wanted + 1e-9, side="right") - 1
+    poses: Floats = samples[newest, 1:]
+    return poses
+
+
+def check_drive(shield: LocalShield, poses: Floats) -> Judged:
+    """poses [n, 3]: x_0 .. x_{n-1} in the map's frame, a step apart; those past the horizon are left out."""
+    horizon = shield.task.horizon
+    poses = poses[: horizon + 1]
+    actions, lost = len(shield.task.robot.actions), None
+    start = tuple(poses[0].tolist())
+    session = shield.session(
+        initial_pose=start, uncertainty="none", learn_map=False, allow_infeasible=True, max_steps=horizon + 1
+    )
+    for t, pose in enumerate(poses):
+        decision = session.step(pose, np.zeros(actions), main_task_done=False)
+        if decision.spec_status == "violated" or (
+            decision.spec_status == "pending" and not any(decision.j_values)
+        ):
+            lost = t
+            break
+        if decision.spec_status == "satisfied":
+            break
+    for pose in poses[session.t :]:
+        session.record(pose)
+    before = None if not lost else tuple(poses[lost - 1].tolist())
+    return Judged(session.close(), len(poses), lost, before, horizon + 1 - len(poses))
+
+
+def told(shield: LocalShield, judged: Judged, step_seconds: float) -> Iterator[str]:
+    """What came of it, in lines for people."""
+    yield f"rule: {shield.task.formula}"
+    yield f"drive: {judged.steps} steps of {step_seconds:g} s"
+    status = judged.verdict.spec_status
+    words = {"satisfied": "kept", "violated": "broken", "pending": f"open: {judged.left} steps are missing"}
+    yield f"the rule is {words[status]}"
+    if judged.lost is None:
+        yield "a way to keep it was there at every step"
+    elif judged.last is None:
+        yield "no way to keep it was found from the first pose on"
+    else:
+        x, y, theta = judged.last
+        at = (judged.lost - 1) * step_seconds
+        yield (
+            f"a way to keep it was there until step {judged.lost - 1} ({at:g} s), at x {x:.2f}, y {y:.2f}, "
+            f"theta {theta:.2f}; none was found from step {judged.lost} on"
+        )
+
+
+def _planar(pose: Any) -> Pose:
+    p, q = pose.position, pose.orientation
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    return p.x, p.y, yaw

@@ -1,0 +1,126 @@
+"""A session as MCAP, with the schemas that Foxglove draws: map, pose and scene, and each decision as JSON.
+
+Topics: `/map` (foxglove.Grid), `/pose` (foxglove.PoseInFrame), `/scene` (foxglove.SceneUpdate: regions, the
+way that was driven, the certified continuation), `/decision` (specshield.Decision, the answer as it was
+given). Everything is in the frame `map`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import foxglove
+import numpy as np
+from foxglove import messages as fox
+from foxglove.channels import GridChannel, PoseInFrameChannel, SceneUpdateChannel
+
+from specshield.arrays import Floats
+from specshield.recordings.outline import outlines
+from specshield.recordings.recording import Recording
+from specshield.world.occupancy import OccupancyGrid
+
+FRAME = "map"
+REGION = fox.Color(r=0.2, g=0.5, b=0.9, a=0.9)
+DRIVEN = fox.Color(r=0.9, g=0.5, b=0.1, a=1.0)
+AHEAD = fox.Color(r=0.2, g=0.7, b=0.3, a=0.9)
+DECISION = {
+    "title": "specshield.Decision",
+    "type": "object",
+    "properties": {
+        "t": {"type": "integer"},
+        "mode": {"type": "string"},
+        "action_name": {"type": "string"},
+        "spec_status": {"type": "string"},
+        "feasible_mass": {"type": ["number", "null"]},
+        "kl": {"type": ["number", "null"]},
+        "distribution": {"type": "array", "items": {"type": "number"}},
+    },
+}
+
+
+def write_mcap(recording: Recording, path: Path) -> None:
+    context = foxglove.Context()
+    with foxglove.open_mcap(path, allow_overwrite=True, context=context):
+        grids, poses = GridChannel("/map", context=context), PoseInFrameChannel("/pose", context=context)
+        scenes = SceneUpdateChannel("/scene", context=context)
+        schema = foxglove.Schema(
+            name="specshield.Decision", encoding="jsonschema", data=json.dumps(DECISION).encode()
+        )
+        decisions = foxglove.Channel("/decision", schema=schema, message_encoding="json", context=context)
+        for item in recording.items:
+            seconds = recording.seconds(item.t)
+            now, at = fox.Timestamp.from_epoch_secs(seconds), round(seconds * 1e9)
+            if item.t == 0:
+                if recording.grid is not None:
+                    grids.log(_grid(recording.grid, now), log_time=at)
+                scenes.log(fox.SceneUpdate(entities=_regions(recording, now)), log_time=at)
+            poses.log(fox.PoseInFrame(timestamp=now, frame_id=FRAME, pose=_pose(*item.pose)), log_time=at)
+            driven = np.array([each.pose for each in recording.items[: item.t + 1]])
+            lines = [
+                fox.SceneEntity(timestamp=now, frame_id=FRAME, id=name, lines=[_line(way[:, :2], color)])
+                for name, way, color in (
+                    ("driven", driven, DRIVEN), ("continuation", recording.ahead(item.t), AHEAD)
+                )
+            ]  # fmt: skip
+            scenes.log(fox.SceneUpdate(entities=lines), log_time=at)
+            if item.decision is not None:
+                decisions.log(json.dumps(item.decision).encode(), log_time=at)
+
+
+def _regions(recording: Recording, now: fox.Timestamp) -> list[fox.SceneEntity]:
+    found = []
+    for name, region in recording.regions.items():
+        lines = outlines(region)
+        x, y = lines[0][:-1].mean(axis=0)
+        label = fox.TextPrimitive(
+            pose=_pose(x, y, 0.0),
+            billboard=True,
+            font_size=12.0,
+            scale_invariant=True,
+            color=REGION,
+            text=name,
+        )
+        found.append(
+            fox.SceneEntity(
+                timestamp=now,
+                frame_id=FRAME,
+                id=f"region/{name}",
+                texts=[label],
+                lines=[_line(line, REGION) for line in lines],
+            )
+        )
+    return found
+
+
+def _grid(grid: OccupancyGrid, now: fox.Timestamp) -> fox.Grid:
+    """One byte a cell: 1 is occupied."""
+    field = fox.PackedElementField(name="occupied", offset=0, type=fox.PackedElementFieldNumericType.Uint8)
+    return fox.Grid(
+        timestamp=now,
+        frame_id=FRAME,
+        pose=_pose(*grid.origin),
+        column_count=grid.width,
+        cell_size=fox.Vector2(x=grid.resolution, y=grid.resolution),
+        row_stride=grid.width,
+        cell_stride=1,
+        fields=[field],
+        data=grid.occupied.astype(np.uint8).tobytes(),
+    )
+
+
+def _pose(x: float, y: float, theta: float) -> fox.Pose:
+    turned = fox.Quaternion(x=0.0, y=0.0, z=math.sin(theta / 2.0), w=math.cos(theta / 2.0))
+    return fox.Pose(position=fox.Vector3(x=float(x), y=float(y), z=0.0), orientation=turned)
+
+
+def _line(points: Floats, color: fox.Color) -> fox.LinePrimitive:
+    return fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineStrip,
+        pose=_pose(0.0, 0.0, 0.0),
+        thickness=2.0,
+        scale_invariant=True,
+        points=[fox.Point3(x=float(x), y=float(y), z=0.0) for x, y in points],
+        color=color,
+    )

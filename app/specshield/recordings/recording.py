@@ -1,0 +1,126 @@
+"""A session as it is written to files: where the robot was, what it was told, and what it moved on."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import Image
+
+from specshield.arrays import Floats
+from specshield.client.models import TrajectoryItem
+from specshield.errors import InputError
+from specshield.robot import Robot, robot_from_json
+from specshield.robot.dynamics import make_body, step
+from specshield.task import parse_regions
+from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Region
+
+if TYPE_CHECKING:
+    from specshield.client import ShieldClient
+    from specshield.local import LocalSession
+    from specshield.service.sessions.chain import Chain
+
+
+@dataclass(frozen=True)
+class Recording:
+    """items: one a step, x_0 first. grid, robot: None where they are not at hand; ways ahead are then not
+    drawn. begun: the time of x_0 [s since 1970]. step_seconds: how long a step took [s].
+    """
+
+    id: str
+    formula: str
+    actions: Sequence[str]
+    regions: Mapping[str, Region]
+    items: Sequence[TrajectoryItem]
+    grid: OccupancyGrid | None = None
+    robot: Robot | None = None
+    begun: float = 0.0
+    step_seconds: float = 1.0
+
+    def seconds(self, t: int) -> float:
+        """When step t was [s since 1970]."""
+        return self.begun + t * self.step_seconds
+
+    def ahead(self, t: int) -> Floats:
+        """The certified continuation at step t, as poses [n, 3] from x_t on; only x_t where there is none."""
+        item, ahead = self.items[t], [self.items[t].pose]
+        decision = item.decision
+        if decision is None or decision.get("witness") is None or self.grid is None or self.robot is None:
+            return np.array(ahead)
+        action = decision["action"]
+        if self.robot.actions[action].terminal:
+            action = decision["completion_action"]
+        body = make_body(self.robot, self.grid)
+        for each in (action, *decision["witness"]):
+            motion = int(self.robot.motion_of[each])
+            if motion >= 0:
+                ahead.append(step(body, *ahead[-1], motion))
+        return np.array(ahead)
+
+
+def of_local(session: LocalSession, step_seconds: float = 1.0) -> Recording:
+    """Of a session in process, up to now."""
+    task = session.task
+    return Recording(
+        session.id,
+        str(task.formula),
+        session.info.actions,
+        task.regions,
+        session.trajectory(),
+        task.grid,
+        task.robot,
+        time.time(),
+        step_seconds,
+    )
+
+
+def of_record(
+    chain: Chain, grid: OccupancyGrid | None, rooms: Mapping[str, Region], step_seconds: float = 1.0
+) -> Recording:
+    """Of a session's record, which a server gives (`GET /v1/sessions/{id}/record`).
+
+    grid, rooms: of its map, None and {} where that is not at hand. Raises InputError for one with a switch.
+    """
+    from specshield.service.schemas.answers import to_json
+    from specshield.service.sessions import record
+
+    if len(chain.configs) > 1:
+        raise InputError(
+            "the session had several rules, and one is written to a file",
+            got=len(chain.configs),
+            expected="a session without a switch",
+        )
+    config, names = chain.configs[0], chain.names[0]
+    begun = datetime.fromisoformat(config.created_at).timestamp() if config.created_at else 0.0
+    items = []
+    for t, row in enumerate(chain.rows):
+        content = chain.steps[t] if t < len(chain.steps) else b""
+        held = row.tolist()
+        told = to_json(record.answer(record.decode(content), row, config.actions)) if content else b"null"
+        pose = (held[0], held[1], held[2])
+        items.append(TrajectoryItem(t, pose, dict(zip(names, held[3:], strict=True)), json.loads(told)))
+    return Recording(
+        config.id,
+        config.spec.formula,
+        config.actions,
+        {**rooms, **parse_regions(config.spec.regions)},
+        items,
+        grid,
+        robot_from_json(config.robot),
+        begun,
+        step_seconds,
+    )
+
+
+def map_of_service(client: ShieldClient, map_id: str) -> tuple[OccupancyGrid, Mapping[str, Region]]:
+    """A server's map, from what it shows of it: in the picture black is occupied, row 0 the highest y."""
+    about = client.maps.get(map_id)
+    pixels = np.asarray(Image.open(io.BytesIO(client.maps.image(map_id))).convert("L"))
+    return OccupancyGrid(pixels[::-1] < 128, about.resolution, about.origin), parse_regions(dict(about.rooms))

@@ -1,0 +1,59 @@
+"""A session as a table, one row a step: CSV, and Parquet by pyarrow."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+from specshield.recordings.recording import Recording
+
+TOLD = (
+    "mode", "action", "action_name", "completion_action", "spec_status", "feasible_mass", "kl", "reason",
+    "margin", "slack", "threshold_left", "map_revision", "finished", "in_collision",
+)  # fmt: skip
+
+
+def rows(recording: Recording) -> list[dict[str, Any]]:
+    """The step, when it was, pose and signals, what was told of it, and pi* and rho of each action.
+
+    What was told is None where a pose was sent without a decision.
+    """
+    found = []
+    for item in recording.items:
+        x, y, theta = item.pose
+        row: dict[str, Any] = {
+            "t": item.t,
+            "seconds": recording.seconds(item.t),
+            "x": x,
+            "y": y,
+            "theta": theta,
+        }
+        row |= {f"signal_{name}": value for name, value in item.signals.items()}
+        told = item.decision or {}
+        row |= {name: told.get(name) for name in TOLD}
+        residual = told.get("residual") or {}
+        row |= {f"residual_{kind}": residual.get(kind) for kind in ("translation", "rotation")}
+        for kind, short in (("distribution", "p"), ("robustness", "rho")):
+            values = told.get(kind) or [None] * len(recording.actions)
+            row |= {f"{short}_{name}": v for name, v in zip(recording.actions, values, strict=True)}
+        found.append(row)
+    return found
+
+
+def write_csv(recording: Recording, path: Path) -> None:
+    table = rows(recording)
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(table[0]))
+        writer.writeheader()
+        writer.writerows(table)
+
+
+def write_parquet(recording: Recording, path: Path) -> None:
+    """The rule and the actions are in the file's metadata."""
+    import pyarrow as arrow
+    from pyarrow import parquet
+
+    table = arrow.Table.from_pylist(rows(recording))
+    about = {"session": recording.id, "formula": recording.formula, "actions": ",".join(recording.actions)}
+    parquet.write_table(table.replace_schema_metadata(about), path)

@@ -1,0 +1,70 @@
+"""The page at `/`: files that go to a browser as they are, from memory.
+
+They hold nothing of anybody's, so that they need no key; what they show they ask of the API, as any caller.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from fastapi import APIRouter, Request, Response
+
+from specshield.errors import NotFound
+
+router = APIRouter(include_in_schema=False)
+FOLDER = Path(__file__).parent / "static"
+TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
+POLICY = (  # nothing from elsewhere, no script or style in the page itself, and no frame around it
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",  # kept, and asked for by its tag: a new version shows at once
+    "Vary": "Accept-Encoding",
+}
+
+
+@dataclass(frozen=True)
+class File:
+    """packed: gzip of the content. tag: what a browser shows to hear that it has it already."""
+
+    kind: str
+    content: bytes
+    packed: bytes
+    tag: str
+
+
+@cache
+def files() -> dict[str, File]:
+    """By path below `static`; 60 kB, read at the first request."""
+    found = {}
+    for path in sorted(FOLDER.rglob("*")):
+        if path.suffix in TYPES:
+            content = path.read_bytes()
+            tag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+            kind = TYPES[path.suffix]
+            found[path.relative_to(FOLDER).as_posix()] = File(
+                kind, content, gzip.compress(content, 9, mtime=0), tag
+            )
+    return found
+
+
+@router.get("/")
+@router.get("/page/{path:path}")
+async def page(request: Request, path: str = "index.html") -> Response:
+    file = files().get(path)
+    if file is None:
+        raise NotFound(f"there is no page {path!r}", got=path, expected="the page at /, or a path of /docs")
+    headers = {**HEADERS, "ETag": file.tag}
+    if request.headers.get("if-none-match") == file.tag:
+        return Response(status_code=304, headers=headers)
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        return Response(file.packed, media_type=file.kind, headers={**headers, "Content-Encoding": "gzip"})
+    return Response(file.content, media_type=file.kind, headers=headers)

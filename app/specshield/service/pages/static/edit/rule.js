@@ -1,0 +1,113 @@
+// The rule as text: checked while it is written, the error underlined where it is, its windows on a time line.
+
+import { ask } from "../lib/api.js";
+import { button, el, later } from "../lib/dom.js";
+import { timeline } from "./timeline.js";
+
+const PATTERNS = [
+  ["be there once", (name) => `F[0,60] ${name}`],
+  ["stay there a while", (name) => `F[0,60] G[0,5] ${name}`],
+  ["keep the body out", (name) => `G[0,120] not touches(${name})`],
+];
+
+export class Rule {
+  /** told: called with the server's answer for a rule that is right, with null for one that is not. */
+  constructor(text, map, regions, told) {
+    Object.assign(this, { map, regions, told });
+    this.under = el("pre", { "aria-hidden": "true", class: "under" });
+    this.input = el("textarea", {
+      id: "rule", rows: 4, spellcheck: "false", autocomplete: "off", autocapitalize: "off", "aria-describedby": "rule-said",
+      oninput: () => this.changed(), onscroll: () => (this.under.scrollTop = this.input.scrollTop),
+    });
+    this.input.value = text;
+    this.said = el("p", { id: "rule-said", class: "said", role: "status" });
+    this.lines = el("div", { class: "windows" });
+    this.patterns = el("div", { class: "row", role: "group", "aria-label": "Add to the rule" });
+    this.element = el(
+      "section",
+      { class: "card", "aria-label": "Rule" },
+      el("h2", {}, el("label", { for: "rule" }, "Rule")),
+      this.patterns,
+      el("div", { class: "text" }, this.under, this.input),
+      this.said,
+      this.lines,
+      el("details", { class: "help" }, el("summary", {}, "How rules are written"), help()),
+    );
+    this.check = later(() => this.checkNow(), 200);
+    this.show(null);
+    this.changed();
+  }
+
+  get text() {
+    return this.input.value.trim();
+  }
+
+  changed() {
+    this.mark(null);
+    this.check();
+  }
+
+  /** A region is there, or has another name: [from, to]. */
+  renamed(from, to) {
+    this.input.value = this.input.value.replace(new RegExp(`\\b${from}\\b`, "g"), to);
+  }
+
+  /** name: of the region that the patterns are about. */
+  show(name) {
+    this.name = name ?? this.name ?? Object.keys(this.regions).at(-1) ?? Object.keys(this.map.rooms)[0];
+    if (!this.name) return this.patterns.replaceChildren();
+    const add = ([words, of]) => button(`${this.name}: ${words}`, () => this.add(of(this.name)));
+    this.patterns.replaceChildren(...PATTERNS.map(add));
+  }
+
+  add(part) {
+    this.input.value = this.text ? `${this.text} and ${part}` : part;
+    this.input.focus();
+    this.changed();
+  }
+
+  async checkNow() {
+    const { text } = this;
+    this.asked?.abort();
+    this.asked = new AbortController();
+    if (!text) return this.tell("Draw a region, then say when the robot has to be where.", null);
+    const body = { formula: this.input.value, regions: this.regions, map_id: this.map.id };
+    try {
+      const answer = await ask("v1/specs/validate", { json: body, signal: this.asked.signal });
+      this.tell(`It looks at ${answer.horizon + 1} states: steps 0 to ${answer.horizon}.`, answer);
+    } catch (error) {
+      if (error.name === "AbortError") return;
+      this.tell(error.told?.() ?? error.message, null, error.position ?? 0);
+    }
+  }
+
+  tell(said, answer, position = null) {
+    this.said.textContent = said;
+    this.said.classList.toggle("wrong", position !== null);
+    this.input.setAttribute("aria-invalid", String(position !== null));
+    this.mark(position);
+    this.lines.replaceChildren(...(answer ? [timeline(answer)] : []));
+    this.told(answer);
+  }
+
+  /** Underlines the word at a position of the text. */
+  mark(position) {
+    const text = this.input.value;
+    if (position === null) return this.under.replaceChildren(text);
+    const at = Math.min(position, text.length);
+    const word = /^(\w+|.)?/s.exec(text.slice(at))[0] || " ";
+    this.under.replaceChildren(text.slice(0, at), el("mark", {}, word), text.slice(at + word.length));
+  }
+}
+
+function help() {
+  const rows = [
+    ["F[0,60] Dock", "at some step from 0 to 60 the robot's origin is in Dock"],
+    ["G[0,120] not touches(Stairs)", "at no step up to 120 does its body touch Stairs"],
+    ["inside(Dock)", "all of its body is in Dock"],
+    ["F[0,60] G[0,5] Dock", "it gets there by step 60, and stays for five more"],
+    ["A U[0,30] B", "it is in A until it is in B, by step 30"],
+    ["and   or   not   implies", "join parts; a step is one decision"],
+  ];
+  return el("dl", {}, rows.flatMap(([code, said]) => [el("dt", {}, el("code", {}, code)), el("dd", {}, said)]));
+}

@@ -1,0 +1,155 @@
+// What was asked and answered at one step: the mode in words, and for each action what the model wanted of it,
+// what it got, and whether the rule can still be kept after it.
+
+import { el, metres, pair, percent } from "../lib/dom.js";
+
+const MODES = {
+  prior: "The rule is settled: the model chooses alone.",
+  shaped: "The closest to what the model wants that keeps the rule within reach.",
+  completion: "The model has ended its task; the certified continuation completes the rule.",
+  fallback: "Nothing that the model wants keeps the rule: the certified continuation decides.",
+  violated: "The rule is broken; what can still be kept of it is kept.",
+};
+const REASONS = {
+  infeasible: "no future was found that keeps the rule",
+  zero_prior_mass: "the model gives no probability to any action that keeps the rule",
+  margin_unattainable: "the margin that was asked for cannot be had; the largest there is, is kept",
+};
+const SEEN = 0.001; // a share below this is told with the rest
+
+/** The model's own distribution: softmax of its logits. */
+export function prior(logits) {
+  if (!logits) return null;
+  const most = Math.max(...logits.filter((value) => value !== null));
+  const weights = logits.map((value) => (value === null ? 0 : Math.exp(value - most)));
+  const sum = weights.reduce((total, weight) => total + weight, 0);
+  return weights.map((weight) => weight / sum);
+}
+
+/** Why an action is forbidden, in words. */
+export function whyNot(decision, action) {
+  const value = decision.robustness[action];
+  const told = decision.explanations?.[action];
+  if (told) {
+    const late = told.late_by ? `${told.late_by} steps too late` : null;
+    const misses = told.robustness === null ? null : `misses by ${metres(Math.abs(told.robustness))}`;
+    return `${told.conjunct} could not be kept: ${[late, misses].filter(Boolean).join(", ") || "no way was found"}`;
+  }
+  if (value === null || value === undefined) return "was not looked at";
+  return `no way was found that keeps the rule; the best misses it by ${metres(Math.abs(Math.min(0, value)))}`;
+}
+
+export class Panel {
+  constructor(session) {
+    this.session = session;
+    this.element = el("section", { class: "card panel", "aria-label": "The decision at this step" });
+  }
+
+  show(item) {
+    const { decision } = item;
+    const head = el(
+      "div",
+      { class: "row spread" },
+      el("h2", {}, `Step ${item.t}`, el("small", {}, ` of ${this.session.horizon}`)),
+      decision && el("span", { class: `badge ${decision.spec_status}` }, decision.spec_status),
+    );
+    if (!decision) {
+      this.element.replaceChildren(head, el("p", {}, "No decision was asked for at this step."));
+      return;
+    }
+    const open = this.element.querySelector("details")?.open;
+    this.element.replaceChildren(head, ...this.mode(decision), this.numbers(decision), this.actions(item));
+    if (open) this.element.querySelector("details")?.setAttribute("open", "");
+  }
+
+  mode(decision) {
+    const reason = REASONS[decision.reason] ?? decision.reason;
+    const warnings = decision.warnings.map((text) => el("li", {}, text));
+    if (decision.in_collision) warnings.push(el("li", {}, "The robot touches an obstacle."));
+    return [
+      el("p", { class: "mode" }, el("strong", {}, decision.mode), " ", MODES[decision.mode] ?? "", reason ? ` (${reason})` : ""),
+      warnings.length ? el("ul", { class: "warnings" }, warnings) : null,
+    ].filter(Boolean);
+  }
+
+  numbers(decision) {
+    const { feasible_mass: mass, kl, residual, margin, slack, threshold_left: left, map_revision: revision } = decision;
+    const off = residual && `${metres(residual.translation)}, ${((180 * residual.rotation) / Math.PI).toFixed(1)}°`;
+    return el(
+      "dl",
+      { class: "numbers" },
+      pair("Feasible mass", mass === null ? "–" : percent(mass)),
+      pair("Distance from the model", kl === null ? "–" : `${kl.toFixed(2)} nats`),
+      pair("Off the expected pose", off ?? "–"),
+      margin === undefined ? null : pair("Margin, slack", `${metres(margin)}, ${slack} steps`),
+      left === undefined || left === null || left === 1 ? null : pair("Threshold left", left.toFixed(3)),
+      revision ? pair("Own map", `changed ${revision} times`) : null,
+    );
+  }
+
+  actions({ decision, logits }) {
+    const wanted = prior(logits);
+    const { actions, robot } = this.session;
+    if (decision.distribution.length !== actions.length) return el("p", {}, "Decided for another robot, before a switch.");
+    const groups = alike(robot.actions);
+    const rows = groups.map((group) => this.row(group.map((i) => actions[i]), robot.actions[group[0]], group, decision, wanted));
+    const sum = (values, group) => (values ? group.reduce((total, i) => total + values[i], 0) : 0);
+    const shares = groups.map((group) => Math.max(sum(decision.distribution, group), sum(wanted, group)));
+    const seen = groups.map((group, k) => shares[k] >= SEEN || group.includes(decision.action));
+    const heads = ["Action", "Wanted and got", "Then the rule"].map((name) => el("th", { scope: "col" }, name));
+    const table = (some) =>
+      el("table", { class: "actions" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, some));
+    const rest = rows.filter((_, i) => !seen[i]);
+    return el(
+      "div",
+      {},
+      el("p", { class: "key" }, el("i", { class: "wanted" }), "what the model wants ", el("i", { class: "got" }), "what it gets"),
+      table(rows.filter((_, i) => seen[i])),
+      rest.length ? el("details", {}, el("summary", {}, `${rest.length} more that are below 0.1 %`), table(rest)) : null,
+    );
+  }
+
+  /** group: the actions that do the same; they share a row. */
+  row(names, action, group, decision, wanted) {
+    const sum = (values) => group.reduce((total, i) => total + values[i], 0);
+    const [want, get] = [wanted ? sum(wanted) : null, sum(decision.distribution)];
+    const bars = el(
+      "td",
+      { class: "bars", "aria-label": `wanted ${want === null ? "unknown" : percent(want)}, got ${percent(get)}` },
+      want === null ? null : bar("wanted", want),
+      bar("got", get),
+    );
+    const drawn = group.includes(decision.action) ? el("span", { class: "drawn", title: "The action drawn at this step" }, "drawn") : null;
+    const head = el("th", { scope: "row", title: names.join(", ") }, names[0], names.length > 1 ? ` and ${names.length - 1} more` : "", drawn);
+    head.append(el("small", { class: "does" }, does(action)));
+    return el("tr", {}, head, bars, verdict(decision, group[0], action));
+  }
+}
+
+/** Indices of the actions, those that do the same together. */
+function alike(actions) {
+  const does = ({ translate, rotate, terminal }) => `${translate} ${rotate} ${terminal}`;
+  return [...Map.groupBy(actions.keys(), (i) => does(actions[i])).values()];
+}
+
+function bar(kind, share) {
+  const line = el("i", { class: kind });
+  line.style.width = `${(100 * share).toFixed(1)}%`;
+  return el("span", {}, line, el("small", {}, percent(share)));
+}
+
+function verdict(decision, i, action) {
+  if (action.terminal) return el("td", { class: "told" }, "ends the model's task");
+  const [j, value] = [decision.j_values[i], decision.robustness[i]];
+  if (j === null) return el("td", { class: "told" }, "was not looked at");
+  if (j > 0 || (j !== 0 && value > 0)) return el("td", { class: "told can" }, "can be kept", el("small", {}, ` by ${metres(value)}`));
+  return el("td", { class: "told cannot" }, el("strong", {}, "forbidden: "), whyNot(decision, i));
+}
+
+/** What an action does, in words. */
+export function does({ translate, rotate, terminal }) {
+  if (terminal) return "ends the task";
+  const turn = rotate && `turns ${((180 * rotate) / Math.PI).toFixed(0)}°`;
+  const go = translate && `moves ${translate.toFixed(2)} m`;
+  return [go, turn].filter(Boolean).join(", ") || "leaves the base where it is";
+}

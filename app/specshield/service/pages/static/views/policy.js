@@ -1,0 +1,72 @@
+// One policy: how far it is, and from where its rule can be kept.
+
+import { ask, picture } from "../lib/api.js";
+import { called, el, pair, percent, say } from "../lib/dom.js";
+
+const EVERY = 700; // [ms] between two looks while it is made
+
+export async function show(place, { id, signal }) {
+  const path = `v1/policies/${encodeURIComponent(id)}`;
+  let policy = await ask(path, { signal });
+  const state = el("section", { class: "card", "aria-label": "State" });
+  const figure = el("figure", { class: "heat" });
+  place.append(
+    el("h1", {}, called(policy)),
+    el("div", { class: "watch" }, figure, el("div", { class: "stack" }, state, about(policy))),
+  );
+  state.replaceChildren(...stands(policy));
+  watchOver();
+
+  async function watchOver() {
+    try {
+      while (policy.status === "queued" || policy.status === "training") {
+        await new Promise((done) => setTimeout(done, EVERY));
+        if (signal.aborted) return;
+        policy = await ask(path, { signal });
+        state.replaceChildren(...stands(policy));
+      }
+      if (policy.status !== "ready") return say("The policy could not be made.");
+      say("The policy is ready.");
+      figure.replaceChildren(el("p", { role: "status" }, "Looking from where the rule can be kept …"));
+      const image = el("img", { alt: `From where ${policy.spec.formula} can be kept`, class: "whole" });
+      image.src = URL.createObjectURL(await picture(`${path}/image.svg`, { signal }));
+      figure.replaceChildren(image);
+    } catch (error) {
+      if (!signal.aborted) figure.replaceChildren(el("p", { class: "problem", role: "alert" }, error.told?.() ?? error.message));
+    }
+  }
+}
+
+function stands(policy) {
+  const left = policy.eta_s === null ? "" : `, about ${Math.ceil(policy.eta_s)} s left`;
+  const head = el("div", { class: "row spread" }, el("h2", {}, "State"), el("span", { class: `badge ${policy.status}` }, policy.status));
+  if (policy.status === "failed") return [head, el("p", { class: "problem", role: "alert" }, policy.error ?? "It failed.")];
+  if (policy.status !== "ready")
+    return [head, el("progress", { max: 1, value: policy.progress, "aria-label": "Progress" }), el("p", {}, `${percent(policy.progress)}${left}`)];
+  const share = policy.metrics.feasible_start;
+  return [
+    head,
+    typeof share === "number" ? el("p", {}, `From ${percent(share)} of the places that it looked at, the rule can be kept.`) : null,
+    share === 0 ? el("p", { class: "problem", role: "alert" }, "From no place can this rule be kept: its windows may be too short, or a region out of reach.") : null,
+    el("p", {}, el("a", { class: "button main", href: `#/try/${policy.id}` }, "Try it")),
+  ].filter(Boolean);
+}
+
+function about(policy) {
+  const robot = typeof policy.robot === "string" ? policy.robot : "one of its own";
+  return el(
+    "section",
+    { class: "card", "aria-label": "About this policy" },
+    el("h2", {}, "Rule"),
+    el("p", {}, el("code", {}, policy.spec.formula)),
+    el(
+      "dl",
+      { class: "numbers" },
+      pair("Map", el("a", { href: `#/maps/${policy.map_id}` }, policy.map_id.slice(0, 8))),
+      pair("Robot", robot),
+      pair("Method", policy.method),
+      pair("Horizon", `${policy.horizon} steps`),
+    ),
+    el("p", { class: "id" }, policy.id),
+  );
+}

@@ -1,0 +1,57 @@
+// One session, live and from its beginning.
+
+import { ask } from "../lib/api.js";
+import { el, pair, say } from "../lib/dom.js";
+import { follow } from "../lib/live.js";
+import { Watch } from "./watch.js";
+
+export async function show(place, { id, signal }) {
+  const path = `v1/sessions/${encodeURIComponent(id)}`;
+  const session = await ask(path, { signal });
+  const map = await ask(`v1/maps/${session.map_id}`, { signal });
+  const watch = new Watch(session, map);
+  place.append(
+    el("div", { class: "row spread" }, el("h1", {}, session.id), el("p", { class: "state", role: "status" })),
+    watch.element,
+  );
+  watch.side.append(about(session));
+  await watch.load(signal);
+  const { items } = await ask(`${path}/trajectory`, { signal });
+  for (const item of items) watch.push(item);
+  watch.show();
+  state(place, session.finished, session.spec_status);
+  if (!session.finished) listen(place, watch, id, items, signal);
+}
+
+async function listen(place, watch, id, items, signal) {
+  const last = items.findLast((item) => item.decision)?.t ?? -1;
+  await follow(new Map([[id, last]]), (item) => {
+    if (item.rule >= watch.session.rules?.length) return dispatchEvent(new Event("hashchange")); // another rule
+    if (!item.finished) return watch.push(item);
+    state(place, true, item.spec_status);
+    say(`The session is over: the rule is ${item.spec_status}.`);
+  }, signal).catch((error) => place.append(el("p", { class: "problem", role: "alert" }, error.message)));
+}
+
+function state(place, finished, status) {
+  place.querySelector(".state").textContent = finished ? `over, the rule is ${status}` : "live";
+}
+
+function about(session) {
+  const policies = session.policy_ids.map((id) => el("a", { href: `#/policies/${id}` }, id.slice(0, 8)));
+  return el(
+    "section",
+    { class: "card", "aria-label": "About this session" },
+    el("h2", {}, "Rule"),
+    el("p", {}, el("code", {}, session.spec.formula)),
+    el(
+      "dl",
+      { class: "numbers" },
+      pair("Policy", ...policies),
+      pair("Robot", session.robot.name),
+      pair("Threshold", String(session.threshold)),
+      pair("Kept until", new Date(session.expires_at).toLocaleString()),
+    ),
+    el("p", {}, el("a", { href: "#/floor?sessions=" + session.id }, "Show it with others on one floor")),
+  );
+}

@@ -1,0 +1,195 @@
+// A simulated robot with a policy: it is set down, driven by a stand-in model, pushed, and met by obstacles.
+
+import { ask } from "../lib/api.js";
+import { button, called, el, svg } from "../lib/dom.js";
+import { Episode } from "../trial/episode.js";
+import { goalSeeker, wanderer } from "../trial/model.js";
+import { SIZE, World } from "../trial/world.js";
+import { Floor } from "../lib/floor.js";
+import { centre } from "../lib/motion.js";
+import { Watch } from "./watch.js";
+
+const TRIES = 60; // starts that are drawn before it is given up
+const PACE = 120; // [ms] between two steps
+
+export async function show(place, { id, signal }) {
+  const policy = await ask(`v1/policies/${encodeURIComponent(id)}`, { signal });
+  const map = await ask(`v1/maps/${policy.map_id}`, { signal });
+  const robot = await resolved(policy.robot, signal);
+  const floor = new Floor(map, `Floor ${called(map)}`);
+  const rule = { ...policy.spec, map_id: policy.map_id };
+  const { avoided } = await ask("v1/specs/validate", { json: rule, signal }).catch(() => ({ avoided: [] }));
+  floor.regions(policy.spec.regions ?? {}, avoided);
+  const told = el("p", { class: "told", role: "alert" });
+  const model = el("select", {}, el("option", { value: "goal" }, "goes to a goal"), el("option", { value: "wander" }, "wanders"));
+  const setup = el(
+    "section",
+    { class: "card", "aria-label": "Begin" },
+    el("h2", {}, "Begin"),
+    el("p", {}, "Click on the floor to set the robot down there, or:"),
+    el("label", {}, "The model ", model),
+    button("Set it down anywhere", () => begin(null), { class: "main" }),
+    told,
+  );
+  place.append(el("h1", {}, `Try ${called(policy)}`), el("p", {}, el("code", {}, policy.spec.formula)), el("div", { class: "watch" }, floor.element, setup));
+  const occupancy = await floor.load(signal);
+  floor.element.classList.add("drawing");
+  floor.element.addEventListener("click", (event) => begin(floor.point(event)));
+
+  async function begin(point) {
+    told.textContent = "";
+    try {
+      const session = await start(policy, occupancy, robot, point);
+      const watch = new Watch(session, map);
+      await watch.load(signal);
+      place.querySelector(".watch").replaceWith(watch.element);
+      const world = new World(robot, watch.floor.occupancy, session.start);
+      new Controls(watch, world, robot, model.value, signal);
+    } catch (error) {
+      told.textContent = error.told?.() ?? error.message;
+      for (const { formula, late_by: late } of error.conjuncts ?? []) told.append(` ${formula}${late ? `: ${late} steps late` : ""};`);
+    }
+  }
+}
+
+/** A robot as /v1/robots has it, whatever a policy says of it. */
+async function resolved(robot, signal) {
+  if (typeof robot === "string") return ask(`v1/robots/${robot}`, { signal });
+  const actions = robot.actions.map((action) => ({ translate: 0, rotate: 0, terminal: false, ...action }));
+  return { name: "custom", on_contact: "stay", ...robot, actions, footprint: { offset: [0, 0], ...robot.footprint } };
+}
+
+/** A session at a point, or where it is taken of those drawn at random; `start` is its pose. */
+async function start(policy, occupancy, robot, point) {
+  const [x0, y0, x1, y1] = occupancy.map.bounds;
+  for (let tried = 0; ; tried++) {
+    const [x, y] = point ?? [x0 + Math.random() * (x1 - x0), y0 + Math.random() * (y1 - y0)];
+    const pose = [x, y, point ? 0 : (2 * Math.random() - 1) * Math.PI]; // at a point, it looks along x
+    if (!point && !occupancy.fits(centre(robot, pose), robot.footprint.radius + 0.05) && tried < 20 * TRIES) continue;
+    try {
+      const session = await ask("v1/sessions", { json: { policy_id: policy.id, initial_pose: pose } });
+      return { ...session, start: pose };
+    } catch (error) {
+      if (point || !["infeasible-start", "invalid-pose"].includes(error.type) || tried > TRIES) throw error;
+    }
+  }
+}
+
+class Controls {
+  constructor(watch, world, robot, kind, signal) {
+    Object.assign(this, { watch, world, robot, kind, mode: null });
+    this.episode = new Episode(watch.session, world, () => [], (item) => this.take(item));
+    this.goal = svg("circle", { class: "goal", r: 0.15 });
+    this.run = button("Run", () => this.toggle(), { class: "main" });
+    this.modes = [
+      ["goal", "Move the goal"],
+      ["push", "Put the robot elsewhere"],
+      ["drop", "Drop an obstacle"],
+    ].map(([mode, name]) => button(name, () => this.choose(mode), { "aria-pressed": "false", "data-mode": mode }));
+    this.told = el("p", { class: "hint", role: "status" }, "Run it, or go step by step.");
+    const now = [
+      button("Step", () => this.once()),
+      button("Push the robot", () => this.shoved(this.world.push())),
+      button("Obstacle before it", () => this.drop(this.world.ahead(0.1))),
+    ];
+    const card = el(
+      "section",
+      { class: "card controls", "aria-label": "Controls" },
+      el("div", { class: "row" }, this.run, now),
+      el("div", { class: "row", role: "group", "aria-label": "Then click on the floor" }, this.modes),
+      this.told,
+      el("p", {}, el("a", { href: `#/sessions/${watch.session.id}` }, "This session's own page")),
+    );
+    watch.side.prepend(card);
+    watch.floor.layers.marks.append(this.goal);
+    watch.floor.element.addEventListener("click", (event) => this.clicked(watch.floor.point(event)));
+    signal.addEventListener("abort", () => this.pause());
+    this.setGoal(this.somewhere());
+    watch.mark.move(world.pose);
+    this.once();
+  }
+
+  /** A free place far from the robot. */
+  somewhere() {
+    const { occupancy } = this.world;
+    const [x0, y0, x1, y1] = occupancy.map.bounds;
+    const far = occupancy.distances(this.world.pose, this.robot.footprint.radius);
+    let best = this.world.pose.slice(0, 2);
+    for (let i = 0; i < 200; i++) {
+      const point = [x0 + Math.random() * (x1 - x0), y0 + Math.random() * (y1 - y0)];
+      if (Number.isFinite(far(point)) && far(point) > far(best)) best = point;
+    }
+    return best;
+  }
+
+  setGoal(point) {
+    const { occupancy } = this.world;
+    const fits = (at, radius) => occupancy.fits(at, radius);
+    const distance = occupancy.distances(point, this.robot.footprint.radius + 0.03);
+    this.episode.model = this.kind === "goal" ? goalSeeker(this.robot, fits, distance) : wanderer(this.robot);
+    this.goal.setAttribute("cx", point[0]);
+    this.goal.setAttribute("cy", -point[1]);
+    this.goal.toggleAttribute("hidden", this.kind !== "goal");
+  }
+
+  choose(mode) {
+    this.mode = this.mode === mode ? null : mode;
+    for (const each of this.modes) each.setAttribute("aria-pressed", String(each.dataset.mode === this.mode));
+    this.watch.floor.element.classList.toggle("drawing", this.mode !== null);
+    this.tell(this.mode ? "Click on the floor." : "");
+  }
+
+  clicked(point) {
+    const { mode } = this;
+    if (mode) this.choose(mode);
+    if (mode === "goal") this.setGoal(point);
+    if (mode === "drop") this.drop(point);
+    if (mode === "push") this.shoved(this.world.put([...point, this.world.pose[2]]));
+  }
+
+  drop(point) {
+    if (!this.world.drop(point)) return this.tell("The robot stands there.");
+    this.watch.floor.layers.marks.append(svg("circle", { class: "obstacle", cx: point[0], cy: -point[1], r: SIZE }));
+    this.tell("An obstacle stands there. The service hears of it when the robot sees it.");
+  }
+
+  shoved(could) {
+    this.watch.mark.move(this.world.pose);
+    this.tell(could ? "The robot was pushed. The service hears of it with the next step." : "There is no room for it.");
+  }
+
+  async once() {
+    if (this.busy || this.episode.over) return;
+    this.busy = true;
+    try {
+      await this.episode.step();
+    } catch (error) {
+      this.pause();
+      this.tell(error.told?.() ?? error.message);
+    }
+    this.busy = false;
+  }
+
+  toggle() {
+    if (this.timer) return this.pause();
+    this.run.textContent = "Pause";
+    this.timer = setInterval(() => this.once(), PACE);
+  }
+
+  pause() {
+    clearInterval(this.timer);
+    this.timer = 0;
+    this.run.textContent = "Run";
+  }
+
+  take(item) {
+    if (!item.finished) return this.watch.push(item);
+    this.pause();
+    this.tell(`The episode is over: the rule is ${item.spec_status}.`);
+    this.run.disabled = true;
+  }
+
+  tell(text) {
+    this.told.textContent = text;
+  }
+}

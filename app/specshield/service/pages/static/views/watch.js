@@ -1,0 +1,70 @@
+// One robot: its floor, what it was answered at the step that is shown, and what came before.
+
+import { ask } from "../lib/api.js";
+import { Chart } from "../lib/chart.js";
+import { el, metres, onceAFrame, percent } from "../lib/dom.js";
+import { Floor } from "../lib/floor.js";
+import { Mark } from "../lib/mark.js";
+import { Panel } from "./panel.js";
+import { Replay } from "./replay.js";
+
+export class Watch {
+  /** session, map: as the API shows them. */
+  constructor(session, map) {
+    this.session = session;
+    this.items = [];
+    this.floor = new Floor(map, `Floor with robot ${session.id}`);
+    this.mark = new Mark(this.floor, session.robot, session.id);
+    this.panel = new Panel(session);
+    this.charts = [
+      [new Chart("Robustness of what comes", metres), (d) => d.robustness[taken(d)]],
+      [new Chart("Feasible mass", percent), (d) => d.feasible_mass],
+      [new Chart("Slack kept", (steps) => `${steps} steps`), (d) => d.slack || null],
+    ];
+    this.draw = onceAFrame(() => this.show());
+    this.replay = new Replay(this.draw);
+    const left = el("div", { class: "stack" }, this.floor.element, this.replay.element);
+    this.charted = el("section", { class: "card charts", "aria-label": "Over time" });
+    this.charted.append(...this.charts.map(([chart]) => chart.element));
+    this.side = el("div", { class: "stack side" }, this.panel.element);
+    this.element = el("div", { class: "watch" }, left, this.side, this.charted);
+  }
+
+  async load(signal) {
+    const { spec, map_id } = this.session;
+    const body = { formula: spec.formula, regions: spec.regions, signals: spec.signals, map_id };
+    const told = ask("v1/specs/validate", { json: body, signal }).catch(() => ({ avoided: [] }));
+    this.floor.regions(spec.regions, (await told).avoided);
+    await this.floor.load(signal);
+  }
+
+  /** item: {t, pose, logits, decision}, as in a trajectory. */
+  push(item) {
+    this.items[item.t] = item;
+    this.replay.extend(item.t);
+    this.draw();
+  }
+
+  show() {
+    const t = this.replay.t;
+    const known = this.items.slice(0, t + 1).filter(Boolean);
+    const item = known.at(-1);
+    if (!item) return;
+    this.mark.show(known);
+    this.panel.show(item);
+    const decided = this.items.filter((each) => each?.decision);
+    const last = Math.max(this.session.horizon, this.items.length - 1);
+    for (const [chart, value] of this.charts) {
+      const values = decided.map((each) => [each.t, value(each.decision)]);
+      chart.show(values.filter(([, v]) => v !== null && v !== undefined && Math.abs(v) < 1e6), last, t);
+    }
+    this.charted.hidden = this.charts.every(([chart]) => chart.element.hidden);
+  }
+}
+
+/** The action that the robot executes: what was drawn, and in place of `end` what completes the rule. */
+function taken(decision) {
+  return decision.next_poses.length && decision.robustness[decision.action] !== null
+    ? decision.action
+    : (decision.completion_action ?? decision.action);
+}

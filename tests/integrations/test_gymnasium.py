@@ -1,0 +1,117 @@
+"""The gymnasium wrapper, on an environment and with an agent that this project did not make."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+pytest.importorskip("minigrid")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from examples import minigrid_rooms  # noqa: E402
+from specshield.errors import RobotError  # noqa: E402
+from specshield.integrations.gymnasium import ShieldWrapper  # noqa: E402
+from specshield.local import LocalShield  # noqa: E402
+from specshield.sim.cases import load_case  # noqa: E402
+from specshield.sim.robot import SimulatedRobot  # noqa: E402
+
+EXAMPLE = Path(minigrid_rooms.__file__)
+START = (4.5, 5.0, 0.0)
+
+
+def inside(env: gymnasium.Env, column: int, row: int) -> bool:
+    """Whether MiniGrid's own numbers have the agent in that room, off its walls."""
+    room, (x, y) = env.unwrapped.room_grid[row][column], env.unwrapped.agent_pos
+    (left, top), (width, height) = room.top, room.size
+    return left < x < left + width - 1 and top < y < top + height - 1
+
+
+def test_a_random_model_keeps_the_rule_in_100_of_100_episodes() -> None:
+    """Judged here by the rooms of MiniGrid, with the rule of the example taken apart by hand."""
+    env, kept = minigrid_rooms.maze(minigrid_rooms.chance), 0
+    for seed in range(100):
+        random = np.random.default_rng(seed)
+        _, info = env.reset(seed=seed)
+        first, second, over = [inside(env, 0, 0)], [inside(env, 1, 1)], False
+        while not over:
+            _, _, terminated, truncated, info = env.step(int(random.integers(7)))
+            first.append(inside(env, 0, 0))
+            second.append(inside(env, 1, 1))
+            over = terminated or truncated
+        assert len(first) > 90
+        keeps = any(first[:41]) and any(second[50:91]) and not any(first[60:91])
+        assert keeps == (info["verdict"].spec_status == "satisfied")
+        kept += keeps
+    assert kept == 100
+
+
+def test_the_bot_does_its_mission_within_the_rule() -> None:
+    env = minigrid_rooms.maze(minigrid_rooms.bot)
+    ends = [minigrid_rooms.drive(env, seed) for seed in range(10)]
+    assert ends == [("satisfied", True)] * 10
+
+
+def test_the_checker_of_gymnasium_passes() -> None:
+    env = minigrid_rooms.maze(minigrid_rooms.chance)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(different from the unwrapped|spec is None|render).*")
+        check_env(env, skip_render_check=True)
+
+
+def test_the_example() -> None:
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLE), "2"], capture_output=True, text=True, check=True, timeout=300
+    )
+    bot, chance = done.stdout.splitlines()
+    assert bot == "the bot: the rule was kept in 2 of 2 episodes, the mission done in 2"
+    assert chance.startswith("a model that draws at random: the rule was kept in 2 of 2 episodes")
+
+
+class House(gymnasium.Env[Any, Any]):
+    """A case's apartment; its task is done when the robot says so."""
+
+    def __init__(self, actions: int = 20) -> None:
+        self.action_space = gymnasium.spaces.Discrete(actions)
+        self.observation_space = gymnasium.spaces.Discrete(1)
+        self.executed: list[int] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.robot = SimulatedRobot(load_case("case1"), START)
+        return 0, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        self.executed.append(action)
+        self.robot.execute(action)
+        return 0, 1.0, False, False, {}
+
+
+def test_an_agent_that_ends_its_task_leaves_the_rule_to_the_shield() -> None:
+    house = House()
+    env = ShieldWrapper(house, LocalShield.shipped("case1"), lambda env: env.unwrapped.robot.pose, seed=2)
+    env.reset(seed=0)
+    rewards, terminated, info = [], False, {}
+    while not terminated:
+        wanted = 4 if len(rewards) == 5 else 0  # forward, `end`, and nothing else
+        _, reward, terminated, truncated, info = env.step(wanted)
+        assert not truncated
+        rewards.append(reward)
+    assert info["verdict"].spec_status == "satisfied"
+    assert len(rewards) == 80  # the second visit cannot be before
+    assert sum(rewards) == 6.0  # none for what the shield did alone
+    assert 4 not in house.executed
+
+
+def test_other_actions_than_the_robots_are_refused() -> None:
+    env = ShieldWrapper(House(7), LocalShield.shipped("case1"), lambda env: START)
+    with pytest.raises(RobotError, match=r"Discrete\(20\)"):
+        env.reset()

@@ -1,0 +1,197 @@
+"""Sessions as files, read back with the libraries of those who will open them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from specshield.local import LocalShield
+from specshield.recordings import drive
+from specshield.recordings.recording import Recording, of_local
+from specshield.recordings.tables import write_csv, write_parquet
+from specshield.robot.dynamics import make_body, step
+from tests.serving import RunningServer
+
+START = (4.5, 5.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def shield() -> LocalShield:
+    return LocalShield.shipped("case1")
+
+
+@pytest.fixture(scope="module")
+def recording(shield: LocalShield) -> Recording:
+    """12 steps, the last without a decision."""
+    random, pose = np.random.default_rng(0), START
+    session = shield.session(initial_pose=START, uncertainty="none", learn_map=False)
+    for _ in range(12):
+        decision = session.step(pose, np.where(np.arange(20) == 4, -np.inf, random.normal(size=20)))
+        pose = decision.next_poses[decision.execute]
+    session.close(pose)
+    return of_local(session, step_seconds=0.5)
+
+
+def test_the_table_has_every_step_and_every_number(recording: Recording, tmp_path: Path) -> None:
+    write_csv(recording, tmp_path / "s.csv")
+    table = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
+    assert [float(row["x"]) for row in table] == [item.pose[0] for item in recording.items]
+    assert float(table[3]["seconds"]) == recording.begun + 1.5
+    told = recording.items[5].decision
+    assert told is not None
+    assert float(table[5]["p_m"]) == told["distribution"][0]
+    assert table[5]["mode"] == "shaped"
+    assert table[12]["mode"] == ""
+
+
+def test_parquet_holds_the_same(recording: Recording, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write_parquet(recording, tmp_path / "s.parquet")
+    table = parquet.read_table(tmp_path / "s.parquet")
+    assert table.schema.metadata[b"formula"].startswith(b"F[0,60]")
+    assert table["theta"].to_pylist() == [item.pose[2] for item in recording.items]
+    assert table["p_m"].to_pylist()[12] is None
+
+
+def test_mcap_opens_with_the_schemas_of_foxglove(recording: Recording, tmp_path: Path) -> None:
+    """Read by the `mcap` library, which checks the file's structure, and decoded by its own schemas."""
+    pytest.importorskip("foxglove")
+    decoder = pytest.importorskip("mcap_protobuf.decoder")
+    from mcap.reader import make_reader
+
+    from specshield.recordings.foxglove import write_mcap
+
+    write_mcap(recording, tmp_path / "s.mcap")
+    with open(tmp_path / "s.mcap", "rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[decoder.DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        schemas = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values()}
+        assert schemas == {
+            "/map": "foxglove.Grid",
+            "/pose": "foxglove.PoseInFrame",
+            "/scene": "foxglove.SceneUpdate",
+            "/decision": "specshield.Decision",
+        }
+        messages = [
+            (channel.topic, message.log_time, message.data, schema)
+            for schema, channel, message in reader.iter_messages()
+        ]
+        decoded = [each[3] for each in reader.iter_decoded_messages(topics=["/pose", "/scene", "/map"])]
+    told = [json.loads(data) for topic, _, data, _ in messages if topic == "/decision"]
+    assert [each["t"] for each in told] == list(range(12))
+    times = [at for topic, at, _, _ in messages if topic == "/pose"]
+    assert np.diff(times) == pytest.approx(5e8, abs=1e3)
+    poses = [each for each in decoded if each.DESCRIPTOR.name == "PoseInFrame"]
+    assert [each.pose.position.x for each in poses] == [item.pose[0] for item in recording.items]
+    (grid,) = (each for each in decoded if each.DESCRIPTOR.name == "Grid")
+    assert recording.grid is not None
+    assert np.frombuffer(grid.data, np.uint8).sum() == recording.grid.occupied.sum()
+    entities = {e.id: e for each in decoded if each.DESCRIPTOR.name == "SceneUpdate" for e in each.entities}
+    assert {"region/Charger1", "region/Charger2", "driven", "continuation"} <= set(entities)
+    circle = entities["region/Charger1"].lines[0].points
+    assert [math.dist((p.x, p.y), (0.9, 5.0)) for p in circle] == pytest.approx([0.6] * len(circle))
+
+
+def test_the_way_ahead_ends_within_the_rule(recording: Recording) -> None:
+    ahead = recording.ahead(3)
+    nearest = min(math.dist(pose[:2], centre) for pose in ahead for centre in ((0.9, 5.0), (9.1, 6.6)))
+    assert nearest < 0.6
+    assert len(recording.ahead(12)) == 1
+
+
+def test_rerun_writes_a_file(recording: Recording, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    from specshield.recordings.rerun import write_rrd
+
+    write_rrd(recording, tmp_path / "s.rrd")
+    assert (tmp_path / "s.rrd").read_bytes()[:3] == b"RRF"
+    assert (tmp_path / "s.rrd").stat().st_size > 10_000
+
+
+def bag_of(folder: Path, poses: list[tuple[float, float, float]], step_seconds: float) -> Path:
+    """A rosbag2 of geometry_msgs/PoseStamped, four times as often as there are steps."""
+    writer = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = {name.rpartition("/")[2]: store.types[name] for name in store.types}
+    with writer.Writer(folder, version=9) as bag:
+        connection = bag.add_connection("/robot_pose", "geometry_msgs/msg/PoseStamped", typestore=store)
+        for i in range(4 * (len(poses) - 1) + 1):
+            x, y, theta = poses[i // 4]
+            at = 1_000_000_000 + round(i * step_seconds / 4 * 1e9)
+            stamp = kind["Time"](sec=at // 10**9, nanosec=at % 10**9)
+            turned = kind["Quaternion"](x=0.0, y=0.0, z=math.sin(theta / 2), w=math.cos(theta / 2))
+            message = kind["PoseStamped"](
+                header=kind["Header"](stamp=stamp, frame_id="map"),
+                pose=kind["Pose"](position=kind["Point"](x=x, y=y, z=0.0), orientation=turned),
+            )
+            bag.write(connection, at, store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
+    return folder
+
+
+def test_a_drive_that_kept_the_rule_and_one_that_lost_it(shield: LocalShield, tmp_path: Path) -> None:
+    """The first follows the shield. The second drives on for 12 steps, then stands until it is too late."""
+    body, poses = make_body(shield.task.robot, shield.task.grid), [START]
+    with shield.session(initial_pose=START, uncertainty="none", learn_map=False) as session:
+        while session.spec_status == "pending":
+            decision = session.step(poses[-1], None, main_task_done=True)
+            poses.append(decision.next_poses[decision.execute])
+    read = drive.read_drive(bag_of(tmp_path / "kept", poses, 0.4), 0.4)
+    assert read == pytest.approx(np.array(poses), abs=1e-9)
+    judged = drive.check_drive(shield, read)
+    assert judged.lost is None
+    assert judged.verdict.spec_status == "satisfied"
+
+    stays = poses[:3] + [poses[2]] * 70
+    lost = drive.check_drive(shield, drive.read_drive(bag_of(tmp_path / "lost", stays, 0.4), 0.4))
+    assert lost.verdict.spec_status == "violated"
+    assert lost.lost is not None
+    reach = 60 - lost.lost  # steps that are left at the first step from which no way was found
+    assert 2 < lost.lost < 60
+    nearest = min(math.dist(stays[-1][:2], centre) - 0.6 for centre in ((0.9, 5.0), (9.1, 6.6)))
+    assert reach * 0.2 < 2.5 * nearest  # not given up long before it was hopeless
+    assert (reach - 1) * 0.2 < nearest + 4.0
+    assert lost.last == pytest.approx(stays[-1], abs=1e-9)
+    assert "until step" in "\n".join(drive.told(shield, lost, 0.4))
+    assert step(body, *poses[0], 0)  # the drives are of this robot
+
+
+def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer, tmp_path: Path) -> None:
+    import os
+    import subprocess
+    import sys
+
+    from specshield.client import ShieldClient
+
+    with ShieldClient(server.url, timeout=30.0) as client:
+        session = client.sessions.create(policy_id="case1", initial_pose=START)
+        session.step(START, np.zeros(20))
+        session.save_record(tmp_path / "record")
+
+    def run(*words: str) -> str:
+        command = [sys.executable, "-m", "specshield.cli", *words]
+        return subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, check=True, env=dict(os.environ)
+        ).stdout
+
+    assert (
+        run("export", session.id, "--to", "csv", "--url", server.url, "--out", "a.csv") == "a.csv: 1 steps\n"
+    )
+    assert run("export", "record", "--to", "csv", "--out", "b.csv") == "b.csv: 1 steps\n"
+    assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+    assert run("export", "record", "--to", "mcap") == f"{session.id}.mcap: 1 steps\n"
+    bag_of(tmp_path / "bag", [START] * 70, 1.0)
+    words = ["check-drive", "bag", "--policy", "case1", "--step-seconds", "1"]
+    refused = subprocess.run(
+        [sys.executable, "-m", "specshield.cli", *words],
+        cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert refused.returncode == 1
+    assert "the rule is broken" in refused.stdout

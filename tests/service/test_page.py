@@ -1,0 +1,194 @@
+"""The page at `/`, in a real browser: from a house to why an action is forbidden. Needs Chromium."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.browsing import browsing, needs_chromium
+from tests.service.world import ahead
+from tests.serving import serving
+from tests.world.test_procthor import SIZES, house
+
+pytestmark = needs_chromium
+SHOTS = os.environ.get("SPECSHIELD_SCREENSHOTS")  # a folder for pictures of every screen
+SCREENS = {"light": (1280, 860), "dark": (1280, 860), "phone": (390, 800)}
+
+
+def look(page, name):
+    """No screen is wider than its window: on a desk, in the dark, on a phone. With SHOTS it is kept."""
+    for kind, (width, height) in SCREENS.items():
+        page.emulate_media(color_scheme="light" if kind == "light" else "dark")
+        page.set_viewport_size({"width": width, "height": height})
+        page.wait_for_timeout(100)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, (name, kind)
+        if SHOTS:
+            page.screenshot(path=Path(SHOTS) / f"{name}-{kind}.png", full_page=True)
+    page.emulate_media(color_scheme="light")
+    page.set_viewport_size({"width": 1280, "height": 860})
+
+
+class Floor:
+    """Where points of the map are on the screen."""
+
+    def __init__(self, page):
+        self.page, self.element = page, page.locator("svg.floor")
+        self.element.scroll_into_view_if_needed()
+
+    def at(self, x, y):
+        script = """(svg, [x, y]) => {
+          const p = new DOMPoint(x, -y).matrixTransform(svg.getScreenCTM());
+          return [p.x, p.y];
+        }"""
+        return self.element.evaluate(script, [x, y])
+
+    def drag(self, start, end):
+        self.page.mouse.move(*self.at(*start))
+        self.page.mouse.down()
+        self.page.mouse.move(*self.at(*end), steps=3)
+        self.page.mouse.up()
+
+    def click(self, x, y):
+        self.page.mouse.click(*self.at(x, y))
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """A server of its own that makes policies."""
+    with serving(tmp_path_factory.mktemp("page"), SPECSHIELD_WORKER="true") as running:
+        yield running
+
+
+def draw(page, floor, shape, start, end, name):
+    page.get_by_role("button", name=shape).click()
+    floor.drag(start, end)
+    field = page.get_by_label("Name of the region").last
+    field.fill(name)
+    field.press("Enter")
+
+
+def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
+    """Upload, draw, write, make, begin, push, drop, see: as somebody does it who has nothing but the page."""
+    (tmp_path / "house.json").write_text(json.dumps(house()))
+    (tmp_path / "sizes.json").write_text(json.dumps(SIZES))
+    with browsing() as (page, complaints):
+        page.goto(own.url)
+        page.get_by_text("No robot is here yet").wait_for()
+        look(page, "empty")
+        page.get_by_role("link", name="Maps", exact=True).click()
+        page.get_by_label("Name").fill("my-house")
+        page.locator("#files").set_input_files([tmp_path / "house.json", tmp_path / "sizes.json"])
+        page.get_by_role("heading", name="my-house").wait_for()
+        page.locator(".walls image").wait_for(state="attached")
+        look(page, "map")
+
+        floor = Floor(page)
+        draw(page, floor, "Circle", (1.0, 1.0), (1.5, 1.0), "Dock")
+        draw(page, floor, "Rectangle", (2.6, 1.4), (3.4, 2.4), "Stairs")
+        rule = page.get_by_role("textbox", name="Rule")
+        rule.fill("F[0,60] Dok and G[0,80] not touches(Stairs)")
+        assert page.locator(".under mark").inner_text() == "Dok"
+        page.get_by_text("nothing declares 'Dok'").wait_for()
+        look(page, "rule-wrong")
+        assert page.get_by_role("button", name="Make it").is_disabled()
+        rule.fill("F[0,60] Dock and G[0,80] not touches(Stairs)")
+        page.get_by_text("steps 0 to 80").first.wait_for()
+        assert page.locator(".timeline li").count() == 2
+        look(page, "rule")
+        page.get_by_label("Name", exact=True).fill("dock-first")
+        page.get_by_role("button", name="Make it").click()
+
+        page.get_by_role("heading", name="dock-first").wait_for()
+        page.locator(".badge.ready").wait_for()
+        page.get_by_alt_text("can be kept").wait_for()
+        look(page, "policy")
+        page.get_by_role("link", name="Try it").click()
+        page.locator(".walls image").wait_for(state="attached")
+        look(page, "begin")
+        Floor(page).click(2.45, 1.9)  # it looks at the stairs, closer than one move
+        page.get_by_role("heading", name="Step 0").wait_for()
+        forbidden = page.locator("tr", has=page.locator(".cannot"), has_text="moves 0.20 m").first
+        assert "forbidden" in forbidden.inner_text()
+        assert re.search(r"misses (it )?by|too late|could not be kept", forbidden.inner_text())
+        assert "got 0.0 %" in forbidden.locator(".bars").get_attribute("aria-label")
+        look(page, "forbidden")
+
+        step = page.get_by_role("button", name="Step", exact=True)
+        page.get_by_role("button", name="Push the robot").click()
+        page.get_by_text("The robot was pushed").wait_for()
+        page.get_by_role("button", name="Drop an obstacle").click()
+        Floor(page).click(1.6, 3.4)
+        assert page.locator(".obstacle").count() == 1
+        step.click()
+        page.get_by_role("heading", name="Step 1").wait_for()
+        page.get_by_role("button", name="Run", exact=True).click()
+        page.get_by_text("The episode is over").wait_for()
+        look(page, "over")
+
+        page.get_by_role("link", name="This session's own page").click()
+        page.get_by_text("over, the rule is").wait_for()
+        page.get_by_label("Step", exact=True).fill("0")
+        page.get_by_role("heading", name="Step 0").wait_for()
+        assert page.locator(".cannot").count()
+        look(page, "session")
+        page.get_by_role("link", name="Robots", exact=True).click()
+        page.get_by_role("link", name="on one floor").click()
+        page.locator(".robot").wait_for(state="attached")
+        look(page, "floor")
+    unasked = [text for text in complaints if "422" not in text]  # the rule that was wrong
+    assert unasked == []
+    assert len(complaints) - len(unasked) <= 2
+
+
+def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step):
+    session = begin()
+    with browsing() as (page, complaints):
+        page.goto(f"{server.url}/#/sessions/{session['id']}")
+        page.get_by_text("live").wait_for()
+        for t, pose in enumerate(ahead(3)):
+            assert step(session, t, [pose]).status_code == 200
+        page.get_by_role("heading", name="Step 3").wait_for()
+        assert page.locator(".actions tbody tr").count() == 5
+        client.post(f"/v1/sessions/{session['id']}/close", json={})
+        page.get_by_text("over, the rule is pending").wait_for()
+    assert complaints == []
+
+
+def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path):
+    with serving(tmp_path, SPECSHIELD_API_KEY="a-secret-key") as running, browsing() as (page, _):
+        page.goto(running.url)
+        field = page.get_by_label("API key")
+        field.fill("wrong")
+        field.press("Enter")
+        page.get_by_text("does not know this key").wait_for()
+        field.fill("a-secret-key")
+        field.press("Enter")
+        page.get_by_text("No robot is here yet").wait_for()
+        page.get_by_role("link", name="Policies", exact=True).click()
+        page.get_by_role("link", name="case1", exact=True).wait_for()
+        page.reload()
+        page.get_by_role("link", name="case1", exact=True).wait_for()
+        kept = page.evaluate("[localStorage.length, document.cookie, location.href]")
+        assert kept[:2] == [0, ""]
+        assert "secret" not in kept[2]
+
+
+def test_its_files_are_small_tagged_and_allow_nothing_from_elsewhere(server):
+    with httpx.Client(base_url=server.url) as client:
+        page = client.get("/")
+        assert page.headers["content-type"].startswith("text/html")
+        assert page.headers["content-encoding"] == "gzip"
+        assert "default-src 'none'; script-src 'self'" in page.headers["content-security-policy"]
+        assert "unsafe" not in page.headers["content-security-policy"]
+        again = client.get("/", headers={"If-None-Match": page.headers["etag"]})
+        assert (again.status_code, again.content) == (304, b"")
+        script = client.get("/page/main.js", headers={"Accept-Encoding": "identity"})
+        assert script.headers["content-type"].startswith("text/javascript")
+        assert "content-encoding" not in script.headers
+        for path in ("/page/nothing.js", "/page/../pages/__init__.py", "/page/%2e%2e/__init__.py"):
+            assert client.get(path).status_code == 404

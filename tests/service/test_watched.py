@@ -1,0 +1,117 @@
+"""What a page needs of the service: names, robots in full, pictures, one stream of several sessions."""
+
+from __future__ import annotations
+
+import json
+import threading
+from xml.etree import ElementTree
+
+import httpx
+
+from tests.service.world import START, ahead, grid_json, policy_files
+
+
+def test_maps_and_policies_have_names_that_are_accepted_wherever_their_ids_are(client):
+    grid = grid_json()
+    grid["info"]["resolution"] = 0.05
+    map_id = client.post("/v1/maps", json={**grid, "name": "ward-3"}).json()["id"]
+    shown = client.get("/v1/maps/ward-3").json()
+    assert (shown["id"], shown["name"]) == (map_id, "ward-3")
+    assert "ward-3" in [
+        item["name"] for item in client.get("/v1/maps", params={"limit": 1000}).json()["items"]
+    ]
+    for name, problem in (("case1", "name-taken"), ("0" * 64, "invalid-input"), ("no name", "invalid-input")):
+        refused = client.post("/v1/maps", json={**grid, "name": name})
+        assert (refused.status_code, refused.json()["path"]) == (
+            409 if problem == "name-taken" else 422,
+            "name",
+        )
+        assert refused.json()["type"] == problem
+    other = client.post("/v1/maps", json=grid_json()).json()["id"]
+    assert (
+        client.post("/v1/maps", json={**grid_json(), "name": "ward-3"}).json()["id"] == map_id
+    )  # who has it
+
+    assert client.post("/v1/maps", json={**grid, "name": "ward-4"}).json()["name"] == "ward-4"
+    assert client.get("/v1/maps/ward-3").status_code == 404, "a name that was changed is free again"
+    assert client.post("/v1/maps", json={**grid_json(), "name": "ward-3"}).json()["id"] == other
+
+    files = {**{k: (k, v) for k, v in policy_files(seed=5).items()}, "name": (None, "to-the-goal")}
+    sent = client.post("/v1/policies", files=files).json()
+    assert sent["name"] == client.get("/v1/policies/to-the-goal").json()["name"] == "to-the-goal"
+    body = {"policy_id": "to-the-goal", "initial_pose": START}
+    begun = client.post("/v1/sessions", json=body).json()
+    assert begun["policy_ids"] == [sent["id"]]
+    assert begun["robot"]["actions"][0] == {
+        "name": "forward",
+        "translate": 0.2,
+        "rotate": 0.0,
+        "terminal": False,
+    }
+    client.delete(f"/v1/sessions/{begun['id']}")
+    assert client.delete("/v1/policies/to-the-goal").status_code == 204
+    assert client.get("/v1/policies/to-the-goal").status_code == 404
+    assert client.delete("/v1/maps/ward-4").status_code == 204
+    assert client.get("/v1/maps/ward-4").status_code == 404
+
+
+def test_pictures_stand_alone_and_say_what_is_drawn(client, begin, step):
+    robots = client.get("/v1/robots").json()["items"]
+    assert [action["name"] for action in robots[0]["actions"]][:5] == ["m", "r", "l", "b", "end"]
+    session = begin()
+    assert step(session, 0, [START]).status_code == 200
+    for path in (
+        f"/v1/sessions/{session['id']}/image.svg",
+        f"/v1/policies/{session['policy_ids'][0]}/image.svg",
+    ):
+        drawn = client.get(path)
+        assert drawn.headers["content-type"] == "image/svg+xml"
+        root = ElementTree.fromstring(drawn.content)
+        assert "Goal" in [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
+        links = [image.get("href") for image in root.iter("{http://www.w3.org/2000/svg}image")]
+        assert all(link.startswith("data:image/png;base64,") for link in links)
+        again = client.get(path, headers={"If-None-Match": drawn.headers["etag"]})
+        assert again.status_code == 304
+
+
+def test_several_sessions_are_told_in_one_stream(server, client, begin, step):
+    sessions = [begin(), begin()]
+    assert step(sessions[0], 0, [START]).status_code == 200
+    asked = [f"{sessions[0]['id']}:-1", sessions[1]["id"], "nobody"]
+    found = []
+
+    def read():
+        with httpx.stream(
+            "GET", f"{server.url}/v1/events", params={"session": asked}, timeout=None
+        ) as response:
+            data = (line for line in response.iter_lines() if line.startswith("data: "))
+            found.extend(json.loads(line.removeprefix("data: ")) for line in data)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    while not found:  # the stream is there once it tells what was before
+        reader.join(0.05)
+    answer = step(sessions[1], 0, [START]).json()
+    assert step(sessions[0], 1, ahead(1)).status_code == 200
+    for session in sessions:
+        client.post(f"/v1/sessions/{session['id']}/close", json={})
+    reader.join(30.0)
+    assert not reader.is_alive(), "it ends when all of them are over"
+    told = [(item["session"], item.get("t", "over")) for item in found]
+    assert sorted(told, key=str) == sorted(
+        [(sessions[0]["id"], 0), (sessions[0]["id"], 1), (sessions[0]["id"], "over"), (sessions[1]["id"], 0),
+         (sessions[1]["id"], "over")], key=str,
+    )  # fmt: skip
+    item = next(item for item in found if item["session"] == sessions[1]["id"] and "t" in item)
+    assert item["decision"] == answer
+    assert item["pose"] == START
+    trajectory = client.get(f"/v1/sessions/{sessions[1]['id']}/trajectory").json()["items"]
+    assert item["logits"] == trajectory[0]["logits"]
+
+
+def test_a_rule_says_when_its_windows_are_and_what_it_avoids(client):
+    text = "F[0,60] G[0,5] a > 1 and G[0,9] not b > 0 and (c > 0 U[2,8] a > 1)"
+    told = client.post("/v1/specs/validate", json={"formula": text}).json()
+    windows = [(w["operator"], w["begin"], w["end"], w["depth"]) for w in told["windows"]]
+    assert windows == [("F", 0, 60, 0), ("G", 0, 65, 1), ("G", 0, 9, 0), ("U", 2, 8, 0)]
+    assert told["avoided"] == ["b"]
