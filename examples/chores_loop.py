@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from specshield.client import Session
 from specshield.errors import LogitsError, PoseError, RobotError
+from specshield.local import LocalSession
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import wrap
 
@@ -100,7 +101,7 @@ def feed_back(agent: Any, action: int) -> None:
         agent.cache["last_actions"][...] = action
 
 
-def drive(task: Any, agent: Agent, session: Session) -> bool:
+def drive(task: Any, agent: Agent, session: Session | LocalSession) -> bool:
     """One episode of a task of theirs, shielded; whether the agent had done it where it ended.
 
     task: an AbstractSPOCTask in a house whose map the session's policy was made for. session: just begun at

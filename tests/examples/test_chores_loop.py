@@ -9,6 +9,7 @@ import pytest
 from examples import chores_loop
 from specshield.client import ShieldClient
 from specshield.errors import InfeasibleStart, LogitsError, PoseError, RobotError
+from specshield.local import LocalShield
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
 from specshield.sim.robot import SimulatedRobot
@@ -116,8 +117,8 @@ class Recorded:
         if self.t:
             self.drawn.append(int(self.memory().item()))
         p = self.random.dirichlet(np.ones(20) * 0.3).astype(np.float32)
-        p[4] = 1.0 if self.t == 30 else 0.0
-        p /= p.sum()
+        p[4] = 0.0
+        p = np.eye(20, dtype=np.float32)[4] if self.t == 30 else p / p.sum()
         self.t += 1
         if self.kind == "spoc":
             self.cache["last_actions"] = np.zeros((1, 1), np.int64)
@@ -125,17 +126,26 @@ class Recorded:
         return STRETCH.action_names[p.argmax()], p
 
 
-@pytest.mark.parametrize("kind", ["spoc", "allenact"])
-def test_the_loop_keeps_the_rule_and_tells_the_agent_what_was_executed(server, case, kind):
+@pytest.fixture(params=["a server", "in process"])
+def begin(request, server, case):
+    """What begins a session at a pose."""
+    if request.param == "in process":
+        yield lambda pose: LocalShield.shipped(case.name).session(initial_pose=pose)
+        return
     with ShieldClient(server.url, timeout=10.0) as client:
-        for pose in free_poses(case.task, case.body, 20, np.random.default_rng(3)):
-            try:
-                session = client.sessions.create(policy_id=case.name, initial_pose=tuple(pose))
-                break
-            except InfeasibleStart:
-                continue
-        world, agent = World(case, tuple(pose.tolist())), Recorded(kind)
-        chores_loop.drive(world, agent, session)
+        yield lambda pose: client.sessions.create(policy_id=case.name, initial_pose=pose)
+
+
+@pytest.mark.parametrize("kind", ["spoc", "allenact"])
+def test_the_loop_keeps_the_rule_and_tells_the_agent_what_was_executed(begin, case, kind):
+    for pose in free_poses(case.task, case.body, 20, np.random.default_rng(3)):
+        try:
+            session = begin(tuple(pose.tolist()))
+            break
+        except InfeasibleStart:
+            continue
+    world, agent = World(case, tuple(pose.tolist())), Recorded(kind)
+    chores_loop.drive(world, agent, session)
     assert session.spec_status == "satisfied"
     assert world.names[-1] == "end"
     executed = [STRETCH.action_names.index(name) for name in world.names]

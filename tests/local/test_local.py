@@ -32,6 +32,7 @@ SETTINGS = [
     {"uncertainty": "none", "learn_map": False, "seed": 3},
     {"uncertainty": "none", "threshold": 0.6},
     {"uncertainty": "none", "evaluation": "robustness", "threshold": 0.1, "margin": 0.05},
+    {"uncertainty": "none", "shaping": "lookahead"},
 ]
 
 

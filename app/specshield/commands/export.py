@@ -5,12 +5,14 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from specshield.errors import InputError, NotFound
-from specshield.world.regions import Region
+
+if TYPE_CHECKING:  # every command line reads this module
+    from specshield.world.regions import Region
 
 
 def export(
@@ -27,7 +29,7 @@ def export(
     ] = None,
     step_seconds: Annotated[float, typer.Option(help="How long a step took [s].", min=1e-3)] = 1.0,
 ) -> None:
-    """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun: needs specshield[recordings]."""
+    """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun; needs the extra `recordings`."""
     from specshield.client import ShieldClient
     from specshield.recordings.recording import map_of_service, of_record
     from specshield.service.library.maps import Maps
