@@ -133,7 +133,8 @@ class Setting:
         return made_from
 
     def method(self, name: str) -> Method:
-        """A method by its name; NAME@M/K is one with a margin of M metres and K steps of slack.
+        """A method by its name; NAME@M/K is one with a margin of M metres and K steps of slack, NAME@default
+        one as a session is where nobody says anything: it learns its robot and its map.
 
         Raises NotFound for a name that there is not, InputError for a margin that cannot be.
         """
@@ -175,8 +176,8 @@ def split(method: str) -> tuple[str, Config]:
         )
     if not at:
         return kind, Config()
-    if asked == "learned" and kind in CAREFUL:
-        return kind, Config(uncertainty=Uncertainty())
+    if asked == "default" and kind in CAREFUL:
+        return kind, Config(uncertainty=Uncertainty(), learn_map=True)
     metres, _, steps = asked.partition("/")
     try:
         margin, slack = float(metres), int(steps or 0)
@@ -185,7 +186,7 @@ def split(method: str) -> tuple[str, Config]:
     if kind not in CAREFUL or not math.isfinite(margin):
         raise InputError(
             "not a method with a margin", path="methods", got=method,
-            expected=f"NAME@METRES, NAME@METRES/STEPS or NAME@learned, the name one of {', '.join(CAREFUL)}",
+            expected=f"NAME@METRES, NAME@METRES/STEPS or NAME@default, the name one of {', '.join(CAREFUL)}",
         )  # fmt: skip
     return kind, Config(margin=margin, slack=slack)
 

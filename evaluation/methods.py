@@ -51,8 +51,8 @@ class Answer:
 class Method(Protocol):
     """A method for one task; it remembers within an episode and not beyond."""
 
-    def begin(self) -> None:
-        """A new episode."""
+    def begin(self, seed: int) -> None:
+        """A new episode. seed: of what a method draws by itself."""
         ...
 
     def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
@@ -70,7 +70,7 @@ class Decoding:
     def __init__(self, task: Task, how: HardDecoding | RobustDecoding | None = None) -> None:
         self._terminal, self._how = task.robot.terminal, how
 
-    def begin(self) -> None:
+    def begin(self, seed: int) -> None:
         pass
 
     def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
@@ -90,14 +90,19 @@ class Decoding:
 
 
 class Shielded:
-    """The shield. carries: whether each decision's witnesses are handed to the next decision."""
+    """The shield. carries: whether each decision's witnesses are handed to the next decision.
+
+    A session that learns needs a caller who executes what the shield drew: it then takes its seed from the
+    run, and not the draws that methods share.
+    """
 
     def __init__(self, shield: Shield, carries: bool = True) -> None:
         self._shield, self._carries = shield, carries
         self._carry: Carry | None = None
 
-    def begin(self) -> None:
+    def begin(self, seed: int) -> None:
         self._carry = None
+        self._shield = replace(self._shield, config=replace(self._shield.config, seed=seed))
 
     def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
         decision = decide(self._shield, history, logits, logits is None, carry=self._carry)
@@ -120,6 +125,8 @@ class Shielded:
 
     def _chosen(self, decision: Decision, logits: Floats | None, draw: float) -> tuple[Floats, int, str]:
         """The distribution, the action drawn and the mode."""
+        if self._shield.config.uncertainty is not None:
+            return decision.distribution, decision.action, decision.mode
         return decision.distribution, drawn(decision.distribution, draw), decision.mode
 
 

@@ -148,7 +148,7 @@ def _episode(experiment: Experiment, name: str, i: int, own: int, begun: _Beginn
     poses = np.empty((MAX_STEPS + 1, 3))
     tally = _Tally()
     ended_at, main_done, t = None, False, 0
-    method.begin()
+    method.begin(own)
     model.reset(np.random.default_rng([own, MODEL]))
     while True:
         poses[t] = robot.pose

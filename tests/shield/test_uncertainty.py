@@ -11,7 +11,7 @@ from specshield.shield.episode import Config, decide, make_shield
 from specshield.shield.uncertainty import HARDER, MENDED, Noise, Uncertainty, margin_for, slack_for
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted
 
-STRETCH = (0.01, math.radians(0.5), 0.05)  # what is assumed
+STRETCH = (0.01, math.radians(0.5), 0.05, True)  # what is assumed
 MOVES = np.array([[0.2, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, -0.1], [0.0, 0.0, 0.0]])
 HERE = np.zeros(3)
 
@@ -71,11 +71,11 @@ def test_slack_covers_what_motions_may_cost(left, slips, lost, kept, move):
     chance, noise = 0.0025, Noise(move, move / 2.0, slips, lost, kept)
     spread = HARDER * math.hypot(move / 0.2, move / 2.0 / MENDED)
 
+    number = betabinom(left, lost, kept) if lost < 100 else binom(left, lost / (lost + kept))
+    k = np.arange(left + 1)
+
     def over(slack):
-        n = left - slack
-        number = betabinom(n, lost, kept) if lost < 100 else binom(n, lost / (lost + kept))
-        k = np.arange(n + 1)
-        tail = norm.sf(slack - k, scale=spread * math.sqrt(n)) if move else (k > slack).astype(float)
+        tail = norm.sf(slack - k, scale=spread * math.sqrt(left)) if move else (k > slack).astype(float)
         return (1.0 - slips) * tail[0] + slips * float(number.pmf(k) @ tail)
 
     found = slack_for(noise, 0.2, left, chance)

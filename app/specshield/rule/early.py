@@ -27,7 +27,8 @@ class Conjuncts(NamedTuple):
 
     below: the tree without the F or G at the top of each conjunct, and without the `and` that joins them.
     kind [K]: what that is; OTHER: none, and the conjunct is whole in `below`. at [K]: where in the buffer the
-    values begin that it ranges over; a, b [K]: its window; horizon [K]: of what is below it.
+    values begin that it ranges over; a, b [K]: its window; horizon [K]: of what is below it. plain [K]:
+    whether that is a predicate, or under an F a G over one.
     """
 
     below: Tree
@@ -36,6 +37,7 @@ class Conjuncts(NamedTuple):
     a: Ints
     b: Ints
     horizon: Ints
+    plain: Bools
 
 
 @lru_cache(maxsize=256)
@@ -70,7 +72,14 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
         (p.a, p.b, p.child.horizon) if isinstance(p, (Always, Eventually)) else (0, 0, 0) for p in parts
     ]
     a, b, horizon = np.array(windows, np.int64).reshape(-1, 3).T.copy()
-    return whole, Conjuncts(below, np.array(kinds, np.int64), np.array(at, np.int64), a, b, horizon)
+    plain = np.array([_is_plain(part) for part in parts], np.bool_)
+    return whole, Conjuncts(below, np.array(kinds, np.int64), np.array(at, np.int64), a, b, horizon, plain)
+
+
+def _is_plain(part: Formula) -> bool:
+    if isinstance(part, Eventually) and isinstance(part.child, Always):
+        return part.child.child.horizon == 0
+    return isinstance(part, (Always, Eventually)) and part.child.horizon == 0
 
 
 @kernel

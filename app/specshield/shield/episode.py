@@ -16,11 +16,13 @@ from numpy.typing import ArrayLike
 
 from specshield.arrays import Floats
 from specshield.compiled import leaf
-from specshield.errors import InfeasibleStart, LogitsError, PoseError
+from specshield.errors import InfeasibleStart, PoseError
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
 from specshield.robot.oddity import oddities
 from specshield.shield import shaping
+from specshield.shield.caution import threshold
 from specshield.shield.caution.experience import learn, remember
+from specshield.shield.caution.threshold import chances, left_of, next_left
 from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
 from specshield.shield.explanation import explanations
 from specshield.shield.feasibility import futures, prefix_of
@@ -114,7 +116,7 @@ def decide(
     task, robot = shield.task, shield.task.robot
     poses = _history(history)
     t, signals = len(poses) - 1, signals or {}
-    log_prior = _log_prior(shield, logits, main_task_done)
+    log_prior = shaping.log_prior_of(task.robot, logits, main_task_done)
     taught, said = teach(shield, carry, poses, occupied, free)
     said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)), *said)
     shield = on_map(shield, taught.map)
@@ -122,6 +124,7 @@ def decide(
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
     memory, weights = None if carry is None else carry.memory, None
+    chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
@@ -137,13 +140,20 @@ def decide(
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior)
-        answer = _answer(shield, log_prior, judged, main_task_done, weights)
+        if shield.config.threshold_over == "episode" and spec_status == "pending":
+            chance = chances(shield, care, prefix, judged)
+            left = left_of(shield, carry, chance)
+        answer = _answer(shield, log_prior, judged, main_task_done, weights, chance, left)
         if spec_status == "violated":
             answer = replace(answer, mode="violated")
 
     action = _draw(answer.distribution, shield.config.seed, t)
     moved = judged.completion if judged is not None and robot.terminal[action] else action
     certified = witnesses_of(shield, judged)
+    if chance is not None:
+        left = next_left(left, chance, answer.distribution, robot.terminal)
+    elif shield.config.threshold_over == "episode":
+        left = left_of(shield, carry, None)
     margin, slack = (care.margin, care.least) if judged is None else (judged.margin, judged.slack)
     remembered = None
     if seen is not None:
@@ -172,7 +182,7 @@ def decide(
         warnings=said if judged is None else (*said, *judged.tried.warnings),
         margin=margin,
         slack=slack,
-        threshold_left=shield.config.threshold,
+        threshold_left=left,
         map_revision=taught.map.revision,
         explanations=explanations(shield, prefix, judged, margin, slack) if explain else (),
         carry=Carry(
@@ -181,6 +191,7 @@ def decide(
             certified,
             memory,
             residuals=remembered,
+            threshold_left=left if shield.config.threshold_over == "episode" else None,
             learned=handed_on(shield, taught, int(robot.motion_of[moved])),
             action=action,
         ),
@@ -198,11 +209,13 @@ class _Answer:
 
 
 def _answer(
-    shield: Shield, log_prior: Floats | None, judged: Judged, main_task_done: bool, weights: Floats | None
-) -> _Answer:
+    shield: Shield, log_prior: Floats | None, judged: Judged, main_task_done: bool, weights: Floats | None,
+    chance: Floats | None, left: float,
+) -> _Answer:  # fmt: skip
     """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`.
 
-    weights [A]: the preference's log-weights inside S_t beside the model's log-probabilities.
+    weights [A]: the preference's log-weights inside S_t beside the model's log-probabilities. chance [A],
+    left: of a threshold over the episode (threshold.py).
     """
     terminal = shield.task.robot.terminal
     any_feasible = bool(judged.feasible.any())
@@ -221,7 +234,9 @@ def _answer(
     if config.evaluation == "robustness":
         shaped = shaping.tilt(conditional, judged.values, config.threshold)
         attainable = bool(judged.values.max() >= config.threshold)
-    elif config.threshold == 1.0:
+    elif chance is not None and chance.max() > 0.0:
+        shaped = threshold.shaped(conditional, chance, left)
+    elif config.threshold == 1.0 or config.threshold_over == "episode":
         wanted = conditional if weights is None else conditional + weights
         shaped = shaping.restrict(wanted, judged.feasible)
     else:
@@ -271,48 +286,6 @@ def _wrapped(poses: Floats) -> bool:
             return False
         poses[i, 2] = wrap(poses[i, 2])
     return True
-
-
-def _log_prior(shield: Shield, logits: ArrayLike | None, main_task_done: bool) -> Floats | None:
-    n = len(shield.task.robot.actions)
-    if logits is None:
-        if main_task_done:
-            return None
-        raise LogitsError(
-            "logits are missing",
-            path="logits",
-            got=None,
-            expected=f"{n} numbers; null once main_task_done is true",
-        )
-    array = np.asarray(logits, dtype=np.float64)
-    if array.shape != (n,):
-        raise LogitsError(
-            "the wrong number of logits", path="logits",
-            got=array.shape[0] if array.ndim == 1 else list(array.shape),
-            expected=f"{n}, one for each of {', '.join(shield.task.robot.action_names)}",
-        )  # fmt: skip
-    i = _wrong(array)
-    if i >= 0:
-        raise LogitsError(
-            "a logit is NaN or +infinity",
-            path=f"logits[{i}]",
-            got=str(array[i]),
-            expected="a number, or null for -inf",
-        )
-    if array.max() == -np.inf:
-        raise LogitsError(
-            "every logit is null", path="logits", got="all null", expected="at least one finite logit"
-        )
-    return shaping.log_softmax(array)
-
-
-@leaf
-def _wrong(logits: Floats) -> int:
-    """The first that is NaN or +infinity, -1 where none is."""
-    for i in range(logits.shape[0]):
-        if math.isnan(logits[i]) or logits[i] == math.inf:
-            return i
-    return -1
 
 
 def _follow(carry: Carry | None, poses: Floats) -> tuple[bytes | None, tuple[float, float] | None]:

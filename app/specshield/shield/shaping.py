@@ -9,10 +9,15 @@ Only threshold = 1 with binary J carries a guarantee: a threshold holds per step
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from specshield.arrays import Bools, Floats
-from specshield.compiled import kernel
+from specshield.compiled import kernel, leaf
+from specshield.errors import LogitsError
+from specshield.robot import Robot
 
 
 @kernel
@@ -21,6 +26,49 @@ def log_softmax(logits: Floats) -> Floats:
     top = np.max(logits)
     result: Floats = logits - top - np.log(np.sum(np.exp(logits - top)))
     return result
+
+
+def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -> Floats | None:
+    """The model's log-probabilities [A]; None where it is over and has none. Raises LogitsError."""
+    n = len(robot.actions)
+    if logits is None:
+        if main_task_done:
+            return None
+        raise LogitsError(
+            "logits are missing",
+            path="logits",
+            got=None,
+            expected=f"{n} numbers; null once main_task_done is true",
+        )
+    array = np.asarray(logits, dtype=np.float64)
+    if array.shape != (n,):
+        raise LogitsError(
+            "the wrong number of logits", path="logits",
+            got=array.shape[0] if array.ndim == 1 else list(array.shape),
+            expected=f"{n}, one for each of {', '.join(robot.action_names)}",
+        )  # fmt: skip
+    i = _wrong(array)
+    if i >= 0:
+        raise LogitsError(
+            "a logit is NaN or +infinity",
+            path=f"logits[{i}]",
+            got=str(array[i]),
+            expected="a number, or null for -inf",
+        )
+    if array.max() == -np.inf:
+        raise LogitsError(
+            "every logit is null", path="logits", got="all null", expected="at least one finite logit"
+        )
+    return log_softmax(array)
+
+
+@leaf
+def _wrong(logits: Floats) -> int:
+    """The first that is NaN or +infinity, -1 where none is."""
+    for i in range(logits.shape[0]):
+        if math.isnan(logits[i]) or logits[i] == math.inf:
+            return i
+    return -1
 
 
 @kernel

@@ -101,29 +101,35 @@ def margin_for(noise: Noise, stride: float, steps: int) -> float:
 
 @leaf
 def slack_for(noise: Noise, stride: float, left: int, chance: float) -> int:
-    """The fewest steps to keep free of `left` ones, so that motions cost more of them but for `chance`.
-
-    Of n = left - slack motions, a beta-binomial number is not executed; what noise costs the others is taken
-    to be normal, of a standard deviation that grows with the root of n.
-    """
-    spread = HARDER * math.hypot(noise.move / stride, noise.turn / MENDED)
-    both = math.lgamma(noise.lost + noise.kept) - math.lgamma(noise.kept) if noise.slips > 0.0 else 0.0
+    """The fewest steps to keep free of `left` ones, so that these cost more of them but for `chance`."""
     for free in range(left):
-        n = left - free
-        sigma = spread * math.sqrt(n)
-        over = (1.0 - noise.slips) * _above(free, sigma)
-        if noise.slips > 0.0:
-            share = math.exp(both + math.lgamma(noise.kept + n) - math.lgamma(noise.lost + noise.kept + n))
-            rest = 1.0  # of the probability: that more motions are lost than were counted
-            for k in range(min(free + int(4.0 * sigma), n) + 1):
-                over += noise.slips * share * _above(free - k, sigma)
-                rest -= share
-                if k < n:
-                    share *= (n - k) / (k + 1.0) * (noise.lost + k) / max(noise.kept + n - k - 1.0, 1e-9)
-            over += noise.slips * max(rest, 0.0)
-        if over <= chance:
+        if costs_above(noise, stride, left, free) <= chance:
             return free
     return left
+
+
+@leaf
+def costs_above(noise: Noise, stride: float, n: int, free: int) -> float:
+    """The probability that n motions cost more than `free` steps beside their own.
+
+    A beta-binomial number of them is not executed; what noise costs is taken to be normal, of a standard
+    deviation that grows with the root of n.
+    """
+    sigma = HARDER * math.hypot(noise.move / stride, noise.turn / MENDED) * math.sqrt(n)
+    over = (1.0 - noise.slips) * _above(free, sigma)
+    if noise.slips <= 0.0:
+        return over
+    lost, kept = noise.lost, noise.kept
+    share = math.exp(
+        math.lgamma(lost + kept) - math.lgamma(kept) + math.lgamma(kept + n) - math.lgamma(lost + kept + n)
+    )
+    rest = 1.0  # the probability that more motions are lost than were counted
+    for k in range(min(free + int(4.0 * sigma), n) + 1):
+        over += noise.slips * share * _above(free - k, sigma)
+        rest -= share
+        if k < n:
+            share *= (n - k) / (k + 1.0) * (lost + k) / max(kept + n - k - 1.0, 1e-9)
+    return over + noise.slips * max(rest, 0.0)
 
 
 @leaf

@@ -18,14 +18,17 @@ from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.robot.dynamics import wrap
 from specshield.shield.decision import Carry, Shield
-from specshield.shield.uncertainty import CHANCE, Care, Noise, margin_for
+from specshield.shield.uncertainty import CHANCE, Care, Noise, Uncertainty, margin_for
 from specshield.stl import Eventually, conjuncts
 from specshield.task import Task
 
-# How much what is known before the first step weighs. Chosen by hand.
-NOISE_WEIGHT = 20.0  # [motions]
-SLIP_WEIGHT = 60.0  # [motions]
-SLIPS_AT_ALL = 0.5  # the probability that motions slip, before the first
+ASSUMED = Uncertainty()
+Told = tuple[float, float, float, bool]  # what `Uncertainty` says, and whether it is only assumed
+
+# How much what is taken before the first step weighs. Chosen by hand.
+KNOWN_WEIGHT = 1000.0  # [motions] what was said of the robot
+NOISE_WEIGHT, SLIP_WEIGHT = 20.0, 60.0  # [motions] what is assumed of it
+SLIPS_AT_ALL = 0.5  # the assumed probability that motions slip, before the first
 EXACT = 1e-6  # [m] and [rad]: what ends this near to where f has it shows no noise
 SURE = 3  # [motions] that have shown none, after which there is none but for what is seen
 STRAY = (
@@ -67,7 +70,7 @@ def learn(
     config, t, known = shield.config, len(poses) - 1, shield.config.uncertainty
     if known is None:
         return None, Care(config.margin, config.slack)
-    told = (known.translation, known.rotation, known.slip)
+    told = (known.translation, known.rotation, known.slip, known == ASSUMED)
     seen = Seen() if carry is None or carry.residuals is None else Seen(*FORMAT.unpack(carry.residuals))
     if carry is not None and carry.t == t - 1 and not contact:
         seen = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
@@ -108,27 +111,29 @@ def _standing(motion_of: Ints, distribution: Floats, ending: int, nexts: Floats,
 
 
 @leaf
-def noise_of(told: tuple[float, float, float], seen: Seen) -> Noise:
+def noise_of(told: Told, seen: Seen) -> Noise:
     """The means of what was told, as in `Uncertainty`, and of what was seen, each by how many motions it
     stands for.
     """
-    translation, rotation, slip = told
-    weight = NOISE_WEIGHT if seen.exact < SURE else 0.0
+    translation, rotation, slip, assumed = told
+    weight, weight_of_slip, at_all = KNOWN_WEIGHT, KNOWN_WEIGHT, 1.0
+    if assumed:
+        weight, weight_of_slip, at_all = NOISE_WEIGHT, SLIP_WEIGHT, SLIPS_AT_ALL
+        if seen.exact >= SURE:
+            weight = 0.0
     count = max(weight + seen.noisy, 1.0)
-    slips = SLIPS_AT_ALL / (SLIPS_AT_ALL + (1.0 - SLIPS_AT_ALL) * seen.odds)
+    slips = at_all / (at_all + (1.0 - at_all) * seen.odds)
     return Noise(
         math.sqrt((weight * translation**2 + 0.5 * seen.moves) / count),  # along two axes
         math.sqrt((weight * rotation**2 + seen.turns) / count),
         slips if slip > 0.0 or seen.lost > 0.0 else 0.0,
-        max(SLIP_WEIGHT * slip + seen.lost, TINY),
-        max(SLIP_WEIGHT * (1.0 - slip) + seen.moved - seen.lost, TINY),
+        max(weight_of_slip * slip + seen.lost, TINY),
+        max(weight_of_slip * (1.0 - slip) + seen.moved - seen.lost, TINY),
     )
 
 
 @kernel
-def observe(
-    told: tuple[float, float, float], seen: Seen, before: Floats, foreseen: Floats, pose: Floats
-) -> Seen:
+def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floats) -> Seen:
     """Takes one step into what is remembered. before, pose (3,): x_{t-1} and x_t; foreseen [M, 3]: where f
     leads from x_{t-1}.
     """

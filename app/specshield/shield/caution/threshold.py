@@ -1,0 +1,135 @@
+"""A threshold for the whole episode: delta bounds the probability that the rule is kept, not one step's.
+
+V(a) is a lower bound on the probability of keeping the rule after a, V* the largest of them, d_0 = delta, and
+
+    pi_t = the distribution nearest to the model's with E_pi[V] >= d_t,    d_{t+1} = d_t V*_{t+1} / E_pi_t[V].
+
+Where V is never more than what its best successor is expected to have, d_t is expected never to fall, and
+d_t <= V*_t; so the rule is kept with probability delta or more. In an exact world V is J, 0 or 1.
+
+Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost: one
+minus, for each deadline, the probability that more steps are lost than it leaves free, and minus, for each
+step at which a G or another conjunct is to hold, the probability that a deviation is longer than its
+robustness there. docs/uncertainty.md says where that is a bound.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats, Ints
+from specshield.compiled import kernel
+from specshield.rule.early import ALWAYS, EVENTUALLY, Conjuncts, conjunction_of, find_open
+from specshield.rule.view import view_of
+from specshield.shield import shaping
+from specshield.shield.decision import Carry, Shield
+from specshield.shield.feasibility import Prefix, prefix_of, rho_of
+from specshield.shield.judgement import Judged
+from specshield.shield.uncertainty import Care, Noise, costs_above
+from specshield.stl import SATISFIED_ABOVE
+from specshield.stl.tree import tree_value
+
+GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
+
+
+def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged) -> Floats:
+    """V of each action [A]; of a terminal one, 0."""
+    tried, task = judged.tried, shield.task
+    formula, parts = conjunction_of(task, prefix.formula)
+    leaves = tried.leaves
+    if formula is not prefix.formula:
+        prefix = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
+        _, leaves = rho_of(prefix, tried)
+    still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
+    find_open(parts, prefix.known, prefix.t, still)
+    sigma = math.hypot(care.noise.move, care.stride * care.noise.turn)
+    _chances(
+        parts,
+        still,
+        prefix.t,
+        care.noise,
+        care.stride,
+        sigma,
+        care.margin,
+        leaves,
+        tried.rho,
+        tried.motions,
+        values,
+    )
+    motion_of = task.robot.motion_of
+    return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0)
+
+
+@kernel
+def _chances(
+    parts: Conjuncts, still: Bools, t: int, noise: Noise, stride: float, sigma: float, margin: float,
+    leaves: Floats, rho: Floats, motions: Ints, values: Floats,
+) -> None:  # fmt: skip
+    """Writes V of each motion (M,), which is zero where no future keeps the rule."""
+    buffer = np.empty(leaves.shape[1])
+    for f in range(rho.shape[0]):
+        if not rho[f] > SATISFIED_ABOVE:
+            continue
+        buffer[:] = leaves[f]
+        tree_value(parts.below, buffer)
+        over = 0.0
+        for k in range(still.shape[0]):
+            if still[k]:
+                over += _late(parts, k, t, noise, stride, margin, buffer)
+            if still[k] and sigma > 0.0 and parts.kind[k] == ALWAYS:
+                for step in range(max(parts.a[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
+                    deep = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
+                    over += math.exp(-0.5 * (deep / sigma) ** 2)
+        values[motions[f, 0]] = max(values[motions[f, 0]], 1.0 - over)
+
+
+@kernel
+def _late(
+    parts: Conjuncts, k: int, t: int, noise: Noise, stride: float, margin: float, buffer: Floats
+) -> float:
+    """The probability that motions cost more steps than conjunct k leaves free, or 1 where that is not known.
+
+    An F is first kept by `margin`, or else by as little as it is, so many steps before its window ends. A G
+    that has not begun is kept from so many steps before it begins, and from x_t on without a deadline.
+    """
+    first, a, b = parts.at[k] - parts.a[k], parts.a[k], parts.b[k]
+    if noise.slips <= 0.0 and noise.move <= 0.0 and noise.turn <= 0.0:
+        return 0.0
+    if not parts.plain[k]:
+        return 1.0
+    if parts.kind[k] == EVENTUALLY:
+        met = -1
+        for step in range(a, b + 1):
+            if buffer[first + step] > SATISFIED_ABOVE + margin:
+                met = step
+                break
+            if met < 0 and buffer[first + step] > SATISFIED_ABOVE:
+                met = step
+        return costs_above(noise, stride, b + parts.horizon[k] - t, b - met)
+    if a <= t:
+        return 0.0
+    return costs_above(noise, stride, a - t, 0)  # what is below a G is known from its first step on
+
+
+def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float:
+    """d_t / V*_t. values [A]: V; None where nothing was asked of this step."""
+    if carry is not None and carry.threshold_left is not None:
+        return carry.threshold_left
+    best = 1.0 if values is None else float(values.max())
+    return min(shield.config.threshold / best, 1.0) if best > 0.0 else 1.0
+
+
+def shaped(conditional: Floats, values: Floats, left: float) -> Floats | None:
+    """pi_t [A], given that the model does not end; None where it gives what V asks for no mass."""
+    return shaping.tilt(conditional, values, left * float(values.max()))
+
+
+def next_left(left: float, values: Floats, distribution: Floats, terminal: Bools) -> float:
+    """d_{t+1} / V*_{t+1}. values, distribution [A]; after a terminal action the best one is executed."""
+    best = float(values.max())
+    expected = float(distribution @ np.where(terminal, best, values))
+    if best <= 0.0 or expected <= 0.0:
+        return left
+    return min(left * best / expected, 1.0)

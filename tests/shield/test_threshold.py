@@ -1,0 +1,79 @@
+"""A threshold over the episode: V beside a model checker's best policy, and asked against kept."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from specshield.policy.reachability import policy as reachability
+from specshield.shield.caution.experience import learn
+from specshield.shield.caution.threshold import chances
+from specshield.shield.episode import Config, close, decide, make_shield
+from specshield.shield.feasibility import prefix_of
+from specshield.shield.judgement import judge
+from specshield.shield.proposal import Proposal
+from specshield.shield.uncertainty import Uncertainty
+from tests.oracles.cells import WAIT, Cells, ways
+
+VECTORS = json.loads((Path(__file__).parents[1] / "oracles/storm/vectors.json").read_text())
+RULE, REGIONS = "F[0,4] A and F[5,12] B", {"A": (2, 0), "B": (0, 0)}
+
+
+class Everything:
+    """Proposes every future there is to a near horizon, waiting after that."""
+
+    id = "everything"
+
+    def __init__(self, cells):
+        self.task = cells.task
+
+    def propose(self, history, signals, margin):
+        steps = self.task.horizon + 1 - len(history)
+        rows = ways(min(steps, 6))
+        return Proposal(np.pad(rows, ((0, 0), (0, steps - rows.shape[1])), constant_values=WAIT), WAIT)
+
+
+@pytest.mark.parametrize("formula", sorted({vector["formula"] for vector in VECTORS}))
+@pytest.mark.parametrize("make", [Everything, lambda cells: reachability.synthesise(cells.task)])
+def test_v_is_never_above_what_the_best_policy_has(formula, make):
+    found = []
+    for vector in (v for v in VECTORS if v["formula"] == formula):
+        cells = Cells(formula, None, {name: tuple(cell) for name, cell in vector["cells"].items()})
+        known = Uncertainty(0.0, 0.0, vector["slip"])
+        shield = make_shield([make(cells)], Config(uncertainty=known, threshold_over="episode"))
+        poses = np.array([cells.pose(*vector["start"])])
+        prefix = prefix_of(cells.task, cells.task.formula, shield.view, poses, {})
+        _, care = learn(shield, None, poses)
+        slip = vector["slip"]
+        sure = care.noise._replace(lost=max(1e9 * slip, 1e-9), kept=1e9 * (1.0 - slip))  # as Storm is told it
+        care = replace(care, noise=sure)
+        judged = judge(shield, prefix, None, False, care)
+        found.append((chances(shield, care, prefix, judged)[:4], vector["best"], vector["slip"]))
+    for values, best, slip in found:
+        assert np.all(values <= np.array(best) + 1e-9), (values, best, slip)
+    if make is not Everything:  # which sees six motions ahead
+        assert all(values == pytest.approx(best) for values, best, slip in found if slip == 0.0)
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.1])
+@pytest.mark.parametrize("asked", [0.5, 0.9])
+def test_the_rule_is_kept_as_often_as_was_asked(asked, slip):
+    cells = Cells(RULE, None, REGIONS)
+    config = Config(threshold=asked, threshold_over="episode", uncertainty=Uncertainty(0.0, 0.0, slip))
+    shield, kept, runs = make_shield([reachability.synthesise(cells.task)], config), 0, 400
+    for run in range(runs):
+        random, history, carry = np.random.default_rng(run), [cells.pose(0, 0, 0)], None
+        shield = make_shield(shield.proposers, Config(**{**vars(config), "seed": run}))
+        for _ in range(cells.task.horizon):
+            logits = np.append(random.normal(0.0, 2.0, 3), [0.0, -np.inf])
+            found = decide(shield, history, logits, carry=carry)
+            assert 0.0 <= found.threshold_left <= 1.0
+            carry, state = found.carry, cells.state(history[-1])
+            state = state if random.random() < slip else cells.after(state, found.action)
+            history.append(cells.pose(*state))
+        kept += close(shield, history)[0] == "satisfied"
+    spread = 2.6 * np.sqrt(asked * (1.0 - asked) / runs)
+    assert kept / runs >= asked - spread
+    assert kept / runs <= asked + spread + 0.05 + (0.0 if slip == 0.0 else 0.1)
