@@ -122,3 +122,7 @@ def test_bad_specs_name_the_field(given, error, path):
         task_of(**{"formula": "F[0,3] A", **given})
     assert path is None or caught.value.path == path
     assert caught.value.expected
+
+
+def test_a_rule_of_the_first_state_alone_is_a_task():
+    assert task_of("x > 1").horizon == 0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from specshield.arrays import Floats
-from specshield.errors import FormulaError, InputError, MapError, SampleError
+from specshield.errors import InputError, MapError, SampleError
 from specshield.robot import Robot, robot_to_json
 from specshield.stl import BODY_WORDS, Formula, body_name, is_name, parse, region_named
 from specshield.world.occupancy import OccupancyGrid
@@ -116,13 +116,6 @@ def make_task(
     initial = parse_signals(signals or {}, declared)
     known = {name: room for name, room in (rooms or {}).items() if name not in initial} | declared
     tree = parse(formula, names=names_for(known, initial), max_horizon=max_horizon)
-    if tree.horizon < 1:
-        raise FormulaError(
-            "the formula says nothing of any step after the first",
-            path="formula",
-            got=formula,
-            expected="a horizon of at least 1",
-        )
     named = [region_named(name)[1] for name in tree.names]
     used = {name: known[name] for name in named if name in known}
     return Task(grid, robot, tree, used, {name: initial[name] for name in tree.names if name in initial})

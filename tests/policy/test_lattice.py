@@ -16,12 +16,12 @@ from specshield.policy.lattice import (
     coordinates_ahead,
     corner,
     heading_after,
-    heading_count,
     interpolate,
     leads_back,
     make_lattice,
     pose_of,
 )
+from specshield.policy.shape import heading_count
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body
 from specshield.world.occupancy import OccupancyGrid
@@ -35,7 +35,9 @@ def test_the_fewest_headings_that_every_turn_fits():
     assert heading_count([]) == 4
     assert heading_count([math.pi / 2, -math.pi / 2]) == 4
     assert heading_count([math.radians(30), math.radians(-6)]) == 60
-    assert heading_count([1.0]) == 72  # none fits
+    assert heading_count([0.5236]) == 12  # 30 degrees, as people write them
+    assert heading_count([0.5]) == 25  # none fits; 2 of these are 0.5027
+    assert heading_count([0.1, 0.17, 0.23, 0.37]) == 72  # none is near
 
 
 def test_a_pose_and_its_coordinates():

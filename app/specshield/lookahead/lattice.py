@@ -10,8 +10,9 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.policy.lattice import Corners, heading_count, pose_of
+from specshield.policy.lattice import Corners, pose_of
 from specshield.policy.reachability.tables import Tables, slack
+from specshield.policy.shape import heading_count
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 from specshield.rule.progress import (
     ALWAYS,

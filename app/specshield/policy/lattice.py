@@ -8,6 +8,7 @@ What a table says is therefore only a suggestion: the exact simulation certifies
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from specshield.arrays import Bools, Bytes, Codes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
+from specshield.policy.shape import heading_count
 from specshield.robot.dynamics import (
     TOUCH,
     Body,
@@ -30,13 +32,12 @@ from specshield.robot.dynamics import (
 from specshield.rule.progress import STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
-from specshield.task import Task
 
-MAX_HEADINGS = 120
-USUAL_HEADINGS = 72  # where no number of headings up to MAX_HEADINGS fits every turn: 5 degrees each
 STEP_CODES = 64.0  # codes of a step in a table of steps
 INVALID = 65535  # the code of a pose that is in collision or breaks what the table keeps
 NO_TIME = -1.0  # in place of a step, where there is none
+SMALL = 1_000_000  # poses of a lattice that one thread makes
+THREADS = 2  # that make a larger one: kernels let go of the interpreter's lock
 SHORTEST_MOVE = 0.02  # [m] a move that contact cuts shorter than this leads nowhere (chosen by hand)
 
 
@@ -60,24 +61,6 @@ class Lattice(NamedTuple):
     reach: int
 
 
-def heading_count(rotations: list[float]) -> int:
-    """The fewest headings, 4 to MAX_HEADINGS, that every rotation is a multiple of; else USUAL_HEADINGS."""
-    for n in range(4, MAX_HEADINGS + 1):
-        unit = 2.0 * math.pi / n
-        if all(abs(r / unit - round(r / unit)) < 1e-6 for r in rotations):
-            return n
-    return USUAL_HEADINGS
-
-
-def lattice_shape(task: Task, pitch: float) -> tuple[int, int, int]:
-    """Rows, columns and headings of the lattice for a task."""
-    height, width = (
-        max(math.ceil(n * task.grid.resolution / pitch - 1e-9), 1)
-        for n in (task.grid.height, task.grid.width)
-    )
-    return height, width, heading_count([turn for _, turn in task.robot.motions if turn != 0.0])
-
-
 def number_cells(used: Bools) -> Int32s:
     """The row that each cell in use has in a table, -1 for the others. used, result [ny, nx]."""
     cell = np.full(used.shape, -1, np.int32)
@@ -85,8 +68,10 @@ def number_cells(used: Bools) -> Int32s:
     return cell
 
 
-def make_lattice(body: Body, pitch: float) -> Lattice:
-    """Simulates every motion from every pose of the lattice once."""
+def make_lattice(body: Body, pitch: float, cells: Bools | None = None) -> Lattice:
+    """Simulates every motion from every pose of the lattice once, or of those `cells` [ny, nx] alone: the
+    other poses count as not valid.
+    """
     height, width = body.occupied.shape
     ny, nx = (max(math.ceil(n * body.resolution / pitch - 1e-9), 1) for n in (height, width))
     moves, rotations = displacements(body)
@@ -105,7 +90,16 @@ def make_lattice(body: Body, pitch: float) -> Lattice:
         shift=np.array([round(rotations[m] * headings / (2.0 * math.pi)) for m in turning], np.int64),
         reach=math.ceil(longest_motions(body)[0] / pitch) + 1,
     )
-    _simulate_all(body, lattice, moving, turning)
+    if cells is None:
+        cells = np.ones((ny, nx), np.bool_)
+    parts = THREADS if ny * nx * headings > SMALL else 1
+    rows = np.linspace(0, ny, 4 * parts + 1).astype(int).tolist()
+
+    def simulate(part: int) -> None:
+        _simulate_all(body, lattice, moving, turning, cells, rows[part], rows[part + 1])
+
+    with ThreadPoolExecutor(parts) as pool:
+        list(pool.map(simulate, range(4 * parts)))
     return lattice
 
 
@@ -262,12 +256,17 @@ def leads_back(body: Body, last: int, motion: int) -> bool:
 
 
 @kernel
-def _simulate_all(body: Body, lattice: Lattice, moving: Ints, turning: Ints) -> None:
-    ny, nx, headings = lattice.valid.shape
+def _simulate_all(
+    body: Body, lattice: Lattice, moving: Ints, turning: Ints, cells: Bools, first: int, stop: int
+) -> None:
+    """Rows `first` to stop - 1."""
+    _, nx, headings = lattice.valid.shape
     turns_within = swing_radius(body) + TOUCH
     moves_within = turns_within + longest_motions(body)[0]
-    for j in range(ny):
+    for j in range(first, stop):
         for i in range(nx):
+            if not cells[j, i]:
+                continue
             u, v = (i + 0.5) * lattice.pitch, (j + 0.5) * lattice.pitch
             room = free_distance(body, u, v, moves_within)
             for h in range(headings):

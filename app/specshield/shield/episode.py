@@ -57,10 +57,13 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
         ) from None
     check_place(shield, history[0], "initial_pose")
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
-    tried = futures(prefix, shield.body, shield.proposers, None, shield.config.margin)
-    best = float(tried.rho.max(initial=-np.inf))
+    rho, warnings = np.array([prefix.low]), tuple[str, ...]()
+    if shield.task.horizon > 0:  # else the first state says it all
+        tried = futures(prefix, shield.body, shield.proposers, None, shield.config.margin)
+        rho, warnings = tried.rho, tried.warnings
+    best = float(rho.max(initial=-np.inf))
     if not best > SATISFIED_ABOVE:
-        found = f"the best robustness found is {best:.3f}" if len(tried.rho) else "; ".join(tried.warnings)
+        found = f"the best robustness found is {best:.3f}" if len(rho) else "; ".join(warnings)
         raise InfeasibleStart(
             f"no future from here was found that satisfies the formula: {found}",
             path="initial_pose", got=list(pose),

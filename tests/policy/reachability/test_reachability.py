@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,10 @@ from safetensors.numpy import save
 
 from specshield.errors import FragmentError, PolicyError
 from specshield.policy.methods import load_policy
-from specshield.policy.reachability.policy import Settings, synthesise
+from specshield.policy.reachability.policy import Settings, check, synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, simulate
-from specshield.shield.episode import decide, make_shield
+from specshield.shield.episode import decide, make_shield, start
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import MOTIONS, ROBOT, WAIT, Cells
@@ -203,6 +204,24 @@ def test_what_the_tables_do_not_cover_is_refused():
     grid = OccupancyGrid(np.zeros((20, 20), bool), 0.1)
     with pytest.raises(FragmentError, match="too many"):
         synthesise(make_task(grid, STRETCH, " and ".join(f"F[0,{k}] A" for k in range(1, 10)), regions))
-    huge = OccupancyGrid(np.zeros((1000, 1000), bool), 0.05)
-    with pytest.raises(PolicyError, match="too large"):
-        synthesise(make_task(huge, STRETCH, "F[0,9] A", regions), Settings(pitch=0.02))
+    huge = make_task(OccupancyGrid(np.zeros((1000, 1000), bool), 0.05), STRETCH, "F[0,900] A", regions)
+    with pytest.raises(PolicyError, match="too large") as refused:
+        check(huge, Settings(pitch=0.02))
+    would = float(re.findall(r"options.pitch ([0-9.]+) or more", str(refused.value))[0])
+    check(huge, Settings(pitch=would))  # what the message says would do does
+
+
+def test_a_large_floor_costs_what_the_rule_can_reach():
+    """40 x 40 m. A lies in a corner: the lattice covers where the robot can come from in time, no more."""
+    regions = {"A": {"type": "circle", "center": [1.0, 1.0], "radius": 0.5}}
+    floor = OccupancyGrid(np.zeros((800, 800), bool), 0.05)
+    policy = synthesise(make_task(floor, STRETCH, "F[0,20] A", regions))
+    assert policy.tables.pitch == 0.1
+    assert policy.card["metrics"]["size_bytes"] < 3_000_000
+    shield = make_shield([policy])
+    start(shield, (2.0, 3.0, -2.0))
+    again = load_policy(policy.weights(), policy.card, policy.task)
+    assert again.tables.pitch == policy.tables.pitch
+    whole = synthesise(make_task(floor, STRETCH, "F[0,300] A", regions))
+    assert 0.1 < whole.tables.pitch <= 0.2
+    assert load_policy(whole.weights(), whole.card, whole.task).tables.pitch == whole.tables.pitch

@@ -49,7 +49,7 @@ def test_the_steps_at_which_a_corridor_is_feasible():
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     lattice = make_lattice(body, CELL)
     row = np.arange(6, dtype=np.int32).reshape(1, 6)
-    bits, start = feasible_steps(lattice, rules, holds_at(body, rules, lattice), 3, row)
+    bits = feasible_steps(lattice, rules, holds_at(body, rules, lattice), 3, row)
     pending = bits[..., 0] & 1  # [t, cell, heading]
     assert not pending[3].any()  # too late
     assert pending[2, :, EAST].tolist() == [0, 0, 0, 1, 1, 0]
@@ -57,4 +57,3 @@ def test_the_steps_at_which_a_corridor_is_feasible():
     assert pending[1, :, EAST].tolist() == [0, 0, 1, 1, 1, 0]
     assert pending[1, :, NORTH].tolist() == [0, 0, 0, 1, 1, 1]  # a turn, then a move
     assert pending[0, :, EAST].tolist() == [0, 1, 1, 1, 1, 1]  # the last by two turns and a move
-    assert 0.0 < start < 1.0

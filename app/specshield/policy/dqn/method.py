@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from specshield.errors import PolicyError
 from specshield.policy.methods import Made, Method, Run
 from specshield.policy.options import option
 
@@ -50,6 +51,11 @@ def _check(task: Task, options: Settings) -> None:
     from specshield.rule.progress import make_rules
 
     make_rules(task)
+    if task.horizon < 1:
+        raise PolicyError(
+            "there is nothing to learn: the rule looks at the first state alone", path="spec.formula",
+            got=str(task.formula), expected="a horizon of at least 1; or method 'reachability'",
+        )  # fmt: skip
 
 
 def _make(task: Task, options: Settings, run: Run) -> Made:

@@ -31,7 +31,8 @@ from safetensors.numpy import save as save_tensors
 from specshield.arrays import Bools, Codes, Floats, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, make_card
-from specshield.policy.lattice import Lattice, lattice_shape, make_lattice, number_cells, pose_of
+from specshield.policy.extent import COARSEST, fitting_pitch
+from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to, values_at
@@ -40,6 +41,7 @@ from specshield.policy.planner.literals import Literal, PackedLiterals, literals
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
 from specshield.policy.recall import residuals
+from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turns_in_place
 from specshield.rule.progress import signal_rows
@@ -171,9 +173,9 @@ def synthesise(
     """Computes the fields. Raises PolicyError for a map too large."""
     began = time.perf_counter()
     settings = settings or Settings()
-    check(task, settings)
+    pitch = _pitch(task, settings)
     packed, literals = literals_of(task, task.formula)
-    lattice = make_lattice(make_body(task.robot, task.grid), settings.pitch)
+    lattice = make_lattice(make_body(task.robot, task.grid), pitch)
     holds, free = _holding(task, lattice, literals), lattice.valid == 1
     used = free.any(axis=2)
     codes: dict[tuple[int, tuple[int, ...]], Codes] = {}
@@ -190,7 +192,7 @@ def synthesise(
             chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
     cell = number_cells(used)
     code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
-    fields = Fields(cell, code, settings.pitch)
+    fields = Fields(cell, code, pitch)
     # Trying it also leaves its kernels compiled where a server finds them.
     feasible = PlannerPolicy(task, {}, settings, fields, chosen).feasible_start(lattice)
     metrics = {
@@ -210,9 +212,11 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
     cell, code, chosen = named_arrays(
         read_tensors(weights), {"cell": (np.int32, 2), "code": (np.uint16, 3), "chosen": (np.int32, 2)}
     )
-    ny, nx, headings = lattice_shape(task, settings.pitch)
+    usual = cell.shape == side_of(task.grid, settings.pitch)
+    pitch = settings.pitch if usual else _pitch(task, settings)
+    ny, nx = side_of(task.grid, pitch)
     fits = (
-        cell.shape == (ny, nx) and code.shape[2] == headings and chosen.shape == (len(literals), 2)
+        cell.shape == (ny, nx) and 4 <= code.shape[2] <= MAX_HEADINGS and chosen.shape == (len(literals), 2)
         and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
         and chosen.min(initial=-1) >= -1 and chosen.max(initial=-1) < code.shape[0]
     )  # fmt: skip
@@ -220,22 +224,29 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
         raise PolicyError(
             "the fields do not fit the task", path="weights",
             got=[list(cell.shape), list(code.shape), list(chosen.shape)],
-            expected=f"cell {[ny, nx]}, code [fields, cells, {headings}], chosen [{len(literals)}, 2]",
+            expected=f"cell {[ny, nx]}, code [fields, cells, headings], chosen [{len(literals)}, 2]",
         )  # fmt: skip
-    return PlannerPolicy(task, card, settings, Fields(cell, code, settings.pitch), chosen)
+    return PlannerPolicy(task, card, settings, Fields(cell, code, pitch), chosen)
 
 
 def check(task: Task, settings: Settings) -> None:
     """Raises what `synthesise` would for a task it cannot serve, without making anything."""
+    _pitch(task, settings)
+
+
+def _pitch(task: Task, settings: Settings) -> float:
+    """The pitch of the task's lattice [m]. Raises PolicyError where the fields would be too large."""
     _, literals = literals_of(task, task.formula)
-    ny, nx, headings = lattice_shape(task, settings.pitch)
-    fields = min(2 * len(literals), MAX_FIELDS)
-    if ny * nx * headings * fields > MAX_ENTRIES:
+    fields = max(1, min(2 * len(literals), MAX_FIELDS))
+    pitch = fitting_pitch(task, settings.pitch, fields, MAX_ENTRIES)
+    if pitch > COARSEST * settings.pitch:
+        ny, nx, headings = lattice_shape(task, settings.pitch)
         raise PolicyError(
             "the fields are too large", path="options.pitch",
             got=f"{fields} fields of {ny} x {nx} x {headings} poses",
-            expected=f"at most {MAX_ENTRIES} entries: a larger pitch, or fewer predicates",
+            expected=f"options.pitch {pitch / COARSEST:.2f} or more, or fewer predicates",
         )  # fmt: skip
+    return pitch
 
 
 def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> Bools:

@@ -9,7 +9,7 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
 from specshield.policy.lattice import Corners
-from specshield.policy.reachability.tables import Tables, goals_settled
+from specshield.policy.reachability.tables import Tables, goals_settled, slack
 from specshield.robot.dynamics import Body
 from specshield.rule.progress import EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
 from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
@@ -114,3 +114,19 @@ def fill(n: int, wait: int, x: float, y: float, theta: float, motions: Ints, pos
     for rest in range(n, motions.shape[0]):
         motions[rest] = wait
         poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
+
+
+@kernel
+def share_with_slack(guide: Guide, poses: Floats) -> float:
+    """The share of the poses (N, 3) from which the tables leave time enough at the first step."""
+    found, scratch = 0, make_scratch(guide.rules, 1)
+    for n in range(poses.shape[0]):
+        x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
+        scratch.status[:], scratch.run[:] = PENDING, 0
+        update_progress(guide.rules, 0, x, y, theta, scratch)
+        left = slack(
+            guide.body, guide.rules, guide.tables, x, y, theta, 0, scratch.status, scratch.run,
+            scratch.corners,
+        )  # fmt: skip
+        found += left >= 0.0
+    return float(found / poses.shape[0])

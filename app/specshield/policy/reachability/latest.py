@@ -20,9 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from specshield.arrays import Bytes, Ints, Singles
+from specshield.arrays import Bytes, Codes, Int32s, Ints, Singles
 from specshield.compiled import kernel
-from specshield.policy.lattice import NO_TIME, Lattice, bilinear
+from specshield.policy.lattice import INVALID, NO_TIME, STEP_CODES, Lattice, bilinear, number_cells
+from specshield.policy.reachability.tables import Tables
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
 SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged (chosen by hand)
@@ -97,7 +98,8 @@ def latest_times(
                             _settle(rules, holds, added, later, float(phases[j].start), table)
             table[table > phase.end] = phase.end
             table[(table < phase.start) | (valid[i] == 0)] = NO_TIME
-            sweep(lattice, valid[i], float(phase.start), table)
+            if i + 1 < len(phases) or mask != masks[0]:  # elsewhere nothing is left to do
+                sweep(lattice, valid[i], float(phase.start), table)
     return tables, valid
 
 
@@ -211,3 +213,38 @@ def sweep(lattice: Lattice, valid: Bytes, start: float, table: Singles) -> None:
                     active[max(j - reach, 0) : j + reach + 1, max(i - reach, 0) : i + reach + 1] = 1
         if not changed:
             return
+
+
+def pack_times(
+    latest: Singles, valid: Bytes, masks: list[int], phases: tuple[Phase, ...],
+    goals: Ints, rules: Rules, pitch: float,
+) -> Tables:  # fmt: skip
+    """The latest times of `latest_times` as tables."""
+    used = np.any(valid, axis=(0, 3))
+    table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
+    codes: list[Codes] = []
+    for i in range(len(phases)):
+        for n, mask in enumerate(masks):
+            values = latest[i, n][used]
+            settled = mask == masks[0] and i == len(phases) - 1  # nothing left to do
+            if settled or not np.any(values >= 0.0):
+                continue
+            code = np.where(values >= 0.0, 1.0 + np.floor(STEP_CODES * values), 0.0).astype(np.uint16)
+            code[valid[i][used] == 0] = INVALID
+            table[i, mask] = len(codes)
+            codes.append(code)
+    code = np.array(codes, np.uint16).reshape(len(codes), int(used.sum()), valid.shape[3])
+    return time_tables(rules, goals, phases, number_cells(used), code, table, pitch)
+
+
+def time_tables(
+    rules: Rules, goals: Ints, phases: tuple[Phase, ...], cell: Int32s, code: Codes,
+    table: Int32s, pitch: float,
+) -> Tables:  # fmt: skip
+    """Tables of latest times from what a file holds of them."""
+    bit = np.zeros(len(rules.kind), np.int64)
+    bit[goals] = 1 << np.arange(len(goals))
+    ends = np.array([phase.end for phase in phases], np.int32)
+    phase = np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32)
+    none = np.empty((0, 0, 0, 0), np.uint8)
+    return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,39 +11,53 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors.numpy import save as save_tensors
 
-from specshield.arrays import Bytes, Codes, Floats, Int32s, Ints, Singles
-from specshield.errors import PolicyError
+from specshield.arrays import Bools, Floats, Int32s
+from specshield.errors import MapError, PolicyError
 from specshield.policy.card import Card, make_card
-from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, lattice_shape, make_lattice, number_cells
+from specshield.policy.dqn.environment import free_poses
+from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
+from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.reachability.around import go_around
-from specshield.policy.reachability.guide import Guide
-from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
+from specshield.policy.reachability.guide import Guide, share_with_slack
+from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
 from specshield.policy.reachability.method import Settings
+from specshield.policy.reachability.narrow import AFTER, FIRST, ON, continue_narrow
 from specshield.policy.reachability.search import continue_all
-from specshield.policy.reachability.stepwise import MAX_BYTES, digits_of, feasible_steps, state_count
+from specshield.policy.reachability.sight import look_closely
+from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, state_count, step_tables
 from specshield.policy.reachability.tables import Tables
 from specshield.policy.recall import pasts
+from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
-from specshield.robot.dynamics import Body, make_body
+from specshield.robot.dynamics import Body, make_body, simulate
 from specshield.rule.progress import ALWAYS, Rules, make_rules, signal_rows
+from specshield.rule.values import initial_signals
+from specshield.rule.view import look, rate, view_of
 from specshield.shield.proposal import Proposal, joined
+from specshield.stl import SATISFIED_ABOVE
 from specshield.task import Task
 
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
+MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
 FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
 
 
 @dataclass(frozen=True, eq=False)
 class ReachabilityPolicy:
-    """Proposes what the tables (tables.py) lead to (search.py)."""
+    """Proposes what the tables (tables.py) lead to (search.py).
+
+    narrow [K]: the obligations whose predicates the lattice can hardly see (sight.py).
+    """
 
     task: Task
     card: Card
     settings: Settings
     tables: Tables
+    narrow: Bools
     told: bool = True  # whether the tables were made for the map that the policy goes by
 
     @property
@@ -63,8 +78,21 @@ class ReachabilityPolicy:
         other.__dict__.update(_body=body, _rules=self._rules)
         return other
 
+    @cached_property
+    def _top(self) -> Floats:
+        """The latest feasible time of each table [steps]."""
+        code = self.tables.code
+        highest = np.where(code == INVALID, 0, code).max(axis=(1, 2), initial=0)
+        return np.asarray((highest - 1.0) / STEP_CODES, np.float64)
+
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A continuation after each first motion."""
+        return self._proposal(history, signals, margin, FIRST if len(history) == 1 else ON)
+
+    def _proposal(
+        self, history: Floats, signals: Mapping[str, Floats], margin: float, effort: Floats
+    ) -> Proposal:
+        """effort: of the search for narrow predicates."""
         body, rules = self._body, self._rules
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
         rows = signal_rows(self.task, signals, len(history))
@@ -73,7 +101,12 @@ class ReachabilityPolicy:
         for past in pasts(rules, history, rows):
             motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
             poses = np.empty((*motions.shape, 3))
-            preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
+            if self.narrow.any() and guide.wait >= 0:
+                preferred = continue_narrow(
+                    guide, self.narrow, self._top, effort, past, history, rows, motions, poses
+                )
+            else:
+                preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, int(preferred)))
             if not self.told:
                 ways = np.empty_like(motions)
@@ -85,7 +118,41 @@ class ReachabilityPolicy:
     def weights(self) -> bytes:
         """The safetensors file."""
         names = ("cell", "bits") if len(self.tables.bits) else ("cell", "code", "table")
-        return save_tensors({name: getattr(self.tables, name) for name in names})
+        tensors: dict[str, NDArray[Any]] = {name: getattr(self.tables, name) for name in names}
+        if self.narrow.any():
+            tensors["narrow"] = self.narrow.astype(np.uint8)
+        if self.tables.pitch > self.settings.pitch:
+            tensors["pitch"] = np.array([self.tables.pitch])
+        return save_tensors(tensors)
+
+    def feasible_start(self) -> float:
+        """The share of poses drawn over free space (the same each time) from which the rule can be kept.
+
+        As the tables say; where they hardly see what the rule asks for, as what is proposed does.
+        """
+        body, rules = self._body, self._rules
+        exact = bool(self.narrow.any()) or reads_heading(rules)
+        try:
+            poses = free_poses(self.task, body, FEW if exact else MANY, np.random.default_rng(0))
+        except MapError:  # next to no free space
+            return 0.0
+        if not exact:
+            return share_with_slack(Guide(body, rules, self.tables, self.task.robot.wait_motion), poses)
+        return sum(self._keeps(pose) for pose in poses) / len(poses)
+
+    def _keeps(self, pose: Floats) -> bool:
+        """Whether something that is proposed from a pose at the first step keeps the rule."""
+        view, held = view_of(self.task, self.task.formula), initial_signals(self.task).reshape(1, -1)
+        known = np.empty(view.tree.size)
+        low, _ = look(view, pose.reshape(1, 3), held, known)
+        if self.task.horizon == 0:
+            return bool(low > SATISFIED_ABOVE)
+        motions = self._proposal(pose.reshape(1, 3), {}, 0.0, AFTER).motions
+        poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
+        for row, led in zip(motions, poses, strict=True):
+            simulate(self._body, pose, row, led)
+        rate(view, known, 0, poses, held, rho, np.empty((len(motions), view.tree.size)))
+        return bool(rho.max() > SATISFIED_ABOVE)
 
 
 def synthesise(
@@ -97,54 +164,88 @@ def synthesise(
     began = time.perf_counter()
     settings = settings or Settings()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
-    goals, pitch = _goals(task, rules, settings)
-    lattice = make_lattice(body, pitch)
-    holds = holds_at(body, rules, lattice)
+    goals = np.flatnonzero(rules.kind != ALWAYS)
+    pitch, cells = _extent(task, body, rules, settings)
+    lattice = make_lattice(body, pitch, cells)
+    holds, narrow = look_closely(body, rules, lattice, holds_at(body, rules, lattice))
     if task.robot.wait_motion < 0:
         cell = number_cells(np.any(lattice.valid, axis=2))
-        bits, feasible = feasible_steps(lattice, rules, holds, task.horizon, cell)
-        tables = _step_tables(rules, task.horizon, cell, bits, pitch)
-        size = tables.bits.nbytes + tables.cell.nbytes
+        bits = feasible_steps(lattice, rules, holds, task.horizon, cell)
+        tables = step_tables(rules, task.horizon, cell, bits, pitch)
     else:
         masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
         latest, valid = latest_times(lattice, rules, holds, goals, masks, phases)
-        tables = _pack(latest, valid, masks, phases, goals, rules, pitch)
-        start = latest[0, masks.index(0)][valid[0] == 1]
-        feasible = float((start >= 0.0).mean()) if len(start) else 0.0
-        size = tables.code.nbytes + tables.cell.nbytes
+        tables = pack_times(latest, valid, masks, phases, goals, rules, pitch)
+    policy = ReachabilityPolicy(task, {}, settings, tables, narrow)
     metrics = {
-        "feasible_start": round(feasible, 4),
-        "size_bytes": int(size),
+        "feasible_start": round(policy.feasible_start(), 4),
+        "size_bytes": int(tables.code.nbytes + tables.bits.nbytes + tables.cell.nbytes),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
     card = make_card(task, "reachability", options_to_json(settings), 0, metrics, spec)
-    return ReachabilityPolicy(task, card, settings, tables)
+    return replace(policy, card=card)
 
 
 def load_reachability(weights: bytes | Path, card: Card, task: Task) -> ReachabilityPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_options(Settings, card.get("options", {}))
     rules = make_rules(task)
-    goals, pitch = _goals(task, rules, settings)
-    tensors, (ny, nx, headings) = read_tensors(weights), lattice_shape(task, pitch)
+    goals, tensors = np.flatnonzero(rules.kind != ALWAYS), read_tensors(weights)
+    narrow = _narrow_of(tensors.pop("narrow", None), len(rules.kind))
+    pitch = _pitch_of(tensors, task, settings)
     if task.robot.wait_motion < 0:
         cell, bits = named_arrays(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
+        headings = _checked_headings(bits.shape[2])
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
-        _check_fit(cell, (ny, nx), bits.shape[1], bits.shape == size, f"bits {list(size)}")
-        return ReachabilityPolicy(task, card, settings, _step_tables(rules, task.horizon, cell, bits, pitch))
+        _check_fit(cell, side_of(task.grid, pitch), bits.shape[1], bits.shape == size, f"bits {list(size)}")
+        tables = step_tables(rules, task.horizon, cell, bits, pitch)
+        return ReachabilityPolicy(task, card, settings, tables, narrow)
     cell, code, table = named_arrays(
         tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
     )
-    phases = phases_of(rules, task.horizon)
-    fits = (
-        code.shape[2] == headings and table.shape == (len(phases), 1 << len(goals))
-        and table.min() >= -1 and table.max() < code.shape[0]
-    )  # fmt: skip
+    phases, headings = phases_of(rules, task.horizon), _checked_headings(code.shape[2])
+    fits = table.shape == (len(phases), 1 << len(goals)) and table.min() >= -1 and table.max() < code.shape[0]
     wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {1 << len(goals)}]"
-    _check_fit(cell, (ny, nx), code.shape[1], fits, wanted)
-    return ReachabilityPolicy(
-        task, card, settings, _time_tables(rules, goals, phases, cell, code, table, pitch)
-    )
+    _check_fit(cell, side_of(task.grid, pitch), code.shape[1], fits, wanted)
+    tables = time_tables(rules, goals, phases, cell, code, table, pitch)
+    return ReachabilityPolicy(task, card, settings, tables, narrow)
+
+
+def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, settings: Settings) -> float:
+    """The lattice's pitch [m]: one that had to grow is in the file, the others go by the number of cells."""
+    kept, cell = tensors.pop("pitch", None), tensors.get("cell")
+    if kept is not None:
+        found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
+        if not settings.pitch <= found <= COARSEST * settings.pitch:
+            raise PolicyError(
+                "the array 'pitch' is of another kind", path="weights.pitch", got=found,
+                expected=f"float64, one number from {settings.pitch:g} to {COARSEST * settings.pitch:g}",
+            )  # fmt: skip
+        return found
+    fine = settings.pitch / 3.0
+    return fine if cell is not None and cell.shape == side_of(task.grid, fine) else settings.pitch
+
+
+def _checked_headings(headings: int) -> int:
+    if not 4 <= headings <= MAX_HEADINGS:
+        raise PolicyError(
+            "the tables do not fit the task", path="weights", got=f"{headings} headings",
+            expected=f"4 to {MAX_HEADINGS} headings",
+        )  # fmt: skip
+    return headings
+
+
+def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
+    """The obligations that a file names as narrow. Files of rules without any do not have the tensor."""
+    if tensor is None:
+        return np.zeros(count, np.bool_)
+    if tensor.dtype != np.uint8 or tensor.shape != (count,):
+        raise PolicyError(
+            "the array 'narrow' is of another kind", path="weights.narrow",
+            got=f"{tensor.dtype} {list(tensor.shape)}", expected=f"uint8 [{count}]",
+        )  # fmt: skip
+    narrow: Bools = tensor == 1
+    return narrow
 
 
 def _check_fit(cell: Int32s, shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
@@ -158,67 +259,34 @@ def _check_fit(cell: Int32s, shape: tuple[int, int], rows: int, fits: bool, want
 
 def check(task: Task, settings: Settings) -> None:
     """Raises what `synthesise` would raise for a task that it cannot serve, without making anything."""
-    _goals(task, make_rules(task), settings)
+    rules = make_rules(task)
+    _extent(task, make_body(task.robot, task.grid), rules, settings)
 
 
-def _goals(task: Task, rules: Rules, settings: Settings) -> tuple[Ints, float]:
-    """The goals (indices of the obligations that are not `always`) and the pitch of the task's lattice [m].
+def _extent(task: Task, body: Body, rules: Rules, settings: Settings) -> tuple[float, Bools | None]:
+    """The pitch of the task's lattice [m], and the cells [ny, nx] that it covers, None for all.
 
     Raises PolicyError where the tables would be too large.
     """
     goals = np.flatnonzero(rules.kind != ALWAYS)
     if task.robot.wait_motion < 0:
-        entries, unit = (task.horizon + 1) * -(-state_count(rules) // 8), "bytes"
-        limits = FINE_ENTRIES, MAX_BYTES
+        entries, most = (task.horizon + 1) * -(-state_count(rules) // 8), MAX_BYTES
     else:
-        entries = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon))
-        limits, unit = (FINE_ENTRIES, MAX_ENTRIES), "entries"
-    for pitch, limit in zip((settings.pitch / 3.0, settings.pitch), limits, strict=True):
-        ny, nx, headings = lattice_shape(task, pitch)
-        if ny * nx * headings * entries <= limit:
-            return goals, pitch
+        entries, most = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon)), MAX_ENTRIES
+    ny, nx, headings = lattice_shape(task, settings.pitch / 3.0)
+    if ny * nx * headings * entries <= FINE_ENTRIES:
+        return settings.pitch / 3.0, None
+    pitch = fitting_pitch(task, settings.pitch, entries, most)
+    if pitch == settings.pitch:
+        return pitch, None
+    cells = places_that_matter(task, body, rules, settings.pitch)
+    pitch = fitting_pitch(task, settings.pitch, entries, most, float(cells.mean()))
+    if pitch <= COARSEST * settings.pitch:
+        return pitch, places_that_matter(task, body, rules, pitch)
+    least = math.ceil(100.0 * pitch / COARSEST) / 100.0
+    would = f"options.pitch {least:.2f} or more" if least <= 1.0 else "fewer windows that overlap"
     raise PolicyError(
         "the tables are too large", path="options.pitch",
-        got=f"{entries} {unit} for each of {ny} x {nx} x {headings} poses",
-        expected=f"at most {limit} {unit}: a larger pitch, or fewer windows that overlap",
+        got=f"{entries} entries for each pose at a pitch of {settings.pitch:g} m",
+        expected=would,
     )  # fmt: skip
-
-
-def _pack(
-    latest: Singles, valid: Bytes, masks: list[int], phases: tuple[Phase, ...],
-    goals: Ints, rules: Rules, pitch: float,
-) -> Tables:  # fmt: skip
-    used = np.any(valid, axis=(0, 3))
-    table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
-    codes: list[Codes] = []
-    for i in range(len(phases)):
-        for n, mask in enumerate(masks):
-            values = latest[i, n][used]
-            settled = mask == masks[0] and i == len(phases) - 1  # nothing left to do
-            if settled or not np.any(values >= 0.0):
-                continue
-            code = np.where(values >= 0.0, 1.0 + np.floor(STEP_CODES * values), 0.0).astype(np.uint16)
-            code[valid[i][used] == 0] = INVALID
-            table[i, mask] = len(codes)
-            codes.append(code)
-    code = np.array(codes, np.uint16).reshape(len(codes), int(used.sum()), valid.shape[3])
-    return _time_tables(rules, goals, phases, number_cells(used), code, table, pitch)
-
-
-def _time_tables(
-    rules: Rules, goals: Ints, phases: tuple[Phase, ...], cell: Int32s, code: Codes,
-    table: Int32s, pitch: float,
-) -> Tables:  # fmt: skip
-    bit = np.zeros(len(rules.kind), np.int64)
-    bit[goals] = 1 << np.arange(len(goals))
-    ends = np.array([phase.end for phase in phases], np.int32)
-    phase = np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32)
-    none = np.empty((0, 0, 0, 0), np.uint8)
-    return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch)
-
-
-def _step_tables(rules: Rules, horizon: int, cell: Int32s, bits: Bytes, pitch: float) -> Tables:
-    code = np.empty((0, *bits.shape[1:3]), np.uint16)
-    phase, end = np.zeros(horizon + 1, np.int32), np.array([horizon], np.int32)
-    bit = np.zeros(len(rules.kind), np.int64)
-    return Tables(cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch)

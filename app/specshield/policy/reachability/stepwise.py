@@ -24,6 +24,7 @@ import numpy as np
 from specshield.arrays import Bytes, Floats, Int32s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.lattice import Lattice, corner
+from specshield.policy.reachability.tables import Tables
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
 MAX_BYTES = 100_000_000  # of the tables
@@ -76,10 +77,8 @@ def transitions(rules: Rules, t: int, holds: int) -> Ints:
     return np.where(broken, BROKEN_STATE, after)
 
 
-def feasible_steps(
-    lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, row: Int32s
-) -> tuple[Bytes, float]:
-    """B as bits, uint8 [T + 1, cells, H, ceil(P / 8)], and the share of valid poses feasible at t = 0.
+def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, row: Int32s) -> Bytes:
+    """B as bits, uint8 [T + 1, cells, H, ceil(P / 8)].
 
     holds [K, ny, nx, H]; row [ny, nx]: of each cell in B, -1 for none.
     """
@@ -94,7 +93,6 @@ def feasible_steps(
     bits = np.zeros((horizon + 1, len(of), lattice.headings, -(-states // 8)), np.uint8)
     valid = lattice.valid[used]
     bits[horizon, :, :, (states - 1) >> 3] = np.where(valid, 1 << ((states - 1) & 7), 0)
-    start = 0.0
     for t in range(horizon, -1, -1):
         asked = sum(
             1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS) if rules.a[k] <= t <= rules.b[k]
@@ -105,9 +103,7 @@ def feasible_steps(
         _before(bits[t], valid, of, after, before)
         if t > 0:
             _step_back(lattice, valid, row, before, bits[t - 1])
-        elif valid.any():
-            start = float((before[..., 0] & 1)[valid == 1].mean())
-    return bits, start
+    return bits
 
 
 @kernel
@@ -195,3 +191,11 @@ def _majority(bits: Bytes, at: Ints, weight: Floats, n: int, h: int, b: int) -> 
             if share > 0.5:
                 result |= 1 << bit
     return result
+
+
+def step_tables(rules: Rules, horizon: int, cell: Int32s, bits: Bytes, pitch: float) -> Tables:
+    """Tables of feasibility step by step from what a file holds of them."""
+    code = np.empty((0, *bits.shape[1:3]), np.uint16)
+    phase, end = np.zeros(horizon + 1, np.int32), np.array([horizon], np.int32)
+    bit = np.zeros(len(rules.kind), np.int64)
+    return Tables(cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch)

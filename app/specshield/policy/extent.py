@@ -1,0 +1,87 @@
+"""How fine a lattice is and which part of the map it covers, so that what it costs is bounded.
+
+A lattice of a flat has the pitch that was asked for. On a large floor it covers only the places that a
+trajectory which keeps the rule can be at: nowhere farther from a goal than the robot can drive in the steps
+that are left for it. Where that is still too much, the pitch grows until it fits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from specshield.arrays import Bools
+from specshield.compiled import kernel
+from specshield.policy.lattice import pose_of
+from specshield.policy.shape import headings_of, side_of
+from specshield.robot.dynamics import Body, longest_motions, swing_radius
+from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, STACK, Rules, read_predicates, value_count
+from specshield.rule.values import HEADING
+from specshield.stl.program import VALUE
+from specshield.task import Task
+
+# Of a lattice: 3 s to make on one core, and 10 MB a table (python -m benchmarks.floors).
+MOST_POSES = 5_000_000
+MOST_ENTRIES = 10_000_000  # of the tables of a floor with more poses: 20 MB, unless that takes ROUGH
+ROUGH = 2.0  # times the pitch that was asked for
+MOST_STEPS = 40_000_000  # poses times motions, each of which takes up to 10 bytes while tables are made
+COARSEST = 4.0  # times the pitch that was asked for; beyond it doors are missed
+
+
+def fitting_pitch(task: Task, pitch: float, entries: int, most: int, share: float = 1.0) -> float:
+    """The smallest pitch from `pitch` [m] on whose lattice is not too large, with `entries` in the tables for
+    each pose and at most `most` of them. share: of the map that is covered. Callers refuse what is beyond
+    COARSEST.
+    """
+    headings = headings_of(task)
+    allowed = min(MOST_POSES, MOST_STEPS // len(task.robot.motions), most / entries)
+    ny, nx = side_of(task.grid, pitch)
+    poses = ny * nx * headings * share
+    if poses <= allowed:
+        return pitch
+    times = poses / allowed
+    if poses > MOST_POSES:
+        times = max(times, min(poses * entries / MOST_ENTRIES, ROUGH**2))
+    return round(pitch * math.sqrt(times) + 5e-4, 3)
+
+
+def places_that_matter(task: Task, body: Body, rules: Rules, pitch: float) -> Bools:
+    """The cells [ny, nx] at which a trajectory that keeps the rule can be, as far as its goals tell.
+
+    Where every goal is settled and no `always` is still to begin or to end, a robot that can wait needs no
+    table either.
+    """
+    ny, nx = side_of(task.grid, pitch)
+    kept = np.ones((ny, nx), np.bool_)
+    goals = np.flatnonzero(rules.kind != ALWAYS)
+    edges = [t for k in np.flatnonzero(rules.kind == ALWAYS) for t in (rules.a[k], rules.b[k] + 1)]
+    over = max([int(rules.last[k]) for k in goals] + [int(t) for t in edges if t <= task.horizon], default=0)
+    if task.robot.wait_motion < 0:
+        over = task.horizon
+    move = longest_motions(body)[0]
+    for k in goals:
+        code = slice(int(rules.programs.starts[k]), int(rules.programs.starts[k + 1]))
+        reads = rules.programs.args[code][rules.programs.ops[code] == VALUE]
+        if np.any(reads == HEADING):
+            continue
+        there = _holds_about(body, rules, int(k), ny, nx, pitch, pitch + 2.0 * swing_radius(body))
+        if there.any():
+            first = rules.a[k] + (rules.b[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
+            steps = max(int(rules.last[k]), over - int(first))
+            kept &= distance_transform_edt(~there) * pitch <= steps * move + pitch
+    return kept
+
+
+@kernel
+def _holds_about(body: Body, rules: Rules, k: int, ny: int, nx: int, pitch: float, about: float) -> Bools:
+    """Whether predicate k, which does not read the heading, holds within `about` [m] of each cell."""
+    found = np.zeros((ny, nx), np.bool_)
+    values, stack, out = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
+    for j in range(ny):
+        for i in range(nx):
+            x, y, theta = pose_of(body, pitch, 4, j, i, 0.0)
+            read_predicates(rules, x, y, theta, values, stack, out)
+            found[j, i] = out[k] > -about
+    return found

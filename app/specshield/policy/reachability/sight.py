@@ -1,0 +1,109 @@
+"""What of a rule's predicates a lattice can hardly see: places between its crossings, windows between its
+headings.
+
+Tables are made on crossings. A dock smaller than a cell, or a heading that no crossing has, holds at none of
+them, and the tables would say that nothing leads there. So such a predicate counts as kept wherever it holds
+within about half a cell and half a heading: the tables lead near, and the rest of the way is searched for in
+exact poses (finish.py).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from specshield.arrays import Bools, Bytes, Floats
+from specshield.compiled import kernel
+from specshield.policy.lattice import Lattice, pose_of
+from specshield.robot.dynamics import Body
+from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
+from specshield.rule.values import HEADING, REGIONS, region_count
+from specshield.stl.program import VALUE
+
+# Chosen by hand. A crossing is at most 0.71 cells from any place.
+BESIDE = 0.75  # [cells] by which a place may be missed
+GRAIN = math.radians(1.5)  # [rad] between the headings that are looked at: windows of 2 degrees are seen
+CELLS_ABOUT, HEADINGS_ABOUT = 3, 2  # so far about a pose that lies well inside a predicate, the lattice sees
+
+
+def look_closely(body: Body, rules: Rules, lattice: Lattice, holds: Bytes) -> tuple[Bytes, Bools]:
+    """`holds` with what the lattice hardly sees put in, and which obligations have such a predicate [K].
+
+    holds [K, ny, nx, H]: of `holds_at`. An `always` counts only where it asks for nothing but narrow places:
+    a gap beside what a robot has to keep out of is no place to lead it to.
+    """
+    narrow = np.zeros(len(rules.kind), np.bool_)
+    for k in range(len(rules.kind)):
+        outer, inner = _views(body, rules, lattice, k)
+        if rules.kind[k] == ALWAYS and inner.any():
+            continue
+        missed = outer & ~_about(inner) & (lattice.valid == 1)
+        if missed.any():
+            narrow[k] = True
+            holds = holds.copy() if not narrow[:k].any() else holds
+            holds[k] |= missed
+    return holds, narrow
+
+
+def _views(body: Body, rules: Rules, lattice: Lattice, k: int) -> tuple[Bools, Bools]:
+    """Where predicate k holds somewhere about a pose of the lattice, and where it holds well all about it.
+
+    Shape [ny, nx, H]; 1 in place of ny and nx where it does not read the place, in place of H where it does
+    not read the heading.
+    """
+    place, heading, turned = _reads(rules, k)
+    headings = lattice.headings
+    unit = 2.0 * math.pi / headings
+    samples = 2 * math.ceil(0.5 * unit / GRAIN) + 1 if heading else 1
+    spread = np.linspace(-0.5, 0.5, samples) if heading else np.zeros(1)
+    free = np.any(lattice.valid, axis=2) if place else np.ones((1, 1), np.bool_)
+    shape = (*free.shape, headings if heading or turned else 1)
+    outer, inner = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    _look(body, rules, k, lattice.pitch, headings, free, spread, BESIDE * lattice.pitch, outer, inner)
+    return outer, inner
+
+
+def _reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
+    """Whether predicate k reads the place; its heading; areas that turn with the robot."""
+    code = slice(int(rules.programs.starts[k]), int(rules.programs.starts[k + 1]))
+    read = rules.programs.args[code][rules.programs.ops[code] == VALUE].astype(int)
+    areas = [p - REGIONS for p in read if REGIONS <= p < REGIONS + region_count(rules.regions)]
+    place = bool(areas) or bool(np.any(read < HEADING))
+    return place, bool(np.any(read == HEADING)), bool(np.any(rules.regions.point[areas] != 0.0))
+
+
+@kernel
+def _look(
+    body: Body, rules: Rules, k: int, pitch: float, headings: int, free: Bools, spread: Floats, beside: float,
+    outer: Bools, inner: Bools,
+) -> None:  # fmt: skip
+    values, stack, out = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
+    for j in range(outer.shape[0]):
+        for i in range(outer.shape[1]):
+            if not free[j, i]:
+                continue
+            for h in range(outer.shape[2]):
+                least, most = np.inf, -np.inf
+                for s in range(spread.shape[0]):
+                    x, y, theta = pose_of(body, pitch, headings, j, i, h + spread[s])
+                    read_predicates(rules, x, y, theta, values, stack, out)
+                    least, most = min(least, out[k]), max(most, out[k])
+                outer[j, i, h] = most > rules.margin - beside
+                inner[j, i, h] = least > rules.margin + beside
+
+
+def _about(inner: Bools) -> Bools:
+    """Where some pose of `inner` is at most CELLS_ABOUT cells and HEADINGS_ABOUT headings away."""
+    found = inner.copy()
+    for axis in (0, 1):
+        found = np.moveaxis(found, axis, 0)
+        before = found.copy()
+        for n in range(1, CELLS_ABOUT + 1):
+            found[n:] |= before[:-n]
+            found[:-n] |= before[n:]
+        found = np.moveaxis(found, 0, axis)
+    before = found.copy()
+    for n in range(1, HEADINGS_ABOUT + 1):
+        found |= np.roll(before, n, axis=2) | np.roll(before, -n, axis=2)
+    return found
