@@ -4,6 +4,7 @@ are here, aio.py with `await`.
 
 from __future__ import annotations
 
+import logging
 import os
 import uuid
 from collections.abc import Callable, Mapping, Sequence
@@ -30,6 +31,7 @@ from specshield.client.wire import (
 )
 from specshield.errors import InputError, SessionExists, StoreError, TransportError, TransportTimeout
 
+log = logging.getLogger("specshield")
 READY_EVERY = 0.25  # s between two questions whether the server is ready
 
 
@@ -187,6 +189,8 @@ def wait_policy(
             if progress is not None:
                 progress(policy)
             if policy.status in ("ready", "failed"):
+                for warning in policy.warnings:
+                    log.warning("policy %s: %s", id, warning)
                 return policy
         if seconds + interval > timeout:
             raise TransportTimeout(

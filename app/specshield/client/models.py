@@ -42,7 +42,9 @@ class Map:
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy pi_phi: `progress` in [0, 1], `eta_s` the estimated time left [s], `error` why it failed."""
+    """A policy pi_phi: `progress` in [0, 1], `eta_s` the estimated time left [s], `error` why it failed,
+    `warnings` what there is to know of one that is ready, such as a rule that no start can keep.
+    """
 
     id: str
     status: Literal["queued", "training", "ready", "failed"]
@@ -52,6 +54,7 @@ class Policy:
     error: str | None
     name: str | None = None
     eta_s: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -17,6 +18,7 @@ from specshield.errors import MapError, NotFound, PolicyError
 from specshield.local.session import LocalSession
 from specshield.lookahead.preferences import PROJECTION, check_shaping, prepare
 from specshield.policy.methods import DEFAULT, METHODS, Run, load_policy
+from specshield.policy.notices import notices
 from specshield.policy.options import read_options
 from specshield.reasons import refusal
 from specshield.robot import Robot, robot_from_json
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 
     from specshield.client.models import Beginning
 
+log = logging.getLogger("specshield")
 World = OccupancyGrid | Path | str | Mapping[str, Any]
 
 
@@ -127,7 +130,11 @@ class LocalShield:
         how.check(task, settings)
         made = how.make(task, settings, Run(seed))
         weights = made.weights()
-        return _prepared(load_policy(weights, made.card, task), made.card, weights)
+        policy = load_policy(weights, made.card, task)
+        card = {**made.card, "warnings": list(notices(policy))}
+        for notice in card["warnings"]:
+            log.warning("%s", notice)
+        return _prepared(policy, card, weights)
 
     def save(self, folder: str | Path) -> None:
         """Write what `load` reads, which is also what a server takes in its folder of policies."""

@@ -52,6 +52,20 @@ def proof(task: Task, body: Body, history: Floats, signals: Mapping[str, Floats]
     return said if len(ways) == 1 else f"{said}; and its {len(ways) - 1} other ways are ruled out likewise"
 
 
+def contradiction(task: Task, body: Body) -> str | None:
+    """Why no start satisfies the formula while the signals hold their initial values, None where that is
+    open. Looked for are needs that hold nowhere, not what is too far.
+    """
+    known = Known(task, np.empty((0, 3)), {})
+    ground, said = make_ground(task, body, known.held), list[str]()
+    for needs in Reader(known.now, known.constant).alternatives(task.formula):
+        asked = course(needs, known, ground)
+        if not isinstance(asked, str):
+            return None
+        said.append(asked)
+    return said[0] if said else "the values that the signals hold rule it out"
+
+
 def _refuted(needs: Sequence[Need], known: Known, ground: Ground, body: Body) -> str | None:
     """Why these needs cannot all be met, None where that is open."""
     asked = course(needs, known, ground)

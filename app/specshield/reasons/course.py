@@ -39,7 +39,7 @@ def course(needs: Sequence[Need], known: Known, ground: Ground) -> Course | str:
     """What these needs leave to be done, or why they cannot all be met."""
     pending: list[Need] = []
     for need in needs[:MOST_NEEDS]:
-        left = _left(need, known.past(need.predicate), known.now)
+        left = need if need.first > known.now else _left(need, known.past(need.predicate), known.now)
         if left is False:
             return f"{need.formula} is broken already"
         if isinstance(left, Need):
@@ -66,9 +66,7 @@ def _possible(predicate: Formula, ground: Ground) -> Bools:
 
 
 def _left(need: Need, past: Bools, now: int) -> Need | bool:
-    """What of a need is still to come; True where it is met, or may be; False: it is broken."""
-    if need.first > now:
-        return need
+    """What is still to come of a need that has begun; True: it is, or may be, met; False: it is broken."""
     later, part = max(need.first, now + 1), need.formula
     if need.first == need.last:
         if not past[need.first : need.end + 1].all():

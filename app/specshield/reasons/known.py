@@ -19,7 +19,7 @@ ROUNDING = 1e-9  # robustness above minus this counts as positive: f's own code 
 
 @dataclass(frozen=True)
 class Known:
-    """What has been driven, and what the signals hold."""
+    """What has been driven, and what the signals hold. history [t + 1, 3], empty where nothing is known."""
 
     task: Task
     history: Floats
@@ -31,16 +31,16 @@ class Known:
 
     @property
     def held(self) -> dict[str, float]:
-        return {
-            name: float(self.task.signal(name, self.signals, self.now + 1)[-1]) for name in self.task.signals
-        }
+        steps = max(len(self.history), 1)
+        return {name: float(self.task.signal(name, self.signals, steps)[-1]) for name in self.task.signals}
 
     def constant(self, predicate: Formula, step: int) -> bool | None:
         """As `needs.Reader` has it."""
         if not predicate.names or not set(predicate.names) <= set(self.task.signals):
             return None
-        truths = self.past(predicate)[min(step, self.now) :]
-        return bool(truths[0]) if (truths == truths[0]).all() else None
+        held = bool(self.at(predicate, np.zeros((1, 3)))[0])
+        before = self.past(predicate)[step:] if step < self.now else np.empty(0, np.bool_)
+        return held if (before == held).all() else None
 
     def past(self, predicate: Formula) -> Bools:
         """Whether a predicate held at each of the steps 0 to t."""

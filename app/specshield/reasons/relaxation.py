@@ -70,6 +70,17 @@ def relaxations(shield: Shield, history: Floats, signals: Mapping[str, Floats]) 
     return Relaxed(told, rho.shape[1], bool(keeps.all(axis=0).any()))
 
 
+def way(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Ints | None:
+    """Motions from x_t to the horizon that satisfy the formula, if a search finds some without policies."""
+    known, formula = Known(shield.task, history, signals), shield.task.formula
+    ground = make_ground(shield.task, shield.body, known.held)
+    needed = Reader(known.now, known.constant).alternatives(formula)
+    for found in _found(shield, known, ground, needed, ()):
+        if float(values_of(formula, samples_of(shield, history, signals, found))[0]) > SATISFIED_ABOVE:
+            return np.asarray(found[0])
+    return None
+
+
 def _told(part: Formula, i: int, rho: Floats, late: Floats, keeps: Bools) -> Conjunct:
     """rho, late, keeps [conjuncts, futures]."""
     beside = np.delete(keeps, i, axis=0).all(axis=0)

@@ -109,6 +109,12 @@ def _training(server: Server, record: Record) -> Training:
     return Training("ready", 1.0) if record.card is not None else server.jobs.get(record.id)
 
 
+def _warnings(record: Record) -> list[str]:
+    """Those of its card, which a stranger may have sent."""
+    told = (record.card or {}).get("warnings", [])
+    return [str(each)[:500] for each in told[:16]] if isinstance(told, list) else []
+
+
 def _listed(server: Server, record: Record, names: Mapping[str, str]) -> dict[str, Any]:
     shown = _shown(server, record, record.name or names.get(record.id))
     return {**shown, "spec": {name: held for name, held in shown["spec"].items() if name != "regions"}}
@@ -128,6 +134,7 @@ def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
         "eta_s": training.eta_s,
         "error": training.error,
         "metrics": (record.card or {}).get("metrics", {}),
+        "warnings": _warnings(record),
         "map_id": about.map_id,
         "robot": about.robot,
         "spec": about.spec,

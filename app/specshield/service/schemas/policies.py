@@ -70,6 +70,9 @@ class PolicyResponse(Answer):
     eta_s: float | None = Field(description="Estimate of the time left [s]; null where there is none.")
     error: str | None = Field(description="Why it failed.")
     metrics: dict[str, JsonValue] = Field(description="What was measured, such as the rate of satisfaction.")
+    warnings: list[str] = Field(
+        description="What there is to know of a policy that is ready, such as a rule that no start can keep."
+    )
     map_id: str = Field(description="Id of the map.")
     robot: str | dict[str, JsonValue] = Field(description="A preset's name, or the robot as it was sent.")
     spec: dict[str, JsonValue] = Field(

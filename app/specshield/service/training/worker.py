@@ -197,6 +197,7 @@ def _ended(jobs: Jobs, job: Any, state: str, error: str | None) -> None:
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
     # numba, torch and the rest are for the process of the run alone: the worker stays small.
+    from specshield.policy.notices import notices
     from specshield.service.library.claims import Claims
     from specshield.service.library.maps import Maps
     from specshield.service.library.policies import Policies
@@ -210,8 +211,14 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: thr
 
     method = METHODS.get(about.method)
     run = Run(about.seed, about.spec, policies.checkpoints(id), on_progress, cancelled.is_set)
-    policy = method.make(policies.task(about), read_options(method.options, about.options), run)
-    policies.finish(id, policy.weights(), {**policy.card, "map_id": about.map_id, "seed": about.seed})
+    task = policies.task(about)
+    policy = method.make(task, read_options(method.options, about.options), run)
+    weights = policy.weights()
+    said = notices(method.load(weights, policy.card, task))
+    for notice in said:
+        log.warning("policy %s: %s", id, notice)
+    card = {**policy.card, "map_id": about.map_id, "seed": about.seed, "warnings": list(said)}
+    policies.finish(id, weights, card)
 
 
 @contextmanager

@@ -1,0 +1,49 @@
+"""What there is to warn of when a policy is made: a rule that no start keeps, and starts that it misses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from specshield.errors import MapError
+from specshield.policy.dqn.environment import free_poses
+from specshield.reasons.bound import contradiction
+from specshield.reasons.relaxation import way
+from specshield.shield.decision import make_shield
+from specshield.shield.explanation import samples_of, values_of
+from specshield.shield.proposal import Proposer
+from specshield.stl import SATISFIED_ABOVE
+
+STARTS = 16  # poses that a new policy is tried from. Chosen by hand: as with all of it, a second or two
+MOST_SEARCHED = 4  # of those that it has no future from
+
+
+def notices(policy: Proposer) -> tuple[str, ...]:
+    """One sentence each. The starts are drawn from free space, the same each time."""
+    task, shield = policy.task, make_shield([policy])
+    why = contradiction(task, shield.body)
+    if why is not None:
+        return (f"no start satisfies this formula: {why}",)
+    try:
+        poses = free_poses(task, shield.body, STARTS, np.random.default_rng(0))
+    except MapError:
+        return (f"the robot fits nowhere on this map: its footprint has a radius of {task.robot.radius:g} m",)
+    refused = [pose for pose in poses if not _kept(policy, pose)]
+    missed = sum(way(shield, pose[None], {}) is not None for pose in refused[:MOST_SEARCHED])
+    if missed:
+        tried = min(len(refused), MOST_SEARCHED)
+        return (
+            f"the policy found no future from {len(refused)} of {STARTS} random starts, and a search found "
+            f"one from {missed} of {tried} of these: it hardly sees some predicate of the formula; a smaller "
+            "options.pitch, or another method, may find more",
+        )
+    if len(refused) == STARTS:
+        return (f"no future that satisfies the formula was found from any of {STARTS} random starts",)
+    return ()
+
+
+def _kept(policy: Proposer, pose: np.ndarray) -> bool:
+    """Whether some future that the policy proposes from a pose satisfies the formula."""
+    shield = make_shield([policy])
+    proposed = policy.propose(pose[None].copy(), {}, 0.0)
+    samples = samples_of(shield, pose[None], {}, proposed.motions)
+    return bool(not samples or (values_of(policy.task.formula, samples) > SATISFIED_ABOVE).any())

@@ -1,0 +1,54 @@
+"""What is said of a policy that no start, or hardly one, can be kept by."""
+
+import numpy as np
+
+from specshield.policy.notices import notices
+from specshield.reasons.relaxation import way
+from specshield.robot import robot_from_json
+from specshield.shield.decision import make_shield
+from specshield.shield.proposal import Proposal
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+
+REGIONS = {"Dock": {"type": "circle", "center": [1.5, 1.5], "radius": 0.4}}
+ACTIONS = [{"name": "go", "translate": 0.2}, {"name": "turn", "rotate": 0.7853981633974483}, {"name": "wait"}]
+
+
+class Policy:
+    """Stands, or does what a search finds."""
+
+    id = "of a test"
+
+    def __init__(self, formula, searches=False, radius=0.2):
+        robot = robot_from_json({"footprint": {"radius": radius}, "actions": ACTIONS})
+        self.task = make_task(OccupancyGrid(np.zeros((30, 30), bool), 0.1), robot, formula, REGIONS)
+        self.searches = searches
+
+    def propose(self, history, signals, margin):
+        found = way(make_shield([self]), history, signals) if self.searches else None
+        still = np.full(self.task.horizon + 1 - len(history), 2)
+        return Proposal((still if found is None else found)[None], 2)
+
+
+def test_a_policy_that_serves_its_rule_is_not_warned_of():
+    assert notices(Policy("F[0,40] Dock", searches=True)) == ()
+
+
+def test_a_policy_that_misses_what_a_search_finds_is_said_to():
+    (said,) = notices(Policy("F[0,40] Dock"))
+    assert "it hardly sees some predicate" in said
+
+
+def test_a_contradiction_is_said_to_be_one():
+    (said,) = notices(Policy("F[0,9] Dock and G[0,9] not Dock"))
+    assert said.startswith("no start satisfies this formula: F[0,9] Dock asks for 'Dock and not Dock'")
+
+
+def test_a_robot_that_fits_nowhere_is_said_not_to():
+    (said,) = notices(Policy("F[0,9] Dock", radius=2.0))
+    assert "fits" in said
+
+
+def test_a_rule_that_asks_for_too_much_from_everywhere():
+    (said,) = notices(Policy("F[0,1] (Dock and F[1,1] not touches(Dock))", searches=True))
+    assert said == "no future that satisfies the formula was found from any of 16 random starts"
