@@ -19,9 +19,10 @@ class Policy:
 
     id = "of a test"
 
-    def __init__(self, formula, searches=False, radius=0.2):
+    def __init__(self, formula, searches=False, radius=0.2, signals=None):
         robot = robot_from_json({"footprint": {"radius": radius}, "actions": ACTIONS})
-        self.task = make_task(OccupancyGrid(np.zeros((30, 30), bool), 0.1), robot, formula, REGIONS)
+        grid = OccupancyGrid(np.zeros((30, 30), bool), 0.1)
+        self.task = make_task(grid, robot, formula, REGIONS, signals=signals)
         self.searches = searches
 
     def propose(self, history, signals, margin):
@@ -52,3 +53,15 @@ def test_a_robot_that_fits_nowhere_is_said_not_to():
 def test_a_rule_that_asks_for_too_much_from_everywhere():
     (said,) = notices(Policy("F[0,1] (Dock and F[1,1] not touches(Dock))", searches=True))
     assert said == "no future that satisfies the formula was found from any of 16 random starts"
+
+
+def test_a_rule_that_answers_signals_is_told_what_becomes_of_it_when_they_rise():
+    near = "G[0,6] (call > 0.5 -> F[0,30] Dock)"  # from everywhere on this floor
+    far = "G[0,6] (call > 0.5 -> F[0,2] Dock)"
+    kept = []
+    for formula in (near, far):
+        policy = Policy(formula, searches=True, signals={"call": 0.0})
+        (said,) = notices(policy)
+        kept.append(int(said.split("from ")[-1].split(" of ")[0]))
+    assert kept[0] == 16
+    assert kept[1] < 8

@@ -6,6 +6,7 @@ import numpy as np
 
 from specshield.errors import MapError
 from specshield.policy.dqn.environment import free_poses
+from specshield.policy.reactions import calls, withstands
 from specshield.reasons.bound import contradiction
 from specshield.reasons.relaxation import way
 from specshield.shield.decision import make_shield
@@ -38,6 +39,12 @@ def notices(policy: Proposer) -> tuple[str, ...]:
         )
     if len(refused) == STARTS:
         return (f"no future that satisfies the formula was found from any of {STARTS} random starts",)
+    if calls(policy):
+        kept = sum(withstands(shield, policy, pose) for pose in poses)
+        return (
+            "feasible_start is for signals that stay as they are; where they rise at the worst moment of the "
+            f"policy's own way, the rule can still be kept from {kept} of {STARTS} random starts",
+        )
     return ()
 
 
