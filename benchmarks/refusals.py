@@ -36,7 +36,7 @@ from specshield.sim.cases import case_names, load_case
 from specshield.task import Task, make_task
 
 Floats = NDArray[np.float64]
-CELL, HEADINGS = 0.04, 60  # [m] and per turn: what the search takes for one place
+CELL, HEADINGS = 0.1, 60  # [m] and per turn: what the search takes for one place
 MOST = 2_000_000  # states of one search
 
 

@@ -58,7 +58,8 @@ def _kept(shield: Shield, policy: Proposer, history: Floats, signals: Mapping[st
     best = int(np.argmax(values))
     if not values[best] > SATISFIED_ABOVE:
         return None
-    return driven(shield, history, proposed[best : best + 1])[0]
+    found: Floats = driven(shield, history, proposed[best : best + 1])[0]
+    return found
 
 
 def _holds(antecedent: Formula, signals: Mapping[str, float]) -> bool:
