@@ -6,7 +6,7 @@ BIN := .venv/bin
 # A clone shares no compiled kernels with another, and keeps its own between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
 
-.PHONY: install demo run test wheel-check lint lines bench reliability results openapi clean
+.PHONY: install demo run test wheel-check lint lines docs bench reliability results openapi clean
 
 install: .venv/.dev
 
@@ -57,6 +57,10 @@ lines: .venv/bin/python
 
 bench: .venv-bench/.done
 	.venv-bench/bin/python -m benchmarks $(ARGS)
+
+# The site of docs/ in out/site; ends where a link or a heading does not exist.
+docs: .venv/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 # docs/reliability.md; hours, best on a machine that nobody else uses. What is in out/reliability is not run again.
 RELIABILITY = $(BIN)/python -m benchmarks.reliability

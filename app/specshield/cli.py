@@ -28,6 +28,7 @@ NEEDS_SERVER = """\
 This command needs the server's parts: pip install 'specshield[server]'
 What is installed here is the client, for Python: from specshield.client import ShieldClient"""
 
+URL_HELP = "A server that runs already; without it, one of its own on SPECSHIELD_DATA_DIR."
 NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
 
 SERVER_PARTS = (
@@ -57,7 +58,7 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
             if isinstance(command, typer.Typer):
                 app.add_typer(command)
             else:
-                app.command()(command)
+                app.command(command.__name__.removesuffix("_policy").replace("_", "-"))(command)
         app()
     except SpecshieldError as error:
         sys.exit(str(error))
@@ -75,7 +76,8 @@ def _commands() -> Iterator[Callable[..., None]]:
     from specshield.commands.check_drive import check_drive
     from specshield.commands.export import export
 
-    yield from (serve, demo, train, worker, verify, openapi, export, check_drive)
+    yield from (serve, demo, policy, run_policy, watch, doctor, train, worker, verify, openapi)
+    yield from (export, check_drive)
     yield _keys()
     for registered in entry_points(group="specshield.commands"):
         yield registered.load()
@@ -211,6 +213,61 @@ def train(
     from specshield.sim import training
 
     raise typer.Exit(training.train(case, method, seed, updates, option or [], out, resume))
+
+
+def policy(
+    map: Annotated[str, typer.Option(help="A map's YAML, a house's JSON, or the name of one on the server.")],
+    rule: Annotated[
+        str, typer.Option(help="What has to be kept, as 'F[0,60] Kitchen and G[0,60] not Hall'.")
+    ],
+    regions: Annotated[Path | None, typer.Option(help="Places of your own by name, JSON or YAML.")] = None,
+    robot: Annotated[str, typer.Option(help="A preset, or your robot's JSON or YAML.")] = "stretch",
+    assets: Annotated[Path | None, typer.Option(help="Sizes of a house's furniture, JSON.")] = None,
+    method: Annotated[str, typer.Option(help="How the policy is made.")] = "reachability",
+    name: Annotated[str | None, typer.Option(help="What to call the policy.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
+    url: Annotated[str | None, typer.Option(help=URL_HELP)] = None,
+) -> None:
+    """Make a policy for a map, a rule and a robot of your own, and draw from where the rule can be kept."""
+    from specshield.commands.policy import policy as make
+
+    raise typer.Exit(make(map, rule, regions, robot, assets, method, name, out, url))
+
+
+def run_policy(
+    policy: Annotated[str, typer.Argument(help="Id or name of a policy in SPECSHIELD_DATA_DIR.")],
+    target: Annotated[str | None, typer.Option(help="Where the model goes, as 2.5,1.0 [m].")] = None,
+    seed: Annotated[int, typer.Option(help="Decides start, target and model.", min=0)] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
+) -> None:
+    """Drive a simulated robot through an episode, with and without the shield, and draw both."""
+    from specshield.commands.run import run as drive
+
+    raise typer.Exit(drive(policy, target, seed, out))
+
+
+def watch(
+    session: Annotated[str, typer.Argument(help="Id of a session.")],
+    url: Annotated[str, typer.Option(help="The server.")] = "http://127.0.0.1:8000",
+    after: Annotated[
+        int | None, typer.Option(help="Begin after this step. [default: from the first]")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(help="Stop after so many decisions.", min=1)] = None,
+) -> None:
+    """Show the decisions of a session as they are made, a line each."""
+    from specshield.commands.watch import watch as follow
+
+    raise typer.Exit(follow(session, url, after, limit))
+
+
+def doctor(
+    url: Annotated[str | None, typer.Option(help="A server to look at as well.")] = None,
+    port: Annotated[int, typer.Option(help="The port to serve on.", min=1, max=65535)] = 8000,
+) -> None:
+    """Say what of this installation works, what does not, and what to do about it."""
+    from specshield.commands.doctor import doctor as examine
+
+    raise typer.Exit(examine(url, port))
 
 
 def _check_address(host: str, port: int) -> None:

@@ -302,6 +302,7 @@ class AsyncPolicies(Resource):
     create = awaiting(calls.create_policy)
     upload = awaiting(calls.upload_policy)
     get = awaiting(calls.get_policy)
+    image = awaiting(calls.policy_image)
     delete = awaiting(calls.delete_policy)
     wait = awaiting(calls.wait_policy)
     list = pages(Policy, "policies")

@@ -69,6 +69,8 @@ def validate(
 def create_map(format: str, **members: Any) -> Flow[Map]:
     """Send a map in any format that the server has (its /docs lists them), by the format's own members.
 
+    A member `name` is what you call the map; the name is taken wherever its id is.
+
     A member that is bytes or the path object of a file makes all of them go as files, as `map_server` wants.
     """
     if not any(isinstance(member, bytes | os.PathLike) for member in members.values()):
@@ -78,22 +80,31 @@ def create_map(format: str, **members: Any) -> Flow[Map]:
     return build(Map, (yield from call(Request("POST", path("maps"), files=files, slow=True))))
 
 
-def upload_map(metadata: Content, image: Content) -> Flow[Map]:
+def upload_map(metadata: Content, image: Content, *, name: str | None = None) -> Flow[Map]:
     """A ROS map_server map: YAML and PGM or PNG, each its content or the path object of a file."""
-    read = {"metadata": content(metadata, "metadata"), "image": content(image, "image")}
-    return (yield from create_map("map_server", **read))
+    read: dict[str, Content] = {"metadata": content(metadata, "metadata"), "image": content(image, "image")}
+    return (yield from create_map("map_server", **read, **_named(name)))
 
 
 def procthor_map(
-    house: Mapping[str, Any], asset_sizes: Mapping[str, Any], resolution: float = 0.05
+    house: Mapping[str, Any],
+    asset_sizes: Mapping[str, Any],
+    resolution: float = 0.05,
+    *,
+    name: str | None = None,
 ) -> Flow[Map]:
     """A ProcTHOR house, drawn at `resolution` [m]; map (x, y) is house (x, z)."""
-    return (yield from create_map("procthor", house=house, asset_sizes=asset_sizes, resolution=resolution))
+    members = {"house": house, "asset_sizes": asset_sizes, "resolution": resolution}
+    return (yield from create_map("procthor", **members, **_named(name)))
 
 
-def occupancy_grid_map(info: Mapping[str, Any], data: Sequence[int]) -> Flow[Map]:
+def occupancy_grid_map(info: Mapping[str, Any], data: Sequence[int], *, name: str | None = None) -> Flow[Map]:
     """A nav_msgs/OccupancyGrid: its `info`, and `data` row by row from the lowest y."""
-    return (yield from create_map("occupancy_grid", info=info, data=data))
+    return (yield from create_map("occupancy_grid", info=info, data=data, **_named(name)))
+
+
+def _named(name: str | None) -> dict[str, str]:
+    return {} if name is None else {"name": name}
 
 
 def get_map(id: str) -> Flow[Map]:
@@ -123,8 +134,11 @@ def create_policy(
     method: str = "reachability",
     seed: int = 0,
     options: Mapping[str, Any] | None = None,
+    name: str | None = None,
 ) -> Flow[Policy]:
     """Have a policy made; returns at once (see `wait`). The same request again is the same policy.
+
+    `name` is what you call it; the name is taken wherever its id is.
 
     `signals` names the other signals of the formula, with the value each holds before its first sample. The
     server's /docs lists the methods that it has and the options of each.
@@ -136,6 +150,7 @@ def create_policy(
         "method": method,
         "seed": seed,
         "options": options or {},
+        **_named(name),
     }
     return build(Policy, (yield from call(post("policies", body=body, slow=True))))
 
@@ -148,6 +163,13 @@ def upload_policy(weights: Content, card: Content | Mapping[str, Any]) -> Flow[P
         "card": ("card.json", told, "application/json"),
     }
     return build(Policy, (yield from call(Request("POST", path("policies"), files=files, slow=True))))
+
+
+def policy_image(id: str) -> Flow[bytes]:
+    """The floor as SVG, and from where the policy can keep the rule."""
+    delivery = yield from deliver(get("policies", id, "image.svg", slow=True))
+    check(delivery.reply)
+    return delivery.reply.content
 
 
 def get_policy(id: str) -> Flow[Policy]:

@@ -306,6 +306,7 @@ class Policies(Resource):
     create = blocking(calls.create_policy)
     upload = blocking(calls.upload_policy)
     get = blocking(calls.get_policy)
+    image = blocking(calls.policy_image)
     delete = blocking(calls.delete_policy)
     wait = blocking(calls.wait_policy)
     list = pages(Policy, "policies")

@@ -87,9 +87,16 @@ def with_shield(session: Session, case: Case, model: FoundationModel, start: Pos
 
 
 def without_shield(
-    client: ShieldClient, case: Case, model: FoundationModel, start: Pose, seed: int
+    client: ShieldClient,
+    case: Case,
+    model: FoundationModel,
+    start: Pose,
+    seed: int,
+    policy_id: str | None = None,
 ) -> Episode:
     """The model's own draws, executed; after its `end` the robot stands still until the rule is decided.
+
+    policy_id: of a policy for the case's rule; the one that came with the case where none is given.
 
     The verdict is the service's: the poses are recorded into a session that decides nothing.
     """
@@ -107,7 +114,9 @@ def without_shield(
         episode.poses.append(robot.pose)
     still = case.task.horizon + 1 - len(episode.poses)
     episode.poses += [robot.pose] * max(still, 0)
-    session = client.sessions.create(policy_id=case.name, initial_pose=start, allow_infeasible=True)
+    session = client.sessions.create(
+        policy_id=policy_id or case.name, initial_pose=start, allow_infeasible=True
+    )
     episode.session = session.id
     for pose in episode.poses[:-1]:
         session.record(pose)

@@ -18,8 +18,11 @@ import httpx
 
 
 @contextmanager
-def own_server(worker: bool = False, say: Callable[[str], object] = lambda text: None) -> Iterator[str]:
-    """Starts `specshield serve` on a free port, its data in a temporary folder; yields its address.
+def own_server(
+    worker: bool = False, say: Callable[[str], object] = lambda text: None, data: Path | None = None
+) -> Iterator[str]:
+    """Starts `specshield serve` on a free port, its data in `data`, else in a temporary folder; yields its
+    address.
 
     worker: whether it makes policies too. say: is told how far the server is while it starts. Raises
     RuntimeError with the server's log where it does not come up.
@@ -30,7 +33,7 @@ def own_server(worker: bool = False, say: Callable[[str], object] = lambda text:
         with open(log, "wb") as output:
             server = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "serve", "--port", url.rpartition(":")[2]],
-                env=_environment(Path(folder), worker),
+                env=_environment(data or Path(folder) / "data", worker),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -54,7 +57,7 @@ def follow_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
-def _environment(folder: Path, worker: bool) -> dict[str, str]:
+def _environment(data: Path, worker: bool) -> dict[str, str]:
     """This process's, without what would join the server to another's store or lock it."""
     shipped = ("SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR")
     kept = {
@@ -62,7 +65,7 @@ def _environment(folder: Path, worker: bool) -> dict[str, str]:
         for name, value in os.environ.items()
         if name in shipped or (not name.startswith("SPECSHIELD_") and name != "REDIS_URL")
     }
-    own = {"SPECSHIELD_DATA_DIR": str(folder / "data"), "SPECSHIELD_WORKER": "true" if worker else "false"}
+    own = {"SPECSHIELD_DATA_DIR": str(data), "SPECSHIELD_WORKER": "true" if worker else "false"}
     return {**kept, **own}
 
 

@@ -1,0 +1,198 @@
+"""`specshield doctor`: what of an installation works, what does not, and what to do about it."""
+
+from __future__ import annotations
+
+import contextlib
+import email.utils
+import os
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from typing import Literal
+
+from specshield import __version__
+from specshield.errors import SpecshieldError
+
+CLOCK = 2.0  # [s] by which this machine and a server may differ before it is said
+State = Literal["ok", "note", "wrong"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """state `note`: it works, and there is something to know. remedy: what to do, empty where it is ok."""
+
+    state: State
+    what: str
+    remedy: str = ""
+
+
+def doctor(url: str | None, port: int) -> int:
+    """Prints what is found. The exit status is 1 where something is wrong."""
+    checks: list[Callable[[], Iterator[Finding]]] = [_python, _parts, _kernels, _disk, _store]
+    checks.append(lambda: _port(port) if url is None else _server(url))
+    wrong = sum(_shown(check) for check in checks)
+    print("all is well" if not wrong else f"{wrong} of these keep specshield from working")
+    return 1 if wrong else 0
+
+
+def _shown(check: Callable[[], Iterator[Finding]]) -> int:
+    """Prints what a check finds, and counts what is wrong."""
+    wrong = 0
+    try:
+        for finding in check():
+            wrong += finding.state == "wrong"
+            print(f"{finding.state:5}  {finding.what}")
+            if finding.remedy:
+                print(f"       -> {finding.remedy}")
+    except SpecshieldError as error:
+        print(f"wrong  {error}")
+        return wrong + 1
+    return wrong
+
+
+def _python() -> Iterator[Finding]:
+    found = sys.version.split()[0]
+    if sys.version_info < (3, 11):
+        yield Finding(
+            "wrong", f"Python {found}", "Python 3.11 or later for the server; the client takes 3.10"
+        )
+    else:
+        yield Finding("ok", f"Python {found}, specshield {__version__}")
+
+
+def _parts() -> Iterator[Finding]:
+    from specshield.cli import SERVER_PARTS
+
+    missing = [name for name in SERVER_PARTS if find_spec(name) is None]
+    if missing:
+        yield Finding(
+            "wrong", f"missing for a server: {', '.join(missing)}", "pip install 'specshield[server]'"
+        )
+    else:
+        yield Finding("ok", "the server's parts are installed")
+    with contextlib.suppress(PackageNotFoundError):
+        yield Finding("ok", f"torch {version('torch')}: policies can learn here")
+        return
+    yield Finding(
+        "note", "torch is not installed: policies are computed, and none learns (method `dqn`)",
+        "pip install 'specshield[train]' where that is wanted",
+    )  # fmt: skip
+
+
+def _kernels() -> Iterator[Finding]:
+    from specshield import compiled
+    from specshield.service.startup import TAKES
+
+    mark = compiled.mark("ready")
+    if mark is None:
+        yield Finding(
+            "note", f"no compiled kernel can be kept in {compiled.BASE}: every start compiles them all",
+            "set NUMBA_CACHE_DIR to a folder that can be written to",
+        )  # fmt: skip
+    elif mark.exists():
+        yield Finding("ok", f"the kernels are compiled ({compiled.BASE})")
+    else:
+        yield Finding(
+            "note", f"the first start will compile the kernels, for about {TAKES} s on two cores",
+            "python -m specshield.service.startup does so now",
+        )  # fmt: skip
+
+
+def _disk() -> Iterator[Finding]:
+    from specshield.service.library.files import check_writable
+    from specshield.service.settings import read_settings
+
+    settings = read_settings()
+    there = settings.data_dir
+    if there.exists():
+        check_writable(there, "SPECSHIELD_DATA_DIR")
+    near = next(folder for folder in (there.absolute(), *there.absolute().parents) if folder.exists())
+    if not os.access(near, os.W_OK):
+        yield Finding("wrong", f"{near} cannot be written to", "set SPECSHIELD_DATA_DIR to another folder")
+        return
+    free = shutil.disk_usage(near).free
+    if free < settings.disk_reserve_bytes:
+        yield Finding(
+            "wrong", f"{free >> 20} MiB are free for the data folder {there}",
+            f"at least {settings.disk_reserve_bytes >> 20} MiB, or no session begins",
+        )  # fmt: skip
+    else:
+        yield Finding("ok", f"data folder {there.absolute()}, {free >> 30} GiB free")
+
+
+def _store() -> Iterator[Finding]:
+    from specshield.service.settings import read_settings
+    from specshield.service.storage.connect import connect
+    from specshield.service.storage.embedded import EmbeddedStore
+
+    settings = read_settings()
+    if settings.redis_url is None:
+        EmbeddedStore(settings.data_dir)
+        yield Finding("ok", "the store is the server's own, in the data folder")
+        return
+    import redis
+
+    began = time.perf_counter()
+    try:
+        with contextlib.closing(
+            connect(settings.redis_url, blocking=True, socket_timeout=settings.store_timeout)
+        ) as store:
+            store.ping()
+    except redis.RedisError as error:
+        yield Finding(
+            "wrong", f"the store at REDIS_URL does not answer: {error}", "start it, or mend REDIS_URL"
+        )
+        return
+    yield Finding("ok", f"the store at REDIS_URL answers in {1000 * (time.perf_counter() - began):.1f} ms")
+
+
+def _port(port: int) -> Iterator[Finding]:
+    try:
+        socket.create_server(("127.0.0.1", port)).close()
+    except OSError as error:
+        yield Finding(
+            "note", f"port {port} is taken: {error.strerror}",
+            f"a server may run there already: specshield doctor --url http://127.0.0.1:{port}; "
+            "or serve elsewhere, by --port",
+        )  # fmt: skip
+    else:
+        yield Finding("ok", f"port {port} is free")
+
+
+def _server(url: str) -> Iterator[Finding]:
+    import httpx
+
+    began = time.time()
+    try:
+        ready = httpx.get(f"{url}/readyz", timeout=10.0)
+        told = httpx.get(f"{url}/openapi.json", timeout=10.0)
+    except httpx.HTTPError as error:
+        yield Finding("wrong", f"no server answers at {url}: {error}", "specshield serve, or another --url")
+        return
+    if ready.status_code == 200:
+        yield Finding("ok", f"the server at {url} is ready")
+    else:
+        yield Finding(
+            "wrong",
+            f"the server at {url} is not ready: {ready.json().get('detail')}",
+            "wait, or read its log",
+        )
+    theirs = told.json().get("info", {}).get("version") if told.status_code == 200 else None
+    if theirs not in (None, __version__):
+        yield Finding(
+            "note",
+            f"the server is specshield {theirs}, this is {__version__}",
+            "the same version on both sides",
+        )
+    date = ready.headers.get("date")
+    if date is not None:
+        apart = email.utils.parsedate_to_datetime(date).timestamp() - began
+        if abs(apart) > CLOCK + 1.0:  # the header has whole seconds
+            yield Finding(
+                "note", f"the server's clock is {apart:+.0f} s from this one", "ntp on both machines"
+            )

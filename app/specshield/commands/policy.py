@@ -1,0 +1,128 @@
+"""`specshield policy`: a policy for one's own map, rule and robot, from files, in one command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from specshield.client import Map, Policy, ShieldClient
+from specshield.commands.serving import client_of
+from specshield.errors import InputError, PolicyError
+from specshield.sim.progress import StatusLine, duration
+
+LARGEST = 64 << 20  # [bytes] of a file; a server's own limit for a map
+
+
+def policy(
+    map: str,
+    rule: str,
+    regions: Path | None,
+    robot: str,
+    assets: Path | None,
+    method: str,
+    name: str | None,
+    out: Path,
+    url: str | None,
+) -> int:
+    """Sends the map, has the policy made, and writes a picture of from where the rule can be kept.
+
+    Returns the exit status: 1 where the policy is ready but can keep the rule from nowhere.
+    """
+    status = StatusLine()
+    places = {} if regions is None else _mapping(_read(regions, "--regions"), regions, "--regions")
+    machine = _robot(robot)
+    with client_of(url, status, worker=True) as client:
+        world = _map(client, map, assets)
+        spec = client.specs.validate(rule, places, map_id=world.id)
+        print(
+            f"map     {world.name or world.id[:12]}: {_metres(world)}; "
+            f"rooms: {', '.join(world.rooms) or 'none'}"
+        )
+        print(f"rule    {spec.formula}, over {spec.horizon} steps", flush=True)
+        asked = client.policies.create(world.id, rule, places, robot=machine, method=method, name=name)
+        status.say(f"making the policy by {method} ...")
+        made = client.policies.wait(asked.id, interval=0.2, progress=lambda found: _show(status, found))
+        status.clear()
+        if made.status == "failed":
+            raise PolicyError(f"the policy could not be made: {made.error}")
+        called = made.name or made.id
+        print(f"policy  {called}")
+        for metric, value in made.metrics.items():
+            print(f"        {metric}: {value}")
+        for warning in made.warnings:
+            print(f"        warning: {warning}")
+        out.mkdir(parents=True, exist_ok=True)
+        picture = out / f"{called}.svg"
+        picture.write_bytes(client.policies.image(made.id))
+    print(f"picture {picture}")
+    print(f"next    specshield run {called}")
+    return 1 if made.metrics.get("feasible_start") == 0.0 else 0
+
+
+def _show(status: StatusLine, found: Policy) -> None:
+    left = "" if found.eta_s is None else f", about {duration(found.eta_s)} left"
+    status.say(f"{found.status}: {found.progress:4.0%}{left}")
+
+
+def _metres(world: Map) -> str:
+    wide, high = world.width * world.resolution, world.height * world.resolution
+    return f"{wide:.1f} x {high:.1f} m at {world.resolution:g} m"
+
+
+def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
+    """A file is sent; anything else is the id or the name of a map that the server has."""
+    path = Path(map)
+    if not path.suffix:
+        return client.maps.get(map)
+    if path.suffix in (".yaml", ".yml"):
+        metadata = _mapping(_read(path, "--map"), path, "--map")
+        image = path.parent / Path(str(metadata.get("image", ""))).name
+        if not image.is_file():
+            raise InputError(
+                f"{path} names the image {metadata.get('image')!r}, which is not beside it",
+                path="--map", got=str(image), expected="the map's PGM or PNG beside its YAML",
+            )  # fmt: skip
+        return client.maps.upload(path, image)
+    content = _mapping(_read(path, "--map"), path, "--map")
+    if "rooms" in content:
+        sizes = {} if assets is None else _mapping(_read(assets, "--assets"), assets, "--assets")
+        return client.maps.procthor(content, sizes)
+    if "info" in content:
+        return client.maps.occupancy_grid(content["info"], content.get("data", []))
+    raise InputError(
+        f"{path} is no map of a known form", path="--map", got=sorted(content)[:8],
+        expected="a ROS map's YAML beside its image, a ProcTHOR house, or a nav_msgs/OccupancyGrid as JSON",
+    )  # fmt: skip
+
+
+def _robot(robot: str) -> str | Mapping[str, Any]:
+    """A preset's name, or a robot of one's own from a file."""
+    path = Path(robot)
+    return _mapping(_read(path, "--robot"), path, "--robot") if path.suffix else robot
+
+
+def _read(path: Path, option: str) -> Any:
+    """JSON or YAML. Raises InputError where the file cannot be read or is neither."""
+    try:
+        if path.stat().st_size > LARGEST:
+            raise InputError(f"{path} is too large", path=option, expected=f"at most {LARGEST >> 20} MiB")
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InputError(f"{path} cannot be read: {reason}", path=option, got=str(path)) from None
+    try:
+        return json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
+
+
+def _mapping(value: Any, path: Path, option: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise InputError(
+            f"{path} holds no object", path=option, got=type(value).__name__, expected="an object"
+        )
+    return value

@@ -1,0 +1,81 @@
+"""A map, a rule and a robot of one's own, from files to a picture; and what tells how things stand."""
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+
+import yaml
+
+from examples.own_house import HOUSE, REGIONS, ROBOT, RULE, occupancy
+from specshield.client import ShieldClient
+from tests.serving import serving
+
+
+def command(*arguments, **environment):
+    """The finished process of `specshield`, with these environment variables beside this process's own."""
+    return subprocess.run(
+        [sys.executable, "-m", "specshield.cli", *map(str, arguments)],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
+    info, data = occupancy(HOUSE)
+    (tmp_path / "flat.json").write_text(json.dumps({"info": info, "data": data}))
+    (tmp_path / "places.yaml").write_text(yaml.safe_dump(REGIONS))
+    (tmp_path / "cart.yaml").write_text(yaml.safe_dump(ROBOT))
+    own = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
+    files = ("--map", tmp_path / "flat.json", "--regions", tmp_path / "places.yaml")
+    asked = (*files, "--robot", tmp_path / "cart.yaml", "--rule", RULE, "--name", "flat", "--out", tmp_path)
+    made = command("policy", *asked, **own)
+    assert made.returncode == 0, made.stderr
+    assert "specshield run flat" in made.stdout
+    assert (tmp_path / "flat.svg").read_text().startswith("<svg")
+
+    driven = command("run", "flat", "--seed", 3, "--out", tmp_path, **own)
+    assert driven.returncode == 0, driven.stderr
+    assert "shielded rule satisfied" in driven.stdout
+    assert (tmp_path / "flat-run.png").stat().st_size > 5000
+
+
+def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
+    (tmp_path / "flat.json").write_text('{"rooms?": []}')
+    refused = command(
+        "policy", "--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 1", "--url", "http://127.0.0.1:9"
+    )
+    assert refused.returncode == 1
+    assert "Traceback" not in refused.stderr
+    assert len(refused.stderr.strip().splitlines()) == 1
+
+
+def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
+    sound = command("doctor", SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    assert sound.returncode == 0, sound.stdout
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        ill = command(
+            "doctor", "--port", port, REDIS_URL="redis://127.0.0.1:1/0", SPECSHIELD_DATA_DIR=str(tmp_path)
+        )
+    assert ill.returncode == 1
+    assert f"port {port} is taken" in ill.stdout
+    assert re.search(r"^wrong +the store at REDIS_URL does not answer", ill.stdout, re.M)
+    assert "Traceback" not in ill.stderr
+
+
+def test_a_session_is_watched_a_line_a_decision(tmp_path):
+    with serving(tmp_path) as server, ShieldClient(server.url, timeout=60.0) as client:
+        session = client.sessions.create(policy_id="case1", initial_pose=(5.0, 5.0, 0.0), seed=2)
+        pose = (5.0, 5.0, 0.0)
+        for _ in range(3):
+            decision = session.step(pose, [0.0] * 20)
+            pose = decision.next_poses[decision.execute]
+        session.close(pose)
+        watched = command("watch", session.id, "--url", server.url)
+    assert watched.returncode == 0, watched.stderr
+    lines = [line for line in watched.stdout.splitlines() if re.match(r" +\d+ (prior|shaped)", line)]
+    assert [int(line.split()[0]) for line in lines] == [0, 1, 2]
