@@ -267,7 +267,7 @@ def doctor(
     """Say what of this installation works, what does not, and what to do about it."""
     from specshield.commands.doctor import doctor as examine
 
-    raise typer.Exit(examine(url, port))
+    raise typer.Exit(examine(url, port, SERVER_PARTS))
 
 
 def _check_address(host: str, port: int) -> None:

@@ -9,7 +9,7 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
@@ -31,9 +31,9 @@ class Finding:
     remedy: str = ""
 
 
-def doctor(url: str | None, port: int) -> int:
-    """Prints what is found. The exit status is 1 where something is wrong."""
-    checks: list[Callable[[], Iterator[Finding]]] = [_python, _parts, _kernels, _disk, _store]
+def doctor(url: str | None, port: int, parts: Sequence[str]) -> int:
+    """Prints what is found. parts: the modules of a server. The exit status is 1 where something is wrong."""
+    checks: list[Callable[[], Iterator[Finding]]] = [_python, lambda: _parts(parts), _kernels, _disk, _store]
     checks.append(lambda: _port(port) if url is None else _server(url))
     wrong = sum(_shown(check) for check in checks)
     print("all is well" if not wrong else f"{wrong} of these keep specshield from working")
@@ -65,10 +65,8 @@ def _python() -> Iterator[Finding]:
         yield Finding("ok", f"Python {found}, specshield {__version__}")
 
 
-def _parts() -> Iterator[Finding]:
-    from specshield.cli import SERVER_PARTS
-
-    missing = [name for name in SERVER_PARTS if find_spec(name) is None]
+def _parts(parts: Sequence[str]) -> Iterator[Finding]:
+    missing = [name for name in parts if find_spec(name) is None]
     if missing:
         yield Finding(
             "wrong", f"missing for a server: {', '.join(missing)}", "pip install 'specshield[server]'"
