@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import betabinom, binom, norm
 
-from specshield.shield.caution.experience import Seen, noise_of, observe
-from specshield.shield.episode import Config, decide, make_shield
+from specshield.shield.caution.experience import FORMAT, Seen, noise_of, observe, was_stopped
+from specshield.shield.episode import Carry, Config, decide, make_shield
 from specshield.shield.uncertainty import HARDER, MENDED, Noise, Uncertainty, margin_for, slack_for
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted
 
@@ -115,3 +115,17 @@ def test_margin_and_slack_begin_cautious_and_let_go_and_what_was_given_is_the_le
         assert said[0][0] > 0.03
         assert said[-1][0] == config.margin
         assert said[0][1] >= said[-1][1] >= config.slack
+
+
+@pytest.mark.parametrize(("loss", "stands", "stopped"), [(0.0, 2, True), (0.15, 2, False), (0.15, 6, True)])
+def test_a_robot_that_slips_is_not_taken_to_be_held(loss, stands, stopped):
+    """By how often it has slipped: twice in a row is nothing to one that often does."""
+    world = cells("F[0,40] A")
+    policy = Scripted(world, lambda t, motion: [])
+    shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
+    seen, lost = Seen(), np.random.default_rng(0).random(60) < loss
+    seen = walked(seen, np.where(lost[:, None], HERE, MOVES[0]))._replace(stands=stands - 1.0)
+    pose = world.pose(0, 0, 0)
+    nexts = np.array([world.pose(*world.after((0, 0, 0), m)) for m in range(4)])
+    carry = Carry(0, nexts, (None,) * 4, residuals=FORMAT.pack(*seen))
+    assert was_stopped(shield, carry, np.array([pose, pose])) == stopped

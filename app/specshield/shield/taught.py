@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from specshield.arrays import Floats
 from specshield.robot.dynamics import Body, make_body, overlap
+from specshield.shield.caution.experience import was_stopped
 from specshield.shield.contact import Followed, cells_ahead, cells_under, contact_of
 from specshield.shield.decision import Carry, Shield
 from specshield.world.learned import (
@@ -74,6 +75,8 @@ def teach(
     if config.learn_map and carry is not None and carry.t == t - 1:
         body = body_on(shield, before.map)
         motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses)
+        if motion >= 0 and not was_stopped(shield, carry, poses):
+            motion = -1
         for pose in _between(poses):
             if overlap(body, *pose) > UNDER:
                 known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)

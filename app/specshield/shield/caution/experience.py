@@ -38,7 +38,9 @@ MOST_ODDS = 1e6  # so that what changes late is still noticed
 TINY = 1e-9  # [motions]
 FAR = 5.0  # [sigma] what noise does: one motion in 270,000 ends farther off
 
-FORMAT = struct.Struct("<8d")
+SELDOM = 1e-3  # a robot that does not move so often in a row is held by something; chosen by hand
+
+FORMAT = struct.Struct("<9d")
 
 
 class Seen(NamedTuple):
@@ -47,7 +49,8 @@ class Seen(NamedTuple):
     moved: how many there were, and lost: how many of them were not executed; both may be fractions. odds: of
     what was seen if motions never slip, to if they do. noisy: how many were measured against f; moves, turns:
     the sums of their squared residuals [m^2], [rad^2]; exact: how many of them had none. standing: the
-    probability, by the last answer, that the robot is not told to move.
+    probability, by the last answer, that the robot is not told to move. stands: how many motions in a row did
+    not move it.
     """
 
     moved: float = 0.0
@@ -58,6 +61,7 @@ class Seen(NamedTuple):
     turns: float = 0.0
     exact: float = 0.0
     standing: float = 0.0
+    stands: float = 0.0
 
 
 def learn(
@@ -70,7 +74,7 @@ def learn(
     config, t, known = shield.config, len(poses) - 1, shield.config.uncertainty
     if known is None:
         return None, Care(config.margin, config.slack)
-    told = (known.translation, known.rotation, known.slip, known == ASSUMED)
+    told = _told(known)
     seen = Seen() if carry is None or carry.residuals is None else Seen(*FORMAT.unpack(carry.residuals))
     if carry is not None and carry.t == t - 1 and not contact:
         seen = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
@@ -78,6 +82,24 @@ def learn(
     stride, deadlines = _measures(shield.task)
     margin = margin_for(noise, stride, shield.task.horizon - t)
     return seen, Care(max(config.margin, margin), config.slack, noise, stride, 0.5 * CHANCE / deadlines)
+
+
+def _told(known: Uncertainty) -> Told:
+    return known.translation, known.rotation, known.slip, known == ASSUMED
+
+
+def was_stopped(shield: Shield, carry: Carry, poses: Floats) -> bool:
+    """Whether a motion that ended short at x_t met something: noise and slips do not explain it."""
+    known = shield.config.uncertainty
+    if known is None or carry.residuals is None:
+        return True
+    before, pose, seen = poses[-2], poses[-1], Seen(*FORMAT.unpack(carry.residuals))
+    noise, still = noise_of(_told(known), seen), _gap(before, pose)
+    far = EXACT + FAR * (noise.move + noise.turn)
+    miss = min((_gap(end, pose) for end in carry.next_poses if _gap(end, before) > EXACT), default=math.inf)
+    if still < miss and still <= far:
+        return bool((noise.slips * noise.lost / (noise.lost + noise.kept)) ** (seen.stands + 1.0) < SELDOM)
+    return miss > far
 
 
 @lru_cache(maxsize=256)
@@ -96,7 +118,7 @@ def remember(
     standing = _standing(
         shield.task.robot.motion_of, distribution, int(shield.task.robot.motion_of[moved]), nexts, pose
     )
-    return FORMAT.pack(*seen[:-1], standing)
+    return FORMAT.pack(*seen._replace(standing=standing))
 
 
 @kernel
@@ -158,6 +180,7 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
         return Seen(
             seen.moved + slipped, seen.lost + slipped * min(1.0, miss / way), odds,
             seen.noisy, seen.moves, seen.turns, seen.exact, seen.standing,
+            seen.stands + 1.0 if still < miss else 0.0,
         )  # fmt: skip
     dx, dy = pose[0] - foreseen[motion, 0], pose[1] - foreseen[motion, 1]
     return Seen(
@@ -169,6 +192,7 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
         seen.turns + wrap(pose[2] - foreseen[motion, 2]) ** 2,
         seen.exact + (1.0 if miss <= EXACT else 0.0),
         seen.standing,
+        0.0,
     )
 
 
