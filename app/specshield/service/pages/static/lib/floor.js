@@ -44,6 +44,8 @@ export class Floor {
   constructor(map, label) {
     const [x0, y0, x1, y1] = map.bounds;
     this.map = map;
+    this.rooms = []; // [name, place] of each, once the walls are known
+    this.drawn = new Set(); // names of the regions
     this.unit = Math.max(x1 - x0, y1 - y0) / 100; // [m] about a hundredth of the picture
     this.layers = Object.fromEntries(
       ["walls", "rooms", "regions", "ways", "robots", "marks"].map((name) => [name, svg("g", { class: name })]),
@@ -66,15 +68,16 @@ export class Floor {
     const turned = `translate(${origin[0]} ${-origin[1]}) rotate(${(-180 * origin[2]) / Math.PI})`;
     const walls = { href: await this.occupancy.walls(), x: 0, y: -h, width: w, height: h, transform: turned };
     this.layers.walls.replaceChildren(svg("image", walls));
+    const single = Object.entries(this.map.rooms).filter(([, room]) => room.type !== "union");
+    this.rooms = single.map(([name, room]) => [name, this.roomiest(room)]);
     this.names();
     return this.occupancy;
   }
 
-  /** Writes the names of the rooms, each where it has most space. */
+  /** Writes the names of the rooms, each where it has most space; not of those that are drawn as regions. */
   names() {
-    const single = Object.entries(this.map.rooms).filter(([, room]) => room.type !== "union");
-    const shown = single.map(([name, room]) => this.text(this.roomiest(room), name, "room"));
-    this.layers.rooms.replaceChildren(...shown);
+    const others = this.rooms.filter(([name]) => !this.drawn.has(name));
+    this.layers.rooms.replaceChildren(...others.map(([name, place]) => this.text(place, name, "room")));
   }
 
   /** A point of a region with much free space around it; its middle where there is none. */
@@ -103,6 +106,8 @@ export class Floor {
       return svg("g", group, ...members(region).map(shape), this.text([x, y - 2.2 * this.unit], name));
     });
     this.layers.regions.replaceChildren(...shown);
+    this.drawn = new Set(Object.keys(regions));
+    this.names();
   }
 
   text([x, y], said, kind = "") {

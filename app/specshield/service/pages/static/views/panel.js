@@ -36,7 +36,13 @@ export function whyNot(decision, action) {
     return `${told.conjunct} could not be kept: ${[late, misses].filter(Boolean).join(", ") || "no way was found"}`;
   }
   if (value === null || value === undefined) return "was not looked at";
+  if (value > 0) return `keeps the rule by ${metres(value)}, but not with ${inHand(decision)} in hand`;
   return `no way was found that keeps the rule; the best misses it by ${metres(Math.abs(Math.min(0, value)))}`;
+}
+
+/** What a decision keeps in hand for a robot that does not land exactly where it should. */
+function inHand({ margin, slack }) {
+  return [margin > 0 && metres(margin), slack > 0 && `${slack} steps`].filter(Boolean).join(" and ") || "what is kept";
 }
 
 export class Panel {

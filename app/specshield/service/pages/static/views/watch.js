@@ -17,7 +17,7 @@ export class Watch {
     this.mark = new Mark(this.floor, session.robot, session.id);
     this.panel = new Panel(session);
     this.charts = [
-      [new Chart("Robustness of what comes", metres), (d) => d.robustness[taken(d)]],
+      [new Chart("Robustness ahead", metres), (d) => d.robustness[taken(d)]],
       [new Chart("Feasible mass", percent), (d) => d.feasible_mass],
       [new Chart("Slack kept", (steps) => `${steps} steps`), (d) => d.slack || null],
     ];
