@@ -5,7 +5,8 @@
 Rounds with pages and rounds without take turns, so that whatever else the machine does meets both alike.
 Each round has sessions of its own. A page is what the browser keeps open: one stream of `/v1/events` with all
 of the robots, read to the end as it comes, in a process of its own; what a browser draws is not in it. A
-decision is timed by the robot that waits for it [ms], and by the server (`Server-Timing: total`).
+decision is timed by the robot that waits for it [ms], and by the server (`Server-Timing: total`). The CPU
+that the server takes, for each step [ms], is what pages cost it where other work blurs the clock.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import httpx
 import numpy as np
@@ -36,24 +38,33 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0, help="of a round")
     asked = parser.parse_args()
     times: dict[int, Times] = {0: [], asked.pages: []}
+    cpu = {0: 0.0, asked.pages: 0.0}  # [s] of the server
     with own_server() as url:
+        server = int(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()[0])
         for number in range(-1, 2 * asked.rounds):
             pages = asked.pages if number % 2 else 0
-            found = measured(url, asked, pages, max(number, 0) // 2)
+            found, took = measured(url, server, asked, pages, max(number, 0) // 2)
             if number >= 0:  # the one before loads what is loaded once
                 times[pages] += found
+                cpu[pages] += took
     print(machine())
     print(f"{asked.robots} robots, {asked.rate:g} steps/s each; {asked.rounds} rounds of {asked.seconds:g} s")
-    print("| pages open | steps | waited p50 | p99 | in the server p50 | p99 |\n|--:|--:|--:|--:|--:|--:|")
+    print(
+        "| pages open | steps | waited p50 | p99 | in the server p50 | p99 | CPU a step |\n"
+        + "|--:" * 7
+        + "|"
+    )
     for pages, taken in times.items():
         cells = " | ".join(f"{value:.2f}" for value in np.percentile(taken, (50, 99), axis=0).T.ravel())
-        print(f"| {pages} | {len(taken)} | {cells} |")
+        print(f"| {pages} | {len(taken)} | {cells} | {1e3 * cpu[pages] / len(taken):.2f} |")
     none, some = (np.percentile(taken, 99, axis=0) for taken in times.values())
     print(f"p99 with pages to that without: waited {some[0] / none[0]:.3f}, server {some[1] / none[1]:.3f}")
 
 
-def measured(url: str, asked: argparse.Namespace, pages: int, number: int) -> Times:
-    """The steps of one round."""
+def measured(
+    url: str, server: int, asked: argparse.Namespace, pages: int, number: int
+) -> tuple[Times, float]:
+    """The steps of one round, and the server's CPU in it [s]."""
     with httpx.Client(base_url=url, timeout=60.0) as client:
         ids = [begun(client, 1000 * asked.seed + 100 * number + i) for i in range(asked.robots)]
         readers = None
@@ -62,16 +73,23 @@ def measured(url: str, asked: argparse.Namespace, pages: int, number: int) -> Ti
             readers = subprocess.Popen(command, preexec_fn=lambda: os.nice(5))
             while f"specshield_watchers {pages}.0" not in client.get("/metrics").text:
                 time.sleep(0.05)
-        until = time.monotonic() + asked.seconds
+        began, until = cpu_of(server), time.monotonic() + asked.seconds
         with ThreadPoolExecutor(asked.robots) as robots:
             given = [(url, id, asked.rate, until, i) for i, id in enumerate(ids)]
             found = list(robots.map(lambda robot: driven(*robot), given))
+        took = cpu_of(server) - began
         if readers is not None:
             readers.terminate()
             readers.wait()
         for id in ids:
             client.delete(f"/v1/sessions/{id}")
-    return [step for steps in found for step in steps]
+    return [step for steps in found for step in steps], took
+
+
+def cpu_of(process: int) -> float:
+    """The CPU that a process has taken [s], by Linux's account of it."""
+    user, system = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def begun(client: httpx.Client, seed: int) -> str:

@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from specshield.errors import LimitReached, NotFound, SpecshieldError
@@ -27,6 +28,7 @@ from specshield.service.sessions.state import State
 from specshield.service.storage.store import News, Store
 
 EVERY = 0.1  # [s] between two looks at a session; chosen by hand: a page need not be quicker
+TOGETHER = 0.25  # [s] between two messages of a stream of several sessions; by hand: each costs some 0.1 ms
 PARTS = 4  # of the sessions, looked at one after the other, so that none of them holds up a decision
 KEPT = 64  # events kept for the watchers of a session, and read at once
 HEARTBEAT = 15.0  # [s] without an event; chosen by hand, below what proxies wait
@@ -36,10 +38,11 @@ log = logging.getLogger("specshield")
 
 @dataclass(frozen=True)
 class Told:
-    """A decision as it is told. switch: events that come before it. asked: x_t, which of the session's rules
-    held, and the logits, as members of a JSON object. answer: what was answered.
+    """A decision as it is told. session: its id. switch: events that come before it. asked: x_t, which of the
+    session's rules held, and the logits, as members of a JSON object. answer: what was answered.
     """
 
+    session: str
     t: int
     switch: bytes
     asked: bytes
@@ -48,9 +51,10 @@ class Told:
     def event(self) -> bytes:
         return b"%sid: %d\ndata: %s\n\n" % (self.switch, self.t, self.answer)
 
-    def event_of(self, session: str) -> bytes:
-        """For a stream of several sessions."""
-        head = b'{"session":"%s","t":%d,%s' % (session.encode(), self.t, self.asked)
+    @cached_property
+    def whole(self) -> bytes:
+        """The event in a stream of several sessions: made once for all who watch."""
+        head = b'{"session":"%s","t":%d,%s' % (self.session.encode(), self.t, self.asked)
         return b'data: %s,"decision":%s}\n\n' % (head, self.answer)
 
 
@@ -151,12 +155,12 @@ class Watchers:
             yield FIRST
             while places and not self._stopping():
                 told = []
-                for feed, t in list(places.items()):
+                for feed, t in [(feed, t) for feed, t in places.items() if t < feed.end or feed.over]:
                     if t < feed.start:
                         found, t = await self._older(feed, t)
                     else:
                         found, t = [each for each in feed.recent if each.t >= t], max(t, feed.end)
-                    told += [each.event_of(shown(feed.id)) for each in found]
+                    told += [each.whole for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
                         told.append(_end_of(feed))
@@ -164,7 +168,7 @@ class Watchers:
                 if told or time.monotonic() - told_at > HEARTBEAT:
                     told_at = time.monotonic()
                     yield b"".join(told) or b": alive\n\n"
-                await asyncio.sleep(EVERY)
+                await asyncio.sleep(TOGETHER)
 
     @contextlib.contextmanager
     def _watching(self, feeds: Sequence[Feed]) -> Iterator[None]:
@@ -291,7 +295,7 @@ def _events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
             switch = b""
             while switched and switched[0]["from"] <= t + i:
                 switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
-            found.append(Told(t + i, switch, json.dumps(asked)[1:-1].encode(), answer))
+            found.append(Told(shown(feed.id), t + i, switch, json.dumps(asked)[1:-1].encode(), answer))
     return found, t + len(new.steps)
 
 
