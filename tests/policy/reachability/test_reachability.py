@@ -225,3 +225,16 @@ def test_a_large_floor_costs_what_the_rule_can_reach():
     whole = synthesise(make_task(floor, STRETCH, "F[0,300] A", regions))
     assert 0.1 < whole.tables.pitch <= 0.2
     assert load_policy(whole.weights(), whole.card, whole.task).tables.pitch == whole.tables.pitch
+
+
+def test_turns_that_do_not_divide_the_circle_fit_a_flat():
+    """10 x 10 m, 150 steps, no wait: 72 headings would not fit; 25 are as near to turns of 0.5 rad."""
+    moves = [{"name": "go", "translate": 0.25}, {"name": "left", "rotate": 0.5}]
+    robot = robot_from_json(
+        {"footprint": {"radius": 0.2}, "actions": [*moves, {"name": "r", "rotate": -0.5}]}
+    )
+    regions = {"A": {"type": "circle", "center": [8.0, 8.0], "radius": 0.5}}
+    grid = OccupancyGrid(np.zeros((100, 100), bool), 0.1)
+    policy = synthesise(make_task(grid, robot, "F[0,150] A", regions))
+    assert policy.tables.bits.shape[2] == 25
+    start(make_shield([policy]), (1.0, 1.0, -2.0))
