@@ -13,6 +13,7 @@ one window would have to end, that rule has to be taken, and kept.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import sys
 from collections import Counter
@@ -24,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.judge import Judge, distance
-from benchmarks.worlds import KINDS, SHAPES, Kind, World, explore, make_world
+from benchmarks.worlds import KINDS, SHAPES, Kind, World, make_world
 from specshield.client import Session, ShieldClient
-from specshield.errors import InfeasibleSwitch, PoseError
+from specshield.errors import InfeasibleStart, InfeasibleSwitch, PoseError
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.robot.dynamics import in_collision, make_body, motion_count, successors
 from specshield.sim.service import own_server
@@ -35,7 +36,7 @@ from specshield.task import make_task
 Floats = NDArray[np.float64]
 WHAT = ("rule", "map", "both")
 CLOCKS = ("keep", "restart")
-MOST_STATES = 250_000  # of one step; worlds with more are drawn anew
+MOST_STATES = 20_000  # of one step; what has more is drawn anew
 
 
 def keepable(world: World, history: Floats) -> bool | None:
@@ -104,13 +105,13 @@ class Service:
             self.made[task.content_hash] = sent.id
         return self.made[task.content_hash]
 
-
-def begun(kind: Kind, random: np.random.Generator) -> World:
-    """A world whose rule can be kept from its start."""
-    while True:
-        world = make_world(kind, str(random.choice(list(SHAPES))), int(random.integers(2**31)))
-        if explore(world) is not None:
-            return world
+    def begun(self, kind: Kind, seed: int, random: np.random.Generator) -> tuple[World, Session]:
+        """A world, and a session there whose rule can be kept."""
+        while True:
+            world = make_world(kind, str(random.choice(list(SHAPES))), int(random.integers(2**31)))
+            with contextlib.suppress(InfeasibleStart):
+                policy, pose = self.policy(world), world.start
+                return world, self.client.sessions.create(policy_id=policy, initial_pose=pose, seed=seed)
 
 
 def switched(world: World, what: str, random: np.random.Generator) -> World:
@@ -127,21 +128,19 @@ def one(service: Service, number: int, seed: int) -> tuple[str, str]:
     """What was switched, and how it went."""
     random = np.random.default_rng([seed, number])
     kind, what, clock = KINDS[number % 2], WHAT[number // 2 % 3], CLOCKS[number // 6 % 2]
-    world = begun(kind, random)
-    asked = service.policy(world)
+    world, session = service.begun(kind, number, random)
     after = int(random.integers(1, 2 * kind.horizon // 3))
     pose, poses, robot = world.start, [], world.task.robot
-    with service.client.sessions.create(policy_id=asked, initial_pose=pose, seed=number) as session:
+    with session:
         for _ in range(after):
             poses.append(pose)
             decision = session.step(pose, random.normal(0.0, 2.0, len(robot.actions)))
             pose = np.array(decision.next_poses[decision.execute])
-        new = switched(world, what, random)
-        since = np.array([pose] if clock == "restart" else [*poses, pose])
-        free = not in_collision(make_body(robot, new.task.grid), *pose)
-        possible = keepable(new, since) if free else False
-        if possible is None:
-            return what, "too large to search"
+        since, possible = np.array([pose] if clock == "restart" else [*poses, pose]), None
+        while possible is None:
+            new = switched(world, what, random)
+            free = not in_collision(make_body(robot, new.task.grid), *pose)
+            possible = keepable(new, since) if free else False
         before = service.client.sessions.get(session.id).info
         with_pose = {"pose": pose} if random.random() < 0.5 else {}
         how = ""
@@ -203,7 +202,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     found = Counter[tuple[str, str]]()
-    with own_server() as url, ShieldClient(url, timeout=30.0) as client:
+    with own_server() as url, ShieldClient(url, timeout=120.0) as client:
         service = Service(client)
         for number in range(args.switches):
             what, how = one(service, number, args.seed)
