@@ -1,7 +1,7 @@
-"""`python -m evaluation evaluate ...` and `python -m evaluation report ...`, where nothing is installed."""
+"""`python -m evaluation evaluate | worlds | report ...`, where nothing is installed."""
 
-from evaluation.commands import evaluate, mujoco, report
+from evaluation.commands import evaluate, mujoco, report, worlds
 from specshield.cli import run
 
 if __name__ == "__main__":
-    run([evaluate, mujoco, report])
+    run([evaluate, worlds, mujoco, report])

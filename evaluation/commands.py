@@ -65,6 +65,33 @@ def mujoco(
     typer.echo(physical.report(physical.named_cases(case), runs, seed))
 
 
+def worlds(
+    case: Annotated[str, typer.Option(help="Some of case1, case2, drawn_0, drawn_1, ...")] = "case1",
+    world: Annotated[
+        str, typer.Option(help="Some of told, obstacle, shift, collider, person.")
+    ] = "obstacle,shift,collider,person",
+    sensing: Annotated[str, typer.Option(help="Some of scan, contact, none.")] = "scan,contact",
+    runs: Annotated[int, typer.Option(help="Runs of each.", min=1)] = 200,
+    seed: Annotated[int, typer.Option(help="Decides starts, model, draws and worlds.", min=0)] = 0,
+    slack: Annotated[
+        int, typer.Option(help="Steps that every F keeps, in place of what the session learns.", min=-1)
+    ] = -1,
+    out: Annotated[Path | None, typer.Option(help="Folder to keep runs in and to take them up from.")] = None,
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+) -> None:
+    """Measure what a session keeps in worlds that are not as it was told, beside an oracle that was."""
+    from evaluation.worlds.campaign import compare
+    from evaluation.worlds.runs import Trial
+
+    trials = [
+        Trial(each, name, senses, seed, slack < 0, max(slack, 0))
+        for each in case.split(",")
+        for name in world.split(",")
+        for senses in sensing.split(",")
+    ]
+    compare(trials, runs, out, processes or os.cpu_count() or 1)
+
+
 def report(
     results: Annotated[Path, typer.Argument(help="Folder that evaluate has kept results in.")],
     out: Annotated[Path, typer.Option(help="The page to write; figures go into a folder beside it.")] = Path(

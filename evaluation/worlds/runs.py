@@ -20,7 +20,8 @@ from specshield.policy.reachability.policy import synthesise
 from specshield.robot.dynamics import in_collision, simulate
 from specshield.shield.decision import Carry, Config
 from specshield.shield.episode import Shield, decide, make_shield, start
-from specshield.sim.cases import Case, load_case
+from specshield.shield.uncertainty import Uncertainty
+from specshield.sim.cases import Case, case_names, load_case
 from specshield.sim.robot import Pose, SimulatedRobot
 from specshield.stl import SATISFIED_ABOVE, conjuncts, robustness
 
@@ -32,14 +33,27 @@ SENSING = ("scan", "contact", "none")
 
 @dataclass(frozen=True)
 class Trial:
-    """One run's conditions. case: case1, case2, or drawn_N; world, sensing: of WORLDS and SENSING."""
+    """One run's conditions.
+
+    case: case1, case2, or a house as in evaluation/houses.py. world, sensing: of WORLDS and SENSING.
+    uncertain: whether the session learns how exact its robot is, as by default. margin [m], slack [steps]:
+    the least that are kept.
+    """
 
     case: str
     world: str
     sensing: str
     seed: int = 0
+    uncertain: bool = True
     slack: int = 0
     margin: float = 0.0
+
+    @property
+    def config(self) -> Config:
+        known = Uncertainty() if self.uncertain else None
+        return Config(
+            slack=self.slack, margin=self.margin, uncertainty=known, learn_map=self.sensing != "none"
+        )
 
 
 @dataclass(frozen=True)
@@ -50,6 +64,7 @@ class Outcome:
     could: bool
     kept: bool
     rho: float
+    kl: float
     broken: list[str]
     modes: dict[str, int]
     changed: int
@@ -63,20 +78,18 @@ class Outcome:
 
 
 @lru_cache(maxsize=4)
-def prepared(case: str, collider: bool, sensing: str, slack: int, margin: float) -> tuple[Case, Shield]:
-    """A case, and the shield as it is told."""
-    found = load_house_case(case) if case.startswith("drawn") else load_case(case)
+def prepared(case: str, collider: bool) -> tuple[Case, Shield]:
+    """A case, and the shield as it is told, with the paper's settings."""
+    found = load_case(case) if case in case_names() else load_house_case(case)
     task = believed("collider" if collider else "none", found.task)
-    return found, make_shield(
-        [synthesise(task)], Config(slack=slack, margin=margin, learn_map=sensing != "none")
-    )
+    return found, make_shield([synthesise(task)])
 
 
 def run(trial: Trial, i: int) -> Outcome:
     """Run i. Its start, model, draws and world follow from the seed and i alone, whatever is sensed."""
     own = int(np.random.SeedSequence([trial.seed, i]).generate_state(1)[0])
-    case, shield = prepared(trial.case, trial.world == "collider", trial.sensing, trial.slack, trial.margin)
-    plain = prepared(trial.case, trial.world == "collider", "none", 0, 0.0)[1]
+    case, plain = prepared(trial.case, trial.world == "collider")
+    shield = replace(plain, config=replace(trial.config, seed=own))
     world, pose = _begin(trial, case, plain, own)
     could = can_keep(world, pose)
     return _drive(trial, i, own, case, shield, world, pose, could)
@@ -110,7 +123,6 @@ def _drive(
     trial: Trial, i: int, own: int, case: Case, shield: Shield, world: World, pose: Pose, could: bool
 ) -> Outcome:
     model, robot = named("learned").make(case), SimulatedRobot(world.case, pose)
-    shield = replace(shield, config=replace(shield.config, seed=own))
     terminal = case.task.robot.terminal
     poses = np.empty((MAX_STEPS + 1, 3))
     carry: Carry | None = None
@@ -118,7 +130,7 @@ def _drive(
     modes: dict[str, int] = {}
     times, changing = list[float](), list[float]()
     model.reset(np.random.default_rng([own, MODEL]))
-    changed = 0
+    changed, kl = 0, 0.0
     while True:
         poses[t] = robot.pose
         if leaves < 0 and world.is_triggered(robot.pose):
@@ -139,6 +151,7 @@ def _drive(
             changing.append(seconds)
             changed = decision.map_revision
         carry = decision.carry
+        kl += decision.kl or 0.0
         modes[decision.mode] = modes.get(decision.mode, 0) + 1
         if logits is not None and terminal[decision.action]:
             done = True
@@ -156,6 +169,7 @@ def _drive(
         could=could,
         kept=rho > SATISFIED_ABOVE,
         rho=round(rho, 4),
+        kl=round(kl, 4),
         broken=[part for part, value in kept.items() if value <= SATISFIED_ABOVE],
         modes=modes,
         changed=changed,

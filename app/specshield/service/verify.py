@@ -11,6 +11,7 @@ import msgspec
 
 from specshield.errors import InputError, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, prepare
+from specshield.service.heavy.tables import Made, make
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions import chain, history, record
@@ -23,6 +24,8 @@ from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
 from specshield.shield import episode
 from specshield.shield.decision import Carry, Shield, make_shield
+from specshield.shield.taught import Taught
+from specshield.world.learned import LearnedMap
 
 
 def verify(file: Path, settings: Settings) -> int:
@@ -74,11 +77,20 @@ def _decide(found: Chain, shields: Sequence[Shield]) -> int:
 def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, list[str]]]:
     """The steps whose decision is another one now, each with the fields that differ. shields: one a rule."""
     configs, carry, rule = [msgspec.to_builtins(config) for config in found.configs], None, 0
+    maps, made = dict[bytes, LearnedMap](), dict[tuple[int, bytes], Made]()
     for t, content, kept in found.decided():
         while rule < found.rule_at(t):
             carry = carried_over(carry, configs[rule], configs[rule + 1])
             rule += 1
         shield = shields[rule]
+        known = Taught.from_bytes(None if carry is None else carry.learned).map
+        maps[known.digest] = known
+        if kept.tables is not None:
+            if kept.tables not in maps:
+                raise InputError("it names tables for a map that the session never had", t=t)
+            key = rule, kept.tables
+            made[key] = made[key] if key in made else make(shield, maps[kept.tables])
+            shield = replace(shield, proposers=made[key].proposers)
         again, following = _again(found, shield, t, kept, carry)
         if record.encode(again) != content and shield.preference is not None:
             # Where its preference was not at hand, the server projected.
@@ -125,6 +137,7 @@ def _again(
         kept.all_witnesses,
         *points,
         kept.explain,
+        kept.tables,
     )
     return made, pack_carry(decision.carry).unpacked()
 

@@ -35,7 +35,7 @@ from specshield.shield.judgement import (
     robustness_of,
     witnesses_of,
 )
-from specshield.shield.taught import handed_on, on_map, teach
+from specshield.shield.taught import doubted, handed_on, on_map, teach, wary
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
@@ -122,13 +122,14 @@ def decide(
     log_prior = shaping.log_prior_of(task.robot, logits, main_task_done)
     taught, said = teach(shield, carry, poses, occupied, free)
     said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)), *said)
-    shield = on_map(shield, taught.map)
+    told, shield = shield, on_map(shield, taught.map)
     nexts = np.empty((len(robot.motions), 3))
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses)
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
+    care = wary(shield.config, care)
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
@@ -139,7 +140,14 @@ def decide(
         judged = None
         answer = _unmodified(shield, log_prior)
     else:
-        judged = judge(shield, prefix, tail, spec_status == "violated", care)
+        broken = spec_status == "violated"
+        judged = judge(shield, prefix, tail, broken, care)
+        doubt = None if judged.feasible.any() else doubted(taught, t)
+        if doubt is not None:
+            shield = on_map(told, doubt.map)
+            judged = judge(shield, prefix, tail, broken, care)
+            taught, said = doubt, (*said, "no way was left, so what was run into is tried again")
+            touches = _look_around(shield.body, poses[-1], nexts)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior)

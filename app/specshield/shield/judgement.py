@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, flat, is_place
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho_of, together
+from specshield.shield.surprise.recovery import given_up, most_kept, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
 
@@ -56,7 +57,13 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     if lowered or (care.has_slack and _some(best)):
         aimed = aim(shield, care, part, tried, kept, leaves)
         best, feasible = aimed.best, aimed.kept
-    some, first = bool(feasible.any()), tried.preferred
+    some, first, said = bool(feasible.any()), tried.preferred, tried.warnings
+    if recovers(shield.config):
+        said = (*said, *given_up(prefix)) if violated else said
+        if not some:
+            first, more = most_kept(shield, part, tried)
+            said = (*said, *more)
+        tried = replace(tried, warnings=said)
     if tail and feasible[tail[0]]:
         first = tail[0]
     elif some and not feasible[first]:

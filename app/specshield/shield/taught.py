@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Floats
 from specshield.robot.dynamics import Body, make_body, overlap
 from specshield.shield.caution.experience import was_stopped
-from specshield.shield.contact import Followed, cells_ahead, cells_under, contact_of
-from specshield.shield.decision import Carry, Shield
+from specshield.shield.decision import Carry, Config, Shield
+from specshield.shield.surprise.contact import Followed, cells_ahead, cells_under, contact_of
+from specshield.shield.uncertainty import Care
 from specshield.world.learned import (
     CONTACT,
     LearnedMap,
@@ -30,10 +31,15 @@ from specshield.world.learned import (
     revised,
 )
 
+AROUND = 12  # [steps] what a way around something 0.3 m wide takes, found by contact; chosen by hand
+DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand
 KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 UNDER = (
     0.03  # [m] a footprint that covers a cell by more than this shows it free: three times the usual noise
 )
+
+
+HEAD = struct.Struct("<h?h")  # what `Followed` holds
 
 
 @dataclass(frozen=True)
@@ -48,15 +54,14 @@ class Taught:
     contact: bool = False
 
     def to_bytes(self) -> bytes:
-        drawn, follows, halted = self.followed.drawn, self.followed.follows, self.followed.halted
-        return struct.pack("<h?h", drawn, follows, halted) + self.map.to_bytes()
+        followed = self.followed
+        return HEAD.pack(followed.drawn, followed.follows, followed.halted) + self.map.to_bytes()
 
     @staticmethod
     def from_bytes(value: bytes | None) -> Taught:
         if value is None:
             return Taught()
-        size = struct.calcsize("<h?h")
-        return Taught(LearnedMap.from_bytes(value[size:]), Followed(*struct.unpack("<h?h", value[:size])))
+        return Taught(LearnedMap.from_bytes(value[HEAD.size :]), Followed(*HEAD.unpack_from(value)))
 
 
 def teach(
@@ -84,17 +89,42 @@ def teach(
             known = learn(grid, known, t, cells_ahead(body, poses[-1], motion), True, CONTACT)
     beyond = 0
     for name, points in (("free", free), ("occupied", occupied)):  # what is both is taken for occupied
-        cells, outside = cells_of(grid, check_points(() if points is None else points, name))
-        known = learn(grid, known, t, cells, name == "occupied")
-        beyond += outside
+        if points is not None:
+            cells, outside = cells_of(grid, check_points(points, name))
+            known = learn(grid, known, t, cells, name == "occupied")
+            beyond += outside
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
-    return Taught(revised(before.map, known), followed, motion >= 0), said
+    own = known if known is before.map else revised(before.map, known)
+    return Taught(own, followed, motion >= 0), said
 
 
 def _between(poses: Floats) -> Floats:
     """The last pose, and the place half way to it: a motion goes straight on before it turns."""
     x, y, _ = 0.5 * (poses[-2] + poses[-1])
     return np.array([[x, y, poses[-2, 2]], poses[-1]])
+
+
+def wary(config: Config, care: Care) -> Care:
+    """What J asks for where the map may be wrong: time for a way around something that is not on it."""
+    if config.uncertainty is None or not config.learn_map:
+        return care
+    return replace(care, least=max(care.least, AROUND))
+
+
+def changes_map(learned: bytes | None) -> bool:
+    """Whether a session's map has ever changed. learned: as the carry has it."""
+    return learned is not None and len(learned) > HEAD.size
+
+
+def doubted(taught: Taught, t: int) -> Taught | None:
+    """Without the contacts that were made DOUBTED_AFTER steps ago or earlier; None where there are none.
+
+    What a motion ran into is an inference, and nothing that only runs into things ever sees that it is gone.
+    So where no other way is left, it is tried again.
+    """
+    known = taught.map
+    old = known.occupied & (known.by == CONTACT) & (t - known.step >= DOUBTED_AFTER)
+    return replace(taught, map=revised(known, forget(known, old))) if old.any() else None
 
 
 def on_map(shield: Shield, known: LearnedMap) -> Shield:

@@ -40,6 +40,7 @@ from specshield.rule.view import look, rate, view_of
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE
 from specshield.task import Task
+from specshield.world.occupancy import OccupancyGrid
 
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
 MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
@@ -84,6 +85,11 @@ class ReachabilityPolicy:
         code = self.tables.code
         highest = np.where(code == INVALID, 0, code).max(axis=(1, 2), initial=0)
         return np.asarray((highest - 1.0) / STEP_CODES, np.float64)
+
+    def remade(self, grid: OccupancyGrid) -> ReachabilityPolicy:
+        """The policy with tables for another map of the same size."""
+        made = synthesise(replace(self.task, grid=grid), self.settings)
+        return replace(self, tables=made.tables, narrow=made.narrow)
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A continuation after each first motion."""

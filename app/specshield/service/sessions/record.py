@@ -39,6 +39,7 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     values are there. all_witnesses: whether one was asked for each action.
 
     occupied, free: the points that were sent, two float64 each. explain: whether explanations were asked for.
+    tables: which the policies went by, as the digest of the map they were made for; None: their own.
 
     Answered: distribution, as `_sparse` has it. rows: for each action, which distinct row of the table is
     its own. table: each distinct row's J, rho and next pose (x, y, theta), as indices into `pool`, in one
@@ -79,6 +80,7 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     free: bytes | None
     explain: bool
     explanations: tuple[Explanation | None, ...]
+    tables: bytes | None = None
 
     def points_sent(self, kind: str) -> Floats | None:
         """[n, 2]: the `occupied` or `free` points that were sent; None where none were."""
@@ -144,6 +146,7 @@ def make(
     occupied: Floats | None = None,
     free: Floats | None = None,
     explain: bool = False,
+    tables: bytes | None = None,
 ) -> StepRecord:
     """The record of `decision`, made at step t and its stored `row` for a caller who sent what follows.
 
@@ -187,6 +190,7 @@ def make(
         free=None if free is None else free.astype("<f8").tobytes(),
         explain=explain,
         explanations=_explained(decision),
+        tables=tables,
     )
 
 

@@ -16,6 +16,7 @@ from specshield.lookahead.lookahead import AHEADS
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
+from specshield.service.heavy.tables import Tables
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
 from specshield.service.sessions import rules
@@ -38,6 +39,7 @@ class Shields:
         self._policies, self._shields = policies, files.Recent[Shield](room)
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
+        self.tables = Tables()
         self._preparing = ThreadPoolExecutor(1, "prepare")
         self._latest: Future[Preference] | None = None  # the last one that was asked for
 

@@ -37,6 +37,7 @@ from specshield.service.sessions.state import State, pack_carry
 from specshield.service.storage.store import Change, Store
 from specshield.shield import episode
 from specshield.shield.decision import Decision
+from specshield.shield.taught import Taught, changes_map
 from specshield.task import check_signals
 
 ROOM = 64 << 20  # bytes of sessions kept in memory, some 5,000 of them. Chosen by hand.
@@ -164,7 +165,7 @@ class Steps:
 
     async def _decide(self, session: Session, request: StepBody, timing: dict[str, float]) -> Decided:
         ids = tuple(session.config["policy_ids"])
-        if self._shields.slow(session):
+        if self._shields.slow(session) or _learns(session, request):
             made = await self._heavy.decide("step", session, request, session=session.id, key=ids)
             timing["rollout"] = timing.get("rollout", 0.0) + made[-1]
             return Decided(*made[:3])
@@ -201,6 +202,9 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), signals))
     carry = None if state.carry is None else state.carry.unpacked()
     occupied, free = points_of(request.occupied), points_of(request.free)
+    tables = None
+    if carry is not None and changes_map(carry.learned):
+        shield, tables = shields.tables.of(session.id, shield, Taught.from_bytes(carry.learned).map)
     since = session.since
     decision = episode.decide(
         shield,
@@ -229,8 +233,16 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
         occupied,
         free,
         request.explain,
+        tables,
     )
     return session, decision, made
+
+
+def _learns(session: Session, request: StepBody) -> bool:
+    """Whether the map is no longer as the policies were made for: then a step may take long."""
+    carry = session.state.carry
+    changed = carry is not None and changes_map(carry.learned)
+    return changed or bool(request.occupied) or bool(request.free)
 
 
 @contextmanager

@@ -40,9 +40,9 @@ def contact_of(
     foreseen [M, 3]: where f leads from `before`.
     """
     drawn = followed.drawn
+    if drawn >= 0 and _near(foreseen[drawn : drawn + 1], after)[0]:
+        return -1, followed if followed.halted < 0 else replace(followed, halted=-1)
     near = _near(foreseen, after)
-    if drawn >= 0 and near[drawn]:
-        return -1, replace(followed, halted=-1)
     if _near(before[None], after)[0]:  # it stands where it stood
         if drawn < 0 or not followed.follows:
             return -1, followed

@@ -1,0 +1,75 @@
+"""Tables for the maps that sessions learn, made beside their decisions and used when they are there.
+
+Until then, and on what the map has learned since, the ways around are searched for (reachability/around.py).
+Which tables a decision used is in its record, by the digest of the map that they were made for: so it can be
+decided again.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+from specshield.policy.reachability.policy import ReachabilityPolicy
+from specshield.service.library import files
+from specshield.shield.decision import Shield
+from specshield.shield.proposal import Proposer
+from specshield.world.learned import LearnedMap, applied
+
+ROOM = 64  # sessions whose tables are kept: about a megabyte each. Chosen by hand.
+
+
+@dataclass(frozen=True)
+class Made:
+    """A shield's policies, with the tables for a session's own map.
+
+    digest: of what that map has learned. policies: their ids.
+    """
+
+    digest: bytes
+    policies: tuple[str, ...]
+    proposers: tuple[Proposer, ...]
+
+
+class Tables:
+    """The newest tables of each session. One thread makes them, a session's at a time; kernels run without
+    the interpreter's lock.
+    """
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(1, "tables")
+        self._newest, self._making = files.Recent[Made](ROOM), files.Recent[Future[Made]](ROOM)
+
+    def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:
+        """The shield with the newest tables that there are for the session, and their digest, None where
+        there are none. Those for `known` are begun, unless others of the session are being made.
+        """
+        if not len(known) or not any(isinstance(each, ReachabilityPolicy) for each in shield.proposers):
+            return shield, None
+        making = self._making.peek(session)
+        if making is not None and making.done():
+            self._making.drop(session)
+            self._newest.drop(session)
+            made, making = making.result(), None
+            self._newest.get(session, lambda: made)
+        newest = self._newest.peek(session)
+        if newest is not None and newest.policies != _ids(shield):  # of a rule that is no longer in force
+            newest = None
+        if making is None and (newest is None or newest.digest != known.digest):
+            self._making.get(session, lambda: self._threads.submit(make, shield, known))
+        if newest is None:
+            return shield, None
+        return replace(shield, proposers=newest.proposers), newest.digest
+
+
+def make(shield: Shield, known: LearnedMap) -> Made:
+    """Makes them: seconds of work, the same wherever it is done."""
+    grid = applied(shield.task.grid, known)
+    proposers = tuple(
+        each.remade(grid) if isinstance(each, ReachabilityPolicy) else each for each in shield.proposers
+    )
+    return Made(known.digest, _ids(shield), proposers)
+
+
+def _ids(shield: Shield) -> tuple[str, ...]:
+    return tuple(each.id for each in shield.proposers)

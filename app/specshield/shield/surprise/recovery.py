@@ -1,0 +1,61 @@
+"""What to do where no future keeps the whole rule, and what the answer says of it.
+
+After a surprise, or once a part of the rule is lost, the other parts are kept: the safest first, which are
+those of the form G, then the soonest. Of the futures that keep as much, the one goes first that comes
+nearest to the first part that is given up: what was not found by a search may still turn out to be there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from specshield.robot.dynamics import simulate
+from specshield.rule.residual import left_over
+from specshield.rule.view import view_of
+from specshield.shield.decision import Config, Shield
+from specshield.shield.feasibility import Futures, Prefix, prefix_of, rho_of
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
+
+
+def recovers(config: Config) -> bool:
+    """Whether a session's world may be another than it was told: elsewhere all is as in the paper."""
+    return config.uncertainty is not None or config.learn_map
+
+
+def most_kept(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[int, tuple[str, ...]]:
+    """The first motion of the future that keeps most of `prefix.formula`, and a sentence for each part that
+    it gives up.
+    """
+    whole = np.empty_like(tried.poses)
+    for motions, poses in zip(tried.motions, whole, strict=True):
+        simulate(shield.body, prefix.poses[-1], motions, poses)
+    futures = replace(tried, poses=whole)
+    left, said = np.ones(len(tried.motions), np.bool_), list[str]()
+    nearest = np.zeros(len(tried.motions))
+    for part in sorted(conjuncts(prefix.formula), key=_order):
+        view = view_of(prefix.task, part)
+        rho, _ = rho_of(prefix_of(prefix.task, part, view, prefix.poses, prefix.signals), futures)
+        keeps = left & (rho > SATISFIED_ABOVE)
+        if keeps.any():
+            left = keeps
+            continue
+        nearest = nearest if said else rho
+        said.append(f"no way was found to keep {part}: the nearest misses it by {-rho[left].max():.3g}")
+    return int(tried.motions[int(np.argmax(np.where(left, nearest, -np.inf))), 0]), tuple(said)
+
+
+def given_up(prefix: Prefix) -> tuple[str, ...]:
+    """A sentence for each part of a violated rule that is lost."""
+    formula, t = prefix.formula, prefix.t
+    kept, broken = left_over(formula, prefix.task.samples(prefix.poses, prefix.signals), t)
+    lost = [part for part in conjuncts(formula) if part not in kept and part not in broken]
+    return (
+        *(f"{part} was not kept, and is given up" for part in lost),
+        *(f"{part} was broken, and is kept again as soon as it can be" for part in broken),
+    )
+
+
+def _order(part: Formula) -> tuple[bool, int]:
+    return not isinstance(part, Always), part.horizon

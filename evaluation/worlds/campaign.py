@@ -1,0 +1,84 @@
+"""Runs in worlds that are not as told, spread over processes and kept in a file each, and a table of them."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evaluation.statistics import clopper_pearson
+from evaluation.worlds.runs import Outcome, Trial, run
+
+HEAD = (
+    "| case | world | senses | kept of what the oracle can keep | 95 % interval | oracle | "
+    "changed the map, p50 / p99 [ms] | KL | slack |\n|---|---|---|---|---|---|---|--:|--:|"
+)
+
+
+def compare(trials: Sequence[Trial], runs: int, out: Path | None, processes: int) -> None:
+    """Prints a row of the table for each trial as it is done. out: a folder; what it holds is kept."""
+    print(HEAD, flush=True)
+    for trial in trials:
+        print(row(trial, outcomes(trial, runs, out, processes)), flush=True)
+
+
+def outcomes(trial: Trial, runs: int, out: Path | None, processes: int) -> list[Outcome]:
+    """Runs 0 to `runs` - 1 of a trial, those that were kept before among them."""
+    file = None if out is None else out / f"{'-'.join(str(value) for value in asdict(trial).values())}.jsonl"
+    done: dict[int, Outcome] = {}
+    if file is not None and file.exists():
+        kept = (Outcome(**json.loads(line)) for line in file.read_text().splitlines())
+        done = {outcome.run: outcome for outcome in kept}
+    for outcome in _made(trial, [i for i in range(runs) if i not in done], processes):
+        done[outcome.run] = outcome
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with open(file, "a") as lines:
+                lines.write(json.dumps(outcome.to_json()) + "\n")
+    return [done[i] for i in range(runs)]
+
+
+def _made(trial: Trial, missing: Sequence[int], processes: int) -> Iterator[Outcome]:
+    if processes == 1 or len(missing) < 2:
+        yield from (run(trial, i) for i in missing)
+        return
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        yield from pool.map(partial(run, trial), missing)
+
+
+def figures(found: Sequence[Outcome]) -> dict[str, Any]:
+    """kept: of `could`, the runs that the oracle can keep. low, high: the 95 % interval of their share.
+    p50, p99 [ms]: of all decisions that changed the map. kl [nats]: of a run from the model's own, the mean.
+    """
+    could = [outcome for outcome in found if outcome.could]
+    kept = sum(outcome.kept for outcome in could)
+    low, high = clopper_pearson(kept, len(could)) if could else (0.0, 1.0)
+    spent = [ms for outcome in found for ms in outcome.changed_ms]
+    p50, p99 = np.percentile(spent, [50, 99]).round(1).tolist() if spent else (None, None)
+    return {
+        "kept": kept,
+        "could": len(could),
+        "runs": len(found),
+        "low": low,
+        "high": high,
+        "p50": p50,
+        "p99": p99,
+        "kl": float(np.mean([outcome.kl for outcome in found])),
+    }
+
+
+def row(trial: Trial, found: Sequence[Outcome]) -> str:
+    got = figures(found)
+    slack = "learned" if trial.uncertain else str(trial.slack)
+    return (
+        f"| {trial.case} | {trial.world} | {trial.sensing} | {got['kept']} of {got['could']} | "
+        f"{100 * got['low']:.1f} to {100 * got['high']:.1f} % | {got['could']} of {got['runs']} | "
+        f"{got['p50']} / {got['p99']} | {got['kl']:.0f} | {slack} |"
+    )
