@@ -14,10 +14,14 @@ def evaluate(
     runs: Annotated[int, typer.Option(help="Runs, each by every method.", min=1)] = 100,
     seed: Annotated[int, typer.Option(help="Decides starts, model, draws and noise.", min=0)] = 0,
     methods: Annotated[
-        str, typer.Option(help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps.")
+        str,
+        typer.Option(
+            help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps; NAME@default: as a "
+            "session is by default; NAME@episode/D, NAME@default/D: threshold D over the episode."
+        ),
     ] = "",
     noise: Annotated[
-        str, typer.Option(help="none, gaussian, slip, obstacle, shift, collider; or some.")
+        str, typer.Option(help="none, gaussian, rough, slip, obstacle, shift, collider; or some.")
     ] = "none",
     model: Annotated[str, typer.Option(help="The model that is to be kept to the rule.")] = "learned",
     house: Annotated[

@@ -34,6 +34,12 @@ CERTIFYING = ("simplex", "paper", "ours", "lookahead")
 CAREFUL = ("simplex", "paper", "ours", "lookahead")  # NAME@M/K: a margin of M metres, K steps of slack
 
 
+SESSIONS = {  # NAME@default: what a session is where nobody says anything; /D after either: a threshold
+    "default": Config(uncertainty=Uncertainty(), learn_map=True),
+    "episode": Config(),
+}
+
+
 @dataclass(frozen=True)
 class Experiment:
     """One campaign's conditions; with the number of a run they decide everything that is random in it.
@@ -176,10 +182,13 @@ def split(method: str) -> tuple[str, Config]:
         )
     if not at:
         return kind, Config()
-    if asked == "default" and kind in CAREFUL:
-        return kind, Config(uncertainty=Uncertainty(), learn_map=True)
     metres, _, steps = asked.partition("/")
     try:
+        if metres in SESSIONS and kind in CAREFUL:
+            session = SESSIONS[metres]
+            if steps:
+                session = replace(session, threshold=float(steps), threshold_over="episode")
+            return kind, session
         margin, slack = float(metres), int(steps or 0)
     except ValueError:
         margin, slack = math.nan, 0

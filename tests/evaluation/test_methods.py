@@ -89,7 +89,7 @@ def test_simplex_runs_the_models_own_action_wherever_it_is_feasible():
         feasible = CELLS.feasible(history)
         for _ in range(40):
             logits, draw = 2.0 * random.normal(size=5), random.random()
-            method.begin()
+            method.begin(0)
             answer = method.act(history, logits, draw)
             prior = np.exp(log_softmax(logits))
             own = drawn(prior, draw)

@@ -23,7 +23,7 @@ CHANCE = 0.01  # that margin and slack do not suffice in an episode: half of it 
 MENDED = (
     0.1  # [rad] a heading that is off by this costs a motion to mend; a Stretch's smallest turn is 6 degrees
 )
-HARDER = 2.0  # times the noise itself: what it costs in motions (measured by `evaluation uncertain`)
+HARDER = 2.0  # times the noise itself: what it costs in motions (docs/uncertainty.md)
 
 
 @dataclass(frozen=True)
