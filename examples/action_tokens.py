@@ -61,6 +61,7 @@ def say_action(model: Any, prompt: Any, session: Any, pose: Any) -> tuple[int, A
 
 def run(episodes: int) -> int:
     """In how many of them the rule is kept."""
+    torch.set_num_threads(1)  # the model is tiny
     shield = LocalShield.make(OccupancyGrid(np.zeros((40, 40), bool), 0.1), RULE, REGIONS, robot=ROBOT)
     kept = 0
     for seed in range(episodes):

@@ -41,7 +41,7 @@ def test_a_server_decides_the_same_to_the_bit(server: RunningServer, settings: d
     """A whole episode with a model that wanders, ends its task, and a robot that does not land exactly."""
     options = {"initial_pose": START, "max_steps": 150, **settings}
     random = np.random.default_rng(7)
-    with ShieldClient(server.url, timeout=30.0) as client:
+    with ShieldClient(server.url, timeout=300.0) as client:
         remote = client.sessions.create(policy_id="case1", **options)
         local = LocalShield.shipped("case1").session(**options)
         assert replace(remote.info, id="", expires_at="", map_id="", spec={}, rules=()) == replace(

@@ -22,12 +22,12 @@ def export(
     to: Annotated[
         Literal["mcap", "csv", "parquet", "rrd"], typer.Option(help="mcap opens in Foxglove, rrd in Rerun.")
     ],
-    out: Annotated[Path | None, typer.Option(help="[default: the session's id with the ending]")] = None,
+    out: Annotated[Path | None, typer.Option(help="By default the session's id with the ending.")] = None,
     url: Annotated[str, typer.Option(help="The server that keeps the session.")] = "http://127.0.0.1:8000",
     api_key: Annotated[
-        str | None, typer.Option(envvar="SPECSHIELD_API_KEY", help="Where it asks for one.")
+        str | None, typer.Option(envvar="SPECSHIELD_API_KEY", help="Its key, where it asks for one.")
     ] = None,
-    step_seconds: Annotated[float, typer.Option(help="How long a step took [s].", min=1e-3)] = 1.0,
+    step_seconds: Annotated[float, typer.Option(help="How long a step took, in seconds.", min=1e-3)] = 1.0,
 ) -> None:
     """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun; needs the extra `recordings`."""
     from specshield.client import ShieldClient
