@@ -165,12 +165,13 @@ class Steps:
 
     async def _decide(self, session: Session, request: StepBody, timing: dict[str, float]) -> Decided:
         ids = tuple(session.config["policy_ids"])
-        if self._shields.slow(session) or _learns(session, request):
+        if self._shields.slow(session):
             made = await self._heavy.decide("step", session, request, session=session.id, key=ids)
             timing["rollout"] = timing.get("rollout", 0.0) + made[-1]
             return Decided(*made[:3])
+        learns = _learns(session, request)
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
-        if pace.short:  # asking for the thread's own time would cost a tenth of the step
+        if pace.short and not learns:  # asking for the thread's own time would cost a tenth of the step
             begun, cpu = time.perf_counter(), None
             made = decided(self._shields, session, request)
             seconds = time.perf_counter() - begun
@@ -180,9 +181,10 @@ class Steps:
                 self._threads, timed, self._shields, session, request
             )
         timing["rollout"] = timing.get("rollout", 0.0) + seconds
-        pace.add(seconds, cpu)
-        if pace.long:
-            self._shields.note_slow(session)
+        if not learns:  # what a map that changed costs says nothing of other sessions of the policy
+            pace.add(seconds, cpu)
+            if pace.long:
+                self._shields.note_slow(session)
         return Decided(*made)
 
 
