@@ -20,11 +20,13 @@ from specshield.policy.dqn.network import make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability.policy import synthesise
+from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.shield import episode
-from specshield.shield.decision import make_shield
+from specshield.shield.decision import Config, make_shield
+from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -50,12 +52,18 @@ def _propose(task: Task) -> None:
 
 
 def _decide(task: Task) -> None:
-    """What the shield takes to begin a session and to decide, with a DQN that proposes."""
+    """What the shield takes to begin a session, to decide and to refuse, with a DQN that proposes: in a world
+    that is as told, and by a session's defaults.
+    """
     policy = Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))
-    shield, logits = make_shield([policy]), np.zeros(len(STRETCH.actions))
-    episode.start(shield, START)
-    first = episode.decide(shield, [START], logits)
-    episode.decide(shield, [START, first.next_poses[0].tolist()], logits, carry=first.carry)
+    logits = np.zeros(len(STRETCH.actions))
+    for config in (Config(), Config(uncertainty=Uncertainty(), learn_map=True)):
+        shield = make_shield([policy], config)
+        episode.start(shield, START)
+        first = episode.decide(shield, [START], logits)
+        second = [START, first.next_poses[0].tolist()]
+        episode.decide(shield, second, logits, carry=first.carry, occupied=[[1.9, 0.5]], explain=True)
+    refusal(shield, np.array([START]), {})
 
 
 PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
