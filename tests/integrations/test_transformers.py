@@ -97,4 +97,4 @@ def test_what_cannot_work_is_refused(model: Any) -> None:
 
 
 def test_a_model_that_says_anything_keeps_the_rule_in_every_episode() -> None:
-    assert action_tokens.run(20) == 20  # the example with 100 as its argument: 100
+    assert action_tokens.run(20) == 20
