@@ -101,7 +101,6 @@ def test_the_hash_is_of_all_that_matters_and_nothing_else():
     [
         ({"formula": "F[0,3] Nowhere"}, FormulaError, None),
         ({"formula": "F[0,3] (A"}, FormulaError, None),
-        ({"formula": "A"}, FormulaError, "formula"),
         ({"formula": "F[0,1001] A"}, HorizonError, None),
         ({"regions": {"A": {**DISC, "radius": -1}}}, MapError, "regions.A.radius"),
         ({"regions": {"x": DISC}}, MapError, "regions.x"),

@@ -304,7 +304,17 @@ def test_the_public_names():
     ]
     assert all(hasattr(specshield.client, name) for name in specshield.client.__all__)
     public = {name for name in vars(sync.Session) | vars(sync.SessionState) if not name.startswith("_")}
-    assert public == {"step", "record", "unsent", "trajectory", "save_record", "events", "close", "id"}
+    assert public == {
+        "step",
+        "record",
+        "unsent",
+        "trajectory",
+        "save_record",
+        "events",
+        "close",
+        "switch",
+        "id",
+    }
 
 
 def test_importing_the_client_brings_httpx_and_nothing_heavy():

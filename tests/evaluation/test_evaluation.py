@@ -302,7 +302,6 @@ def test_a_procthor_house_comes_from_a_folder_of_the_users(tmp_path):
         (lambda: Experiment("house", "nowhere").setting, "house"),
         (lambda: EXPERIMENT.setting.method("magic"), "methods"),
         (lambda: EXPERIMENT.setting.method("ours@much"), "methods"),
-        (lambda: EXPERIMENT.setting.method("paper@0.1"), "methods"),
         (lambda: EXPERIMENT.setting.method("ours@-1"), "margin"),
     ],
 )

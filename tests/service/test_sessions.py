@@ -300,7 +300,7 @@ def test_listing_by_pages_finds_each_once(client, begin):
 def test_the_draw_is_the_seeds(begin, step):
     draws = []
     for seed in (1, 1, 2, 3, 4, 5):
-        session = begin(seed=seed)
+        session = begin(seed=seed, uncertainty="none")  # which leaves every action allowed
         draws.append([step(session, t, [START]).json()["action"] for t in range(3)])
     assert draws[0] == draws[1]
     assert len({tuple(draw) for draw in draws}) > 1

@@ -246,8 +246,10 @@ def install(app: FastAPI) -> None:
         return response(errors.InsufficientStorage("the server's disk is full", expected="a disk with room"))
 
     async def unknown(request: Request, error: Exception) -> Response:
-        # The traceback goes to the log: starlette raises the error again after this answer.
-        return response(errors.ServerError("the server failed on this request; its log says more"))
+        # The traceback goes to the log: starlette raises the error again after this answer, and uvicorn then
+        # closes the connection, which the caller has to know before it asks there again.
+        failed = errors.ServerError("the server failed on this request; its log says more")
+        return response(failed, {"Connection": "close"})
 
     app.add_exception_handler(SpecshieldError, known)
     app.add_exception_handler(RequestValidationError, invalid)

@@ -81,7 +81,12 @@ class Sessions:
                 preference = await asyncio.shield(asyncio.wrap_future(preparing))
             except FragmentError as error:
                 raise refused(request.shaping, error) from None
-        config, feasible, status, rows = await self._begun(request, settings, preference, key.name)
+        ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
+        try:
+            config, feasible, status, rows = await self._begun(request, settings, preference, key.name)
+        except Exception:  # whatever was wrong with a policy that has been deleted meanwhile, it is not there
+            await self._run(self._policies.still_there, ids, key.name)
+            raise
         content = files.to_json(config)
         state = State(1, 0, feasible, status, self._expiry(), record.digest(content))
         stored_as = scoped(key.name, config["id"])
