@@ -104,6 +104,7 @@ def test_a_server_that_never_answers_costs_a_bounded_time(use):
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(errors.TransportTimeout) as caught:
             use(url, validate, timeout=0.1)
+        # Five is what is promised; fewer are made where the calls' own time is used up on a busy machine.
         assert 1 <= caught.value.details["tries"] <= 5
 
 

@@ -17,7 +17,8 @@ pytest.importorskip("minigrid")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from examples import minigrid_rooms  # noqa: E402
-from specshield.errors import RobotError  # noqa: E402
+from specshield.errors import InfeasibleStart, RobotError  # noqa: E402
+from specshield.integrations import minigrid  # noqa: E402
 from specshield.integrations.gymnasium import ShieldWrapper  # noqa: E402
 from specshield.local import LocalShield  # noqa: E402
 from specshield.sim.cases import load_case  # noqa: E402
@@ -60,7 +61,12 @@ def test_the_bot_does_its_mission_within_the_rule() -> None:
 
 
 def test_the_checker_of_gymnasium_passes() -> None:
-    env = minigrid_rooms.maze(minigrid_rooms.chance)
+    """It draws mazes of its own, and in one of a hundred a thing lies in front of the only door of a room."""
+    maze = gymnasium.make(
+        "BabyAI-GoToObjMazeOpen-v0", room_size=6, num_rows=2, num_cols=2, max_steps=120,
+        disable_env_checker=True,
+    )  # fmt: skip
+    env = minigrid.shielded(maze, minigrid_rooms.RULE, allow_infeasible=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*(different from the unwrapped|spec is None|render).*")
@@ -74,6 +80,12 @@ def test_the_example() -> None:
     bot, chance = done.stdout.splitlines()
     assert bot == "the bot: the rule was kept in 2 of 2 episodes, the mission done in 2"
     assert chance.startswith("a model that draws at random: the rule was kept in 2 of 2 episodes")
+
+
+def test_a_maze_in_which_the_rule_cannot_be_kept_is_refused() -> None:
+    """In the maze of seed 378 a key lies behind the only door of Room_0_0."""
+    with pytest.raises(InfeasibleStart, match=r"F\[0,40\] Room_0_0 was not found to be kept even alone"):
+        minigrid_rooms.maze(minigrid_rooms.chance).reset(seed=378)
 
 
 class House(gymnasium.Env[Any, Any]):

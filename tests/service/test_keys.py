@@ -157,6 +157,7 @@ def test_the_rate_of_a_key_leaves_its_robots_room(keyed):
             assert session.status_code == 201, session.text
             refused = client.get("/v1/maps")
         told = problem(refused, 429, "rate-limited")
+        # At 0.1 a second the next request has its turn within 10 s, told in whole seconds.
         assert 1 <= int(refused.headers["retry-after"]) == told["retry_after"] <= 10
         step = {"t": 0, "poses": [[0.9, 5.0, 0.0]], "logits": [0.0] * 20}
         assert busy.post("/v1/sessions/robot/steps", json=step).status_code == 200

@@ -13,15 +13,14 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.drawing.svg import Plan
-from specshield.errors import PolicyError
-from specshield.robot.dynamics import in_collision, make_body, step
+from specshield.errors import InfeasibleStart, PolicyError, PoseError
+from specshield.robot.dynamics import make_body, step
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.library.policies import Description
 from specshield.service.sessions import record
 from specshield.service.settings import Settings
 from specshield.shield.decision import Shield, make_shield
-from specshield.shield.feasibility import futures, prefix_of
-from specshield.stl import SATISFIED_ABOVE
+from specshield.shield.episode import start
 from specshield.task import Task
 
 # Chosen by hand; a start takes some 0.4 ms.
@@ -119,12 +118,14 @@ def _kept_on_grid(shield: Shield, pitch: float, deadline: float) -> Floats | Non
 
 
 def _can_be_kept(shield: Shield, pose: Floats) -> bool | None:
-    """Whether an episode may begin there, as `episode.start` has it; None where the robot does not fit."""
-    if in_collision(shield.body, *pose):
+    """Whether an episode may begin there; None where the robot does not fit."""
+    try:
+        start(shield, pose.tolist())
+    except PoseError:
         return None
-    prefix = prefix_of(shield.task, shield.task.formula, shield.view, pose[None], {})
-    tried = futures(prefix, shield.body, shield.proposers, None, shield.config.margin)
-    return bool(tried.rho.max(initial=-np.inf) > SATISFIED_ABOVE)
+    except InfeasibleStart:
+        return False
+    return True
 
 
 def _continuation(task: Task, row: Floats, decided: record.StepRecord) -> Floats:

@@ -7,15 +7,19 @@ decided again.
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+from specshield.errors import SpecshieldError
 from specshield.policy.reachability.policy import ReachabilityPolicy
 from specshield.service.library import files
 from specshield.shield.decision import Shield
 from specshield.shield.proposal import Proposer
 from specshield.world.learned import LearnedMap, applied
+from specshield.world.occupancy import OccupancyGrid
 
+log = logging.getLogger("specshield")
 ROOM = 64  # sessions whose tables are kept: about a megabyte each. Chosen by hand.
 
 
@@ -65,10 +69,18 @@ class Tables:
 def make(shield: Shield, known: LearnedMap) -> Made:
     """Makes them: seconds of work, the same wherever it is done."""
     grid = applied(shield.task.grid, known)
-    proposers = tuple(
-        each.remade(grid) if isinstance(each, ReachabilityPolicy) else each for each in shield.proposers
-    )
-    return Made(known.digest, _ids(shield), proposers)
+    return Made(known.digest, _ids(shield), tuple(_remade(each, grid) for each in shield.proposers))
+
+
+def _remade(proposer: Proposer, grid: OccupancyGrid) -> Proposer:
+    """The policy itself where it has no tables, or none can be made for this map."""
+    if not isinstance(proposer, ReachabilityPolicy):
+        return proposer
+    try:
+        return proposer.remade(grid)
+    except SpecshieldError as error:
+        log.warning("policy %s keeps its tables on a session's own map: %s", proposer.id, error)
+        return proposer
 
 
 def _ids(shield: Shield) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from pydantic import ConfigDict, Field, JsonValue, model_validator
 
@@ -37,8 +37,8 @@ class KnownUncertainty(Strict):
 Uncertain = Literal["learned", "none"] | KnownUncertainty
 
 
-class SessionRequest(Strict):
-    model_config = ConfigDict(json_schema_extra={"examples": [examples.SESSION]})
+class _Policies(Strict):
+    """What names one policy, or several for one task."""
 
     policy_id: Id | None = Field(None, description="Id or name of the policy.")
     policy_ids: list[Id] | None = Field(
@@ -48,6 +48,21 @@ class SessionRequest(Strict):
         fail_fast=True,
         description="Several policies for one task: an action is feasible if any says so.",
     )
+
+    @model_validator(mode="after")
+    def _one_way_to_name_policies(self) -> Self:
+        if (self.policy_id is None) == (self.policy_ids is None):
+            raise ValueError("exactly one of policy_id and policy_ids")
+        return self
+
+    @property
+    def policies(self) -> list[str]:
+        return self.policy_ids or [str(self.policy_id)]
+
+
+class SessionRequest(_Policies):
+    model_config = ConfigDict(json_schema_extra={"examples": [examples.SESSION]})
+
     initial_pose: Pose = Field(description="x_0: [m, m, rad], map frame; inside the map and free.")
     id: Id | None = Field(None, description="An id of your own; the server makes one up otherwise.")
     seed: int = Field(0, ge=0, lt=2**63, description="`action` is drawn from the seed and t.")
@@ -98,25 +113,11 @@ class SessionRequest(Strict):
         "step", description="Whether `threshold` holds at each step, or for the episode as a whole."
     )
 
-    @model_validator(mode="after")
-    def _one_way_to_name_policies(self) -> SessionRequest:
-        if (self.policy_id is None) == (self.policy_ids is None):
-            raise ValueError("exactly one of policy_id and policy_ids")
-        return self
 
-    @property
-    def policies(self) -> list[str]:
-        return self.policy_ids or [str(self.policy_id)]
-
-
-class SwitchRequest(Strict):
+class SwitchRequest(_Policies):
     model_config = ConfigDict(json_schema_extra={"examples": [examples.SWITCH]})
 
     t: int = Field(ge=0, le=1_000_000, description="The first step that the new rule decides.")
-    policy_id: Id | None = Field(None, description="Id or name of the policy.")
-    policy_ids: list[Id] | None = Field(
-        None, min_length=1, max_length=8, fail_fast=True, description="Several policies for one task."
-    )
     clock: Literal["keep", "restart"] = Field(
         "keep",
         description="`keep`: the new rule's windows count from where those of the present one do, at first "
@@ -130,16 +131,6 @@ class SwitchRequest(Strict):
         description="Ends with x_t, joined as in a step. Without it, x_t is taken to be where the action of "
         "the last decision leads.",
     )
-
-    @model_validator(mode="after")
-    def _one_of_both(self) -> SwitchRequest:
-        if (self.policy_id is None) == (self.policy_ids is None):
-            raise ValueError("exactly one of policy_id and policy_ids")
-        return self
-
-    @property
-    def policies(self) -> list[str]:
-        return self.policy_ids or [str(self.policy_id)]
 
 
 class SessionRule(Answer):

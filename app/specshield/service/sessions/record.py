@@ -196,35 +196,15 @@ def make(
 
 def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
     """What the caller is answered: to the byte as `answer` has it of the record, in a third of the time."""
-    asked: dict[str, Any] = {}
-    if explain:
-        asked["explanations"] = _explained(decision)
-    if all_witnesses:
-        asked["witnesses"] = tuple(None if w is None else list(w) for w in decision.witnesses)
-    return StepAnswer(
-        t=decision.t,
-        mode=decision.mode,
-        distribution=decision.distribution.tolist(),
+    return _answer(
+        decision,
+        action_name=decision.action_name,
+        distribution=decision.distribution,
         j_values=list(decision.j_values),
         robustness=list(decision.robustness),
-        action=decision.action,
-        action_name=decision.action_name,
-        completion_action=decision.completion_action,
-        spec_status=decision.spec_status,
-        feasible_mass=decision.feasible_mass,
-        kl=decision.kl,
-        reason=decision.reason,
-        finished=decision.finished,
-        next_poses=decision.next_poses.tolist(),
-        residual=None if decision.residual is None else Residual(*decision.residual),
-        in_collision=decision.in_collision,
-        witness=None if decision.witness is None else list(decision.witness),
-        warnings=decision.warnings,
-        margin=decision.margin,
-        slack=decision.slack,
-        threshold_left=decision.threshold_left,
-        map_revision=decision.map_revision,
-        **asked,
+        next_poses=decision.next_poses,
+        explanations=_explained(decision) if explain else None,
+        all_witnesses=all_witnesses,
     )
 
 
@@ -238,34 +218,60 @@ def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
 def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
     """What the caller was answered. row: the stored one of this step; names: of the actions."""
     table = _unpack_table(record, row)
-    asked: dict[str, Any] = {}
-    if record.explain:
-        asked["explanations"] = record.explanations
-    if record.all_witnesses:
-        asked["witnesses"] = tuple(None if w is None else list(w) for w in record.witnesses)
-    return StepAnswer(
-        t=record.t,
-        mode=record.mode,
-        distribution=_full(record.distribution, len(record.rows)).tolist(),
+    return _answer(
+        record,
+        action_name=names[record.action],
+        distribution=_full(record.distribution, len(record.rows)),
         j_values=[None if value != value else value for value in table[:, 0].tolist()],
         robustness=[None if value != value else value for value in table[:, 1].tolist()],
-        action=record.action,
-        action_name=names[record.action],
-        completion_action=record.completion_action,
-        spec_status=record.spec_status,
-        feasible_mass=record.feasible_mass,
-        kl=record.kl,
-        reason=record.reason,
-        finished=record.finished,
-        next_poses=table[:, 2:].tolist(),
-        residual=None if record.residual is None else Residual(*record.residual),
-        in_collision=record.in_collision,
-        witness=None if record.witness is None else list(record.witness),
-        warnings=record.warnings,
-        margin=record.margin,
-        slack=record.slack,
-        threshold_left=record.threshold_left,
-        map_revision=record.map_revision,
+        next_poses=table[:, 2:],
+        explanations=record.explanations if record.explain else None,
+        all_witnesses=record.all_witnesses,
+    )
+
+
+def _answer(
+    made: Decision | StepRecord,
+    action_name: str,
+    distribution: Floats,
+    j_values: list[float | None],
+    robustness: list[float | None],
+    next_poses: Floats,
+    explanations: tuple[Explanation | None, ...] | None,
+    all_witnesses: bool,
+) -> StepAnswer:
+    """Of a decision or its record; what follows `made` are the members that the two hold in different forms.
+
+    distribution [A], next_poses [A, 3]; explanations: None where they were not asked for.
+    """
+    asked: dict[str, Any] = {}
+    if explanations is not None:
+        asked["explanations"] = explanations
+    if all_witnesses:
+        asked["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
+    return StepAnswer(
+        t=made.t,
+        mode=made.mode,
+        distribution=distribution.tolist(),
+        j_values=j_values,
+        robustness=robustness,
+        action=made.action,
+        action_name=action_name,
+        completion_action=made.completion_action,
+        spec_status=made.spec_status,
+        feasible_mass=made.feasible_mass,
+        kl=made.kl,
+        reason=made.reason,
+        finished=made.finished,
+        next_poses=next_poses.tolist(),
+        residual=None if made.residual is None else Residual(*made.residual),
+        in_collision=made.in_collision,
+        witness=None if made.witness is None else list(made.witness),
+        warnings=made.warnings,
+        margin=made.margin,
+        slack=made.slack,
+        threshold_left=made.threshold_left,
+        map_revision=made.map_revision,
         **asked,
     )
 
