@@ -131,7 +131,9 @@ def digest(decision: Decision) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-LATER = ("carry", "warnings", "margin", "slack", "threshold_left", "map_revision", "explanations")
+LATER = (
+    "carry", "warnings", "margin", "slack", "threshold_left", "map_revision", "any_signal", "explanations",
+)  # fmt: skip
 FIELDS = sorted(each.name for each in fields(Decision) if each.name not in LATER)
 
 

@@ -70,6 +70,7 @@ def decisions(draw):
         slack=draw(st.integers(0, 1000)),
         threshold_left=draw(number),
         map_revision=draw(st.integers(0, 1000)),
+        any_signal=draw(st.sampled_from([None, True, False])),
         explanations=holes(
             [Explanation("F[0,9] A", draw(number), draw(st.none() | st.integers(1, 9)))] * count
         )
@@ -99,6 +100,8 @@ def expected(decision, every, explain):
     }
     if not every:
         del shown["witnesses"]
+    if decision.any_signal is None:
+        del shown["any_signal"]
     if not explain:
         del shown["explanations"]
     return msgspec.to_builtins(shown, enc_hook=lambda array: array.tolist())

@@ -42,7 +42,7 @@ def test_whenever_the_event_rises_the_robot_is_soon_safe(server, client):
     """It rises at a random step, falls once the robot is in Safe, and rises again. The model is noise."""
     formula = f"G[0,{UNTIL}] (event > 0.5 -> F[0,{WITHIN}] Safe)"
     policy = make(server, client, formula, {"Safe": SAFE}, {"event": 0.0})
-    assert policy.metrics["feasible_start"] > 0.9
+    assert 1.0 >= policy.metrics["feasible_start"] >= policy.metrics["feasible_start_any_signal"] > 0.9
     assert client.policies.get(policy.id).status == "ready"
     chance = random.Random(4)
     for seed in range(3):
@@ -59,7 +59,9 @@ def test_whenever_the_event_rises_the_robot_is_soon_safe(server, client):
                 logits = [chance.gauss(1.0, 1.0), *(chance.gauss(0.0, 2.0) for _ in range(3)), None]
                 decision = session.step(pose, logits, signals={"event": event})
                 assert decision.reason is None
+                assert decision.any_signal, "so it was promised at the start"
                 pose = decision.next_poses[decision.execute]
+            assert httpx.get(f"{server.url}/v1/sessions/{session.id}").json()["any_signal"] is True
             safe.append(is_safe(pose))
             assert session.close(pose).spec_status == "satisfied"
         risen = [t for t in range(UNTIL + 1) if events[t] > 0.5]

@@ -75,6 +75,7 @@ class SessionInfo:
     finished: bool
     expires_at: str
     margin: float = 0.0
+    any_signal: bool | None = None  # whether the rule is kept whatever the signals do
     rules: tuple[Mapping[str, Any], ...] = ()  # by the contract's names; the last is in force
 
 
@@ -160,6 +161,7 @@ class Decision:
     slack: int = 0  # [steps] that J asked to keep in hand
     threshold_left: float = 1.0  # of the next step
     map_revision: int = 0  # how often the session's own map has changed
+    any_signal: bool | None = None  # whether the rule is kept whatever the signals do from here on
     explanations: tuple[Explanation | None, ...] | None = None  # of each forbidden action, if asked for
     action_names: tuple[str, ...] = field(default=(), repr=False)
     source: Literal["service"] = "service"

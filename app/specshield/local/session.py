@@ -30,7 +30,7 @@ from specshield.shield.decision import Carry, Shield
 from specshield.task import Task, check_signals
 
 OWN = ("execute", "timings", "source", "action_names")  # what the SDK adds to the answer of the contract
-ASKED = ("witnesses", "explanations")  # what an answer has where it was asked for
+ASKED = ("witnesses", "explanations", "any_signal")  # what an answer has where there is something to say
 
 
 class LocalSession:

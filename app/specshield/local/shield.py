@@ -25,6 +25,7 @@ from specshield.robot import Robot, robot_from_json
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
 from specshield.shield.proposal import Proposer
+from specshield.shield.signals import any_signal
 from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task, parse_regions
@@ -160,7 +161,7 @@ class LocalShield:
         known = (
             (Uncertainty() if told == "learned" else None) if isinstance(told, str) else Uncertainty(**told)
         )
-        shield = replace(self.shield, config=Config(**settings, uncertainty=known))
+        shield = replace(self.shield, config=Config(**settings, uncertainty=known, any_signal=told != "none"))
         if shaping != PROJECTION:
             check_preferring(shield.config)
             shield = replace(shield, preference=self._preference(shaping))
@@ -182,6 +183,7 @@ class LocalShield:
             finished=False,
             expires_at="",
             margin=shield.config.margin,
+            any_signal=any_signal(shield, np.array([pose], np.float64)),
         )
         return LocalSession(shield, info, pose)
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from specshield.arrays import Floats
 from specshield.errors import MapError
 from specshield.policy.dqn.environment import free_poses
-from specshield.policy.reactions import calls, withstands
 from specshield.reasons.bound import contradiction
 from specshield.reasons.relaxation import way
-from specshield.shield.decision import make_shield
+from specshield.rule.worst import worst_signals
+from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.explanation import samples_of, values_of
 from specshield.shield.proposal import Proposer
+from specshield.shield.signals import any_signal
 from specshield.stl import SATISFIED_ABOVE
 
 STARTS = 16  # poses that a new policy is tried from. Chosen by hand: as with all of it, a second or two
@@ -39,13 +43,27 @@ def notices(policy: Proposer) -> tuple[str, ...]:
         )
     if len(refused) == STARTS:
         return (f"no future that satisfies the formula was found from any of {STARTS} random starts",)
-    if calls(policy):
-        kept = sum(withstands(shield, policy, pose) for pose in poses)
+    return _of_signals(shield, poses, STARTS - len(refused)) if task.signals else ()
+
+
+def _of_signals(shield: Shield, poses: Floats, silent: int) -> tuple[str, ...]:
+    """What is said of a rule that signals may make harder. silent: of how many starts it is kept if they stay
+    as they are.
+    """
+    if worst_signals(shield.task) is None:
         return (
-            "feasible_start is for signals that stay as they are; where they rise at the worst moment of the "
-            f"policy's own way, the rule can still be kept from {kept} of {STARTS} random starts",
+            "nothing can be said of signals that change: the formula compares signals with the pose, or "
+            "asks for things that no values of the signals ask for together; the rule is kept if they stay "
+            "as they are",
         )
-    return ()
+    asked = replace(shield, config=Config(any_signal=True))
+    kept = sum(any_signal(asked, pose[None]) is True for pose in poses)
+    if kept == silent:
+        return ()
+    return (
+        f"whatever the signals do, the rule can be kept from {kept} of {STARTS} random starts; from "
+        f"{silent}, which is what feasible_start counts, if they stay as they are",
+    )
 
 
 def _kept(policy: Proposer, pose: np.ndarray) -> bool:

@@ -36,7 +36,9 @@ class Config:
     uncertainty: None takes f for exact, as the paper does; else margin and slack follow from what is known
     and learned of the robot, and those given are the least that is kept. threshold_over: whether delta holds
     at each `step` or over the whole `episode`. learn_map: whether a motion that stops short marks what it
-    ran into. map_memory: for how many steps an `occupied` point stays [steps]; None: for ever.
+    ran into. map_memory: for how many steps an `occupied` point stays [steps]; None: for ever. any_signal: J
+    asks that the rule be kept whatever the signals do, where some action has that; else, and without it, that
+    it be kept if they stay as they are, as in the paper.
     """
 
     threshold: float = 1.0
@@ -49,6 +51,7 @@ class Config:
     threshold_over: ThresholdOver = "step"
     learn_map: bool = False
     map_memory: int | None = None
+    any_signal: bool = False
 
     def __post_init__(self) -> None:
         if self.evaluation not in ("feasibility", "robustness"):
@@ -193,8 +196,10 @@ class Decision:
     action. warnings: what did not go as it should, such as a policy that was not used.
 
     margin [m], slack [steps]: what J asked for at this step. threshold_left: delta of the next step.
-    map_revision: how often the session's map has changed. explanations: one an action, None where it is
-    allowed; empty where they were not asked for.
+    map_revision: how often the session's map has changed. any_signal: whether every action that J allows has
+    a future that keeps the rule whatever the signals do from here on; None where that was not asked, or the
+    rule reads no signals. explanations: one an action, None where it is allowed; empty where they were not
+    asked for.
     """
 
     t: int
@@ -220,5 +225,6 @@ class Decision:
     slack: int
     threshold_left: float
     map_revision: int
+    any_signal: bool | None
     explanations: tuple[Explanation | None, ...]
     carry: Carry

@@ -31,10 +31,10 @@ from specshield.shield.judgement import (
     as_actions,
     feasible_mass_of,
     j_values_of,
-    judge,
     robustness_of,
     witnesses_of,
 )
+from specshield.shield.signals import judged_by_signals
 from specshield.shield.taught import doubted, handed_on, on_map, teach, wary
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
@@ -136,16 +136,17 @@ def decide(
     margin_decided = prefix.low > asked or prefix.high <= asked  # whatever follows, it is kept or it is not
 
     answer: _Answer
+    withstands = spec_status == "satisfied"
     if t >= task.horizon or (spec_status == "satisfied" and margin_decided):
         judged = None
         answer = _unmodified(shield, log_prior)
     else:
-        broken = spec_status == "violated"
-        judged = judge(shield, prefix, tail, broken, care)
+        shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
         doubt = None if judged.feasible.any() else doubted(taught, t)
         if doubt is not None:
-            shield = on_map(told, doubt.map)
-            judged = judge(shield, prefix, tail, broken, care)
+            shield, prefix, judged, withstands = judged_by_signals(
+                on_map(told, doubt.map), prefix, tail, spec_status, care
+            )
             taught, said = doubt, (*said, "no way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
@@ -195,6 +196,7 @@ def decide(
         slack=slack,
         threshold_left=left,
         map_revision=taught.map.revision,
+        any_signal=withstands if shield.config.any_signal and task.signals else None,
         explanations=explanations(shield, prefix, judged, margin, slack) if explain else (),
         carry=Carry(
             t,

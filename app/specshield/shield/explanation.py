@@ -81,7 +81,7 @@ def _explained(
     for earlier, rows in _futures(shield, prefix, judged, motion):
         if best is not None and best.late_by is not None and best.late_by <= earlier:
             break  # what comes now is as late or later
-        samples = samples_of(shield, prefix.poses, prefix.signals, rows)
+        samples = samples_of(shield, prefix.poses, prefix.foreseen, rows)
         rho = np.array([values_of(part.asked, samples) for part in parts])  # [parts, rows]
         for n, i in enumerate(np.argmin(rho, axis=0)):
             same = parts[i].conjunct is parts[i].asked

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, kernel
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
 from specshield.rule.progress import signal_rows
-from specshield.rule.view import View, look, rate, read_step, recall_prefix, value_count
+from specshield.rule.view import View, look, rate, read_step, recall_prefix, value_count, view_of
 from specshield.shield.proposal import Proposer, ask
 from specshield.stl import SATISFIED_ABOVE, Formula, robustness_bounds
 from specshield.stl.program import STACK_SIZE
@@ -34,6 +34,7 @@ class Prefix:
     """What was driven, and what it says of a formula: rho lies in [low, high] however it goes on.
 
     poses [t + 1, 3], t = len(poses) - 1; signals {name: [..t + 1]}; rows [t + 1, S]: the same as an array.
+    held [1, S]: what the signals are taken to hold from step t + 1 on.
     """
 
     task: Task
@@ -45,6 +46,7 @@ class Prefix:
     known: Floats  # the formula's leaves at the steps to t
     low: float
     high: float
+    held: Floats
 
     @property
     def t(self) -> int:
@@ -54,6 +56,17 @@ class Prefix:
     def steps(self) -> int:
         """How many motions a future has: T - t."""
         return self.task.horizon - self.t
+
+    def of(self, formula: Formula) -> Prefix:
+        """The same prefix as another formula sees it, a part of the task's own."""
+        seen = prefix_of(self.task, formula, view_of(self.task, formula), self.poses, self.signals)
+        return replace(seen, held=self.held)
+
+    @property
+    def foreseen(self) -> Signals:
+        """The signals to step t, and once more what they are taken to hold from then on."""
+        rows = np.concatenate([self.rows, self.held])
+        return {name: rows[:, i] for i, name in enumerate(self.task.signals)}
 
 
 def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: Signals) -> Prefix:
@@ -67,7 +80,7 @@ def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: 
     if low != low:
         samples = task.samples(poses, signals)
         robustness_bounds(formula, {name: samples[name] for name in formula.names})  # says what and where
-    return Prefix(task, formula, poses, signals, rows, view, known, low, high)
+    return Prefix(task, formula, poses, signals, rows, view, known, low, high, rows[-1:])
 
 
 @dataclass(frozen=True)
@@ -128,7 +141,7 @@ def simulated(
         prefix.high <= SATISFIED_ABOVE
     )  # then every row is wanted whole: parts of the rule are judged on it
     finite = _simulate_and_rate(
-        body, prefix.view, prefix.known, prefix.t, prefix.poses[-1], prefix.rows[-1:],
+        body, prefix.view, prefix.known, prefix.t, prefix.poses[-1], prefix.held,
         prefix.task.robot.wait_motion, not violated, motions, poses, rho, leaves,
     )  # fmt: skip
     said = warnings if finite else [*warnings, NOT_FINITE]
@@ -152,7 +165,7 @@ def rho_of(prefix: Prefix, tried: Futures) -> tuple[Floats, Floats]:
     leaves (N, size) of that formula.
     """
     values, leaves = np.empty(len(tried.motions)), np.empty((len(tried.motions), prefix.view.tree.size))
-    rate(prefix.view, prefix.known, prefix.t, tried.poses, prefix.rows[-1:], values, leaves)
+    rate(prefix.view, prefix.known, prefix.t, tried.poses, prefix.held, values, leaves)
     return np.where(np.isnan(values), -np.inf, values), leaves
 
 

@@ -11,12 +11,11 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.rule.residual import again, joined, left_over
-from specshield.rule.view import view_of
 from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, flat, is_place
-from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, prefix_of, rho_of, together
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, rho_of, together
 from specshield.shield.surprise.recovery import given_up, most_kept, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
@@ -134,7 +133,7 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best
     part, best = prefix, None
     for parts in filter(None, options()):
         formula = joined(parts)
-        part = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
+        part = prefix.of(formula)
         best = best_of(tried, rho_of(part, tried)[0], len(task.robot.motions))
         if _some(best):
             break

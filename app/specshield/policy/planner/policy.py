@@ -48,6 +48,7 @@ from specshield.rule.progress import signal_rows
 from specshield.rule.residual import bounds_after, still_open
 from specshield.rule.values import REGIONS, initial_signals, places, regions_of
 from specshield.rule.view import look
+from specshield.rule.worst import worst_signals
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.stl.program import STACK_SIZE, compile_predicate, pack
@@ -66,7 +67,8 @@ class PlannerPolicy:
     """Plans at every decision.
 
     chosen [L, 2]: of each literal of the formula, which field leads to it freely, and which keeps to what has
-    to hold for a while; -1 for none.
+    to hold for a while; -1 for none. foreseen [S]: what the signals hold from x_{t+1} on; None: their last
+    values.
     """
 
     task: Task
@@ -74,6 +76,7 @@ class PlannerPolicy:
     settings: Settings
     fields: Fields
     chosen: Int32s
+    foreseen: Floats | None = None
 
     @property
     def id(self) -> str:
@@ -91,6 +94,12 @@ class PlannerPolicy:
         """The policy on another map: its fields lead as they did, its ways are those that there are."""
         other = replace(self)
         other.__dict__.update(_body=body, _world=self._world._replace(body=body))
+        return other
+
+    def foreseeing(self, signals: Floats) -> PlannerPolicy:
+        """The policy that takes the signals to hold these values [S] from x_{t+1} on, whatever they hold."""
+        other = replace(self, foreseen=signals)
+        other.__dict__.update(_body=self._body, _world=self._world)
         return other
 
     def _world_of(self, formula: Formula) -> World:
@@ -148,11 +157,15 @@ class PlannerPolicy:
         motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
         effort = self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
         world = world._replace(literals=literals)
-        first, found = plan_all(world, t, history[-1], rows[-1], known, effort, motions)
+        held = rows[-1] if self.foreseen is None else self.foreseen
+        first, found = plan_all(world, t, history[-1], held, known, effort, motions)
         return Proposal(motions, int(first)), bool(found)
 
-    def feasible_start(self, lattice: Lattice) -> float:
-        """The share of poses drawn from the lattice (the same each time) that some plan begins at."""
+    def feasible_start(self, lattice: Lattice, signals: Mapping[str, Floats] | None = None) -> float:
+        """The share of poses drawn from the lattice (the same each time) that some plan begins at.
+
+        signals {name: [1]}: held from x_0 on; else each has its initial value.
+        """
         free, random = np.argwhere(lattice.valid == 1), np.random.default_rng(0)
         if not len(free):
             return 0.0
@@ -160,7 +173,7 @@ class PlannerPolicy:
             pose_of(self._body, lattice.pitch, lattice.headings, *map(float, free[i]))
             for i in random.integers(len(free), size=STARTS)
         )
-        return sum(self._plan(np.array([pose]), {}, 0.0)[1] for pose in poses) / STARTS
+        return sum(self._plan(np.array([pose]), signals or {}, 0.0)[1] for pose in poses) / STARTS
 
     def weights(self) -> bytes:
         """The safetensors file."""
@@ -194,9 +207,14 @@ def synthesise(
     code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
     fields = Fields(cell, code, pitch)
     # Trying it also leaves its kernels compiled where a server finds them.
-    feasible = PlannerPolicy(task, {}, settings, fields, chosen).feasible_start(lattice)
-    metrics = {
-        "feasible_start": round(feasible, 4),
+    policy = PlannerPolicy(task, {}, settings, fields, chosen)
+    metrics: dict[str, float] = {"feasible_start": round(policy.feasible_start(lattice), 4)}
+    if task.signals:
+        worst = worst_signals(task)
+        at_worst = {} if worst is None else dict(zip(task.signals, worst.T, strict=True))
+        share = policy.feasible_start(lattice, at_worst) if at_worst else 0.0
+        metrics["feasible_start_any_signal"] = round(share, 4)
+    metrics |= {
         "fields": len(codes),
         "size_bytes": int(code.nbytes + cell.nbytes),
         "wall_time_s": round(time.perf_counter() - began, 3),

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
-from specshield.arrays import Floats
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import StepBody
@@ -31,9 +29,7 @@ def step(
     return made[0], made[1], made[2], made[3]
 
 
-def begin(
-    settings: Settings, request: SessionRequest, config: Config, owner: str
-) -> tuple[dict[str, Any], bool, str, Floats]:
+def begin(settings: Settings, request: SessionRequest, config: Config, owner: str) -> sessions.Begun:
     return sessions.begin(policies_of(settings), _shields(settings), request, config, None, owner)
 
 

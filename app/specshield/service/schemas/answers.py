@@ -42,6 +42,7 @@ class StepAnswer(msgspec.Struct, frozen=True, kw_only=True):
     slack: int
     threshold_left: float
     map_revision: int
+    any_signal: bool | msgspec.UnsetType = msgspec.UNSET
     explanations: tuple[Explanation | None, ...] | msgspec.UnsetType = msgspec.UNSET
 
 

@@ -179,6 +179,11 @@ class SessionResponse(Answer):
     feasible: bool = Field(
         description="Whether some action had a satisfying future where the rule began to hold."
     )
+    any_signal: bool | None = Field(
+        None,
+        description="Whether, from where the rule began to hold, it is kept whatever the signals do. False: "
+        "if they stay as they are. Null: the rule reads no signals, or `uncertainty` is `none`.",
+    )
     spec_status: SpecStatus = Field(description="Of the history so far, whatever may follow.")
     main_task_done: bool = Field(description="As the last step said.")
     finished: bool = Field(description="No further step will be taken.")

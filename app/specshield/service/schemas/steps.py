@@ -142,6 +142,12 @@ class StepResponse(Answer):
     map_revision: int = Field(
         description="How often the session's own map has changed; 0: it is the policy's."
     )
+    any_signal: bool | None = Field(
+        None,
+        description="Whether what `distribution` allows keeps the rule whatever the signals do from here on. "
+        "False: if they stay as they are. Left out where the rule reads no signals, and with `uncertainty` "
+        "`none`, which takes them to stay as they are.",
+    )
     explanations: list[Explanation | None] | None = Field(
         None, description="Why each action is forbidden, if asked for; null for one that is allowed."
     )

@@ -61,6 +61,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     threshold_over: Literal["step", "episode"] = "step"
     learn_map: bool = False
     map_memory: int | None = None
+    any_signal: bool = False
     created_at: str = ""
     begins: int = msgspec.field(name="from", default=0)
     origin: int = 0

@@ -25,6 +25,7 @@ ALIKE = (
     "learn_map",
     "map_memory",
 )
+ANY_SIGNAL = "any_signal"  # is not asked for by itself: it goes with what is taken of the world
 
 
 def settings_of(config: Mapping[str, Any]) -> Config:
@@ -33,7 +34,7 @@ def settings_of(config: Mapping[str, Any]) -> Config:
     The core counts steps from where the rule's windows begin. So does the draw of actions: each origin has a
     seed of its own.
     """
-    alike = {name: config[name] for name in ALIKE if name in config}
+    alike = {name: config[name] for name in (*ALIKE, ANY_SIGNAL) if name in config}
     origin = config.get("origin", 0)
     if origin:
         alike |= {"seed": alike["seed"] + origin, "max_steps": alike["max_steps"] - origin}
@@ -43,7 +44,8 @@ def settings_of(config: Mapping[str, Any]) -> Config:
 def asked_for(request: SessionRequest) -> Config:
     """What a request asks for. Raises InputError for settings that cannot be had."""
     alike = {name: getattr(request, name) for name in ALIKE}
-    return Config(**alike, uncertainty=_uncertainty(_told(request.uncertainty)))
+    told = _told(request.uncertainty)
+    return Config(**alike, uncertainty=_uncertainty(told), any_signal=told != "none")
 
 
 def asked_by(policy_ids: Sequence[str], about: Description, task: Task) -> dict[str, Any]:
@@ -65,7 +67,7 @@ def asked_by(policy_ids: Sequence[str], about: Description, task: Task) -> dict[
 
 def stored(settings: Config, request: SessionRequest) -> dict[str, Any]:
     """The settings as the config holds them."""
-    alike = {name: getattr(settings, name) for name in ALIKE}
+    alike = {name: getattr(settings, name) for name in (*ALIKE, ANY_SIGNAL)}
     return {**alike, "uncertainty": _told(request.uncertainty)}
 
 

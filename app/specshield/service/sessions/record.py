@@ -81,6 +81,7 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     explain: bool
     explanations: tuple[Explanation | None, ...]
     tables: bytes | None = None
+    any_signal: bool | None = None
 
     def points_sent(self, kind: str) -> Floats | None:
         """[n, 2]: the `occupied` or `free` points that were sent; None where none were."""
@@ -111,7 +112,8 @@ def logits_json(record: StepRecord) -> list[float | None] | None:
 
 
 def encode(record: StepRecord) -> bytes:
-    return _encoder.encode(record)
+    bare = record.any_signal is None  # then to the byte as before there was `any_signal`
+    return _encoder.encode(msgspec.structs.astuple(record)[:-1] if bare else record)
 
 
 def decode(content: bytes) -> StepRecord:
@@ -191,6 +193,7 @@ def make(
         explain=explain,
         explanations=_explained(decision),
         tables=tables,
+        any_signal=decision.any_signal,
     )
 
 
@@ -244,7 +247,7 @@ def _answer(
 
     distribution [A], next_poses [A, 3]; explanations: None where they were not asked for.
     """
-    asked: dict[str, Any] = {}
+    asked: dict[str, Any] = {} if made.any_signal is None else {"any_signal": made.any_signal}
     if explanations is not None:
         asked["explanations"] = explanations
     if all_witnesses:
@@ -293,8 +296,7 @@ def _pack_table(actions: Floats, row: Floats) -> tuple[bytes, bytes, bytes]:
     )
     known = _known(row).view("<i8").tolist()
     place = dict(zip(reversed(known), reversed(range(len(known))), strict=True))
-    room, pool = len(known) - len(place), list[int]()
-    index: list[int] = []
+    room, pool, index = len(known) - len(place), list[int](), list[int]()
     for word in np.frombuffer(b"".join(distinct), "<i8").tolist():
         at = place.setdefault(word, len(place) + room)
         if at == len(known) + len(pool):

@@ -87,7 +87,7 @@ INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before")
 def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]:
     """The session as the contract shows it."""
     shown = {name: value for name, value in rules[-1].items() if name not in INSIDE}
-    names = ("next_t", "feasible", "spec_status", "main_task_done", "finished")
+    names = ("next_t", "feasible", "any_signal", "spec_status", "main_task_done", "finished")
     return {
         **shown,
         "robot": robots.describe(robot_from_json(rules[-1]["robot"])),

@@ -49,8 +49,12 @@ from specshield.service.storage.store import Change, Dump, Record
 from specshield.shield import episode
 from specshield.shield.decision import Config, check_preferring
 from specshield.shield.preference import Preference
+from specshield.shield.signals import any_signal
 
 R = TypeVar("R")
+# The config; whether the start is feasible, and whether it is whatever the signals do (`State`); the
+# formula's verdict on it; and the first row.
+Begun = tuple[dict[str, Any], tuple[bool, bool | None], str, Floats]
 
 
 class Sessions:
@@ -83,12 +87,13 @@ class Sessions:
                 raise refused(request.shaping, error) from None
         ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
         try:
-            config, feasible, status, rows = await self._begun(request, settings, preference, key.name)
+            config, begun, status, rows = await self._begun(request, settings, preference, key.name)
         except Exception:  # whatever was wrong with a policy that has been deleted meanwhile, it is not there
             await self._run(self._policies.still_there, ids, key.name)
             raise
         content = files.to_json(config)
-        state = State(1, 0, feasible, status, self._expiry(), record.digest(content))
+        feasible, withstands = begun
+        state = State(1, 0, feasible, status, self._expiry(), record.digest(content), any_signal=withstands)
         stored_as = scoped(key.name, config["id"])
         await self._store.create(stored_as, content, Change(state.packed(), pack(rows)))
         try:  # whoever deletes a policy sees this session now, or has marked the policy before
@@ -100,12 +105,12 @@ class Sessions:
 
     async def _begun(
         self, request: SessionRequest, settings: Config, preference: Preference | None, owner: str
-    ) -> tuple[dict[str, Any], bool, str, Floats]:
+    ) -> Begun:
         """In a thread, or in another process where the policies' decisions take long."""
         if preference is None:
             ids = await self._run(lambda: [self._policies.find(key, owner).id for key in request.policies])
             if await self._run(self._shields.slow_policies, ids):
-                begun: tuple[dict[str, Any], bool, str, Floats] = await self._heavy.decide(
+                begun: Begun = await self._heavy.decide(
                     "begin", request, settings, owner, session=",".join(ids), key=tuple(ids)
                 )
                 return begun
@@ -251,8 +256,8 @@ def begin(
     settings: Config,
     preference: Preference | None,
     owner: str,
-) -> tuple[dict[str, Any], bool, str, Floats]:
-    """The config, whether the start is feasible, the formula's verdict on it, and the first row."""
+) -> Begun:
+    """As `Begun` has it."""
     records = [policies.find(key, owner) for key in request.policies]
     ids = [record.id for record in records]
     shield = replace(shields.get(ids, settings), preference=preference)
@@ -271,4 +276,4 @@ def begin(
         "owner": owner,
         "nonce": secrets.token_hex(8),
     }
-    return config, feasible, status, rows
+    return config, (feasible, any_signal(shield, rows[:, :3])), status, rows

@@ -13,7 +13,8 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
     length: of the stored poses. next_t: the step after the last decided one. expires_at [s since 1970]. head:
     SHA-256 of the last step's record, of the config where none was decided under it. carry: as `pack_carry`
-    has it. verdicts: of the rules that held before the one in force.
+    has it. verdicts: of the rules that held before the one in force. any_signal: of where the rule in force
+    began to hold, as `Decision` has it.
     """
 
     length: int
@@ -27,6 +28,7 @@ class State(msgspec.Struct, frozen=True, array_like=True):
     closed: bool = False
     carry: PackedCarry | None = None
     verdicts: tuple[str, ...] = ()
+    any_signal: bool | None = None
 
     @staticmethod
     def of(content: bytes) -> State:

@@ -45,6 +45,7 @@ from specshield.service.settings import Settings
 from specshield.service.storage.store import Change, Store
 from specshield.shield import episode
 from specshield.shield.decision import Config
+from specshield.shield.signals import any_signal
 
 R = TypeVar("R")
 
@@ -233,5 +234,6 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
         head=record.digest(files.to_json(config)),
         carry=None if carry is None else pack_carry(carry),
         verdicts=(*session.state.verdicts, verdict),
+        any_signal=any_signal(shield, seen[:, :3], columns(seen, names)),
     )
     return replace(made, state=state)

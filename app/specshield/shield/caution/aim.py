@@ -14,9 +14,8 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.rule.early import EVENTUALLY, Conjuncts, conjunction_of, find_open, rate_open
-from specshield.rule.view import view_of
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Best, Futures, Prefix, prefix_of, rho_of
+from specshield.shield.feasibility import Best, Futures, Prefix, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
 
@@ -46,7 +45,7 @@ def aim(shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Float
     own = prefix.formula is task.formula
     formula, parts = shield.conjunction if own else conjunction_of(task, prefix.formula)
     if formula is not prefix.formula:  # it is written as a plain conjunction, and may have other leaves
-        prefix = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
+        prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried)
     asked = np.zeros(len(parts.kind), np.int64)
     still = np.empty(len(asked), np.bool_)

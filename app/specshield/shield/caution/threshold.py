@@ -22,10 +22,9 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.rule.early import ALWAYS, EVENTUALLY, Conjuncts, conjunction_of, find_open
-from specshield.rule.view import view_of
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Shield
-from specshield.shield.feasibility import Prefix, prefix_of, rho_of
+from specshield.shield.feasibility import Prefix, rho_of
 from specshield.shield.judgement import Judged
 from specshield.shield.uncertainty import Care, Noise, costs_above
 from specshield.stl import SATISFIED_ABOVE
@@ -40,7 +39,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged) -> Float
     formula, parts = conjunction_of(task, prefix.formula)
     leaves = tried.leaves
     if formula is not prefix.formula:
-        prefix = prefix_of(task, formula, view_of(task, formula), prefix.poses, prefix.signals)
+        prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried)
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     find_open(parts, prefix.known, prefix.t, still)

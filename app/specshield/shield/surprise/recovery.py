@@ -13,9 +13,8 @@ import numpy as np
 
 from specshield.robot.dynamics import simulate
 from specshield.rule.residual import left_over
-from specshield.rule.view import view_of
 from specshield.shield.decision import Config, Shield
-from specshield.shield.feasibility import Futures, Prefix, prefix_of, rho_of
+from specshield.shield.feasibility import Futures, Prefix, rho_of
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
 
@@ -35,8 +34,7 @@ def most_kept(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[int, tupl
     left, said = np.ones(len(tried.motions), np.bool_), list[str]()
     nearest = np.zeros(len(tried.motions))
     for part in sorted(conjuncts(prefix.formula), key=_order):
-        view = view_of(prefix.task, part)
-        rho, _ = rho_of(prefix_of(prefix.task, part, view, prefix.poses, prefix.signals), futures)
+        rho, _ = rho_of(prefix.of(part), futures)
         keeps = left & (rho > SATISFIED_ABOVE)
         if keeps.any():
             left = keeps

@@ -79,7 +79,7 @@ export class Panel {
   }
 
   numbers(decision) {
-    const { feasible_mass: mass, kl, residual, margin, slack, threshold_left: left, map_revision: revision } = decision;
+    const { feasible_mass: mass, kl, residual, margin, slack, threshold_left: left, map_revision: revision, any_signal: any } = decision;
     const off = residual && `${metres(residual.translation)}, ${((180 * residual.rotation) / Math.PI).toFixed(1)}°`;
     return el(
       "dl",
@@ -89,6 +89,7 @@ export class Panel {
       pair("Off the expected pose", off ?? "–"),
       margin === undefined ? null : pair("Margin, slack", `${metres(margin)}, ${slack} steps`),
       left === undefined || left === null || left === 1 ? null : pair("Threshold left", left.toFixed(3)),
+      typeof any === "boolean" ? pair("Kept", any ? "whatever the signals do" : "if the signals stay as they are") : null,
       revision ? pair("Own map", `changed ${revision} times`) : null,
     );
   }

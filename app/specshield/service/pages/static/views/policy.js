@@ -44,9 +44,11 @@ function stands(policy) {
   if (policy.status !== "ready")
     return [head, el("progress", { max: 1, value: policy.progress, "aria-label": "Progress" }), el("p", {}, `${percent(policy.progress)}${left}`)];
   const share = policy.metrics.feasible_start;
+  const any = policy.metrics.feasible_start_any_signal;
   return [
     head,
     typeof share === "number" ? el("p", {}, `From ${percent(share)} of the places that it looked at, the rule can be kept.`) : null,
+    typeof any === "number" ? el("p", {}, `That is if the signals stay as they are. Whatever they do, it can be kept from ${percent(any)}.`) : null,
     share === 0 ? el("p", { class: "problem", role: "alert" }, "From no place can this rule be kept: its windows may be too short, or a region out of reach.") : null,
     el("p", {}, el("a", { class: "button main", href: `#/try/${policy.id}` }, "Try it")),
   ].filter(Boolean);

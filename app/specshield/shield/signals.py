@@ -1,0 +1,70 @@
+"""What is feasible whatever the signals do.
+
+J takes signals to hold their last value, as the paper does. Here they are at their worst from x_{t+1} on
+(rule/worst.py): an action that is feasible then has a witness that keeps the rule under any signals. So has
+what is left of the witness after the next step, whatever the signals were at it. So once some action is
+feasible in this sense, some action is at every step of the episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.rule.worst import worst_signals
+from specshield.shield.decision import Shield
+from specshield.shield.feasibility import Prefix, prefix_of
+from specshield.shield.judgement import Judged, judge
+from specshield.shield.uncertainty import Care
+from specshield.stl import SATISFIED_ABOVE, Verdict
+
+
+def judged_by_signals(
+    shield: Shield, prefix: Prefix, tail: bytes | None, status: Verdict, care: Care
+) -> tuple[Shield, Prefix, Judged, bool]:
+    """What the futures say of each action, the shield and the prefix as they were judged, and whether what is
+    feasible is so whatever the signals do. Where nothing is, they are taken to stay as they are.
+    """
+    if shield.config.any_signal and status == "pending":
+        found = _judged_at_worst(shield, prefix, tail, care)
+        if found is not None:
+            return *found, True
+    return shield, prefix, judge(shield, prefix, tail, status == "violated", care), False
+
+
+def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | None = None) -> bool | None:
+    """Whether some action at x_t has a future that keeps the rule whatever the signals are at x_t and after.
+
+    poses [t + 1, 3]; signals {name: [t]}: those before x_t, whose own come with its step. None where that is
+    not asked, or the rule reads no signals.
+    """
+    task = shield.task
+    if not shield.config.any_signal or not task.signals:
+        return None
+    worst = worst_signals(task)
+    if worst is None:
+        return False
+    seen = {
+        name: np.append(task.signal(name, signals, len(poses))[:-1], value)
+        for name, value in zip(task.signals, worst[0], strict=True)
+    }
+    prefix = prefix_of(task, task.formula, shield.view, poses, seen)
+    if prefix.low > SATISFIED_ABOVE or prefix.high <= SATISFIED_ABOVE or prefix.steps <= 0:
+        return prefix.low > SATISFIED_ABOVE
+    return _judged_at_worst(shield, prefix, None, Care(0.0, 0)) is not None
+
+
+def _judged_at_worst(
+    shield: Shield, prefix: Prefix, tail: bytes | None, care: Care
+) -> tuple[Shield, Prefix, Judged] | None:
+    """None where no action is feasible. A proposer that has `foreseeing` plans for the signals at worst."""
+    held = worst_signals(shield.task)
+    if held is None:
+        return None
+    proposers = tuple(p.foreseeing(held[0]) if hasattr(p, "foreseeing") else p for p in shield.proposers)
+    shield, prefix = replace(shield, proposers=proposers), replace(prefix, held=held)
+    judged = judge(shield, prefix, tail, False, care)
+    return (shield, prefix, judged) if judged.feasible.any() else None
