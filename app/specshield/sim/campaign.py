@@ -45,16 +45,22 @@ def run(
     runs: int,
     seed: int,
     on_progress: Callable[[int], None] = lambda _: None,
+    named: bool = False,
 ) -> Campaign:
-    """`runs` pairs of episodes, the i-th decided by `seed` and i alone. on_progress: how many are done."""
+    """`runs` pairs of episodes, the i-th decided by `seed` and i alone. on_progress: how many are done.
+
+    named: whether the sessions' ids say what they are, such as `case1-0-shielded` and `case1-0-alone`: for a
+    server that has no others.
+    """
 
     def pair(i: int) -> tuple[Episode, Episode, int]:
         own = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-        session, start, refused = _begin(client, case, own)
+        ids = [f"{case.name}-{i}-{how}" if named else None for how in ("shielded", "alone")]
+        session, start, refused = _begin(client, case, own, ids[0])
         model = load_learned(case.instruction)
         return (
             with_shield(session, case, model, start, own),
-            without_shield(client, case, model, start, own),
+            without_shield(client, case, model, start, own, id=ids[1]),
             refused,
         )
 
@@ -71,13 +77,14 @@ def run(
     return Campaign(case, seed, [p[0] for p in pairs], [p[1] for p in pairs], sum(p[2] for p in pairs))
 
 
-def _begin(client: ShieldClient, case: Case, seed: int) -> tuple[Session, Pose, int]:
+def _begin(client: ShieldClient, case: Case, seed: int, id: str | None) -> tuple[Session, Pose, int]:
     """A session at the first start that is not refused, of those drawn uniformly over free space."""
     starts = free_poses(case.task, case.body, DRAWS, np.random.default_rng([seed, 2]))
     for refused, (x, y, theta) in enumerate(starts.tolist()):
         start = (x, y, theta)
         try:
-            return client.sessions.create(policy_id=case.name, initial_pose=start, seed=seed), start, refused
+            session = client.sessions.create(policy_id=case.name, initial_pose=start, seed=seed, id=id)
+            return session, start, refused
         except InfeasibleStart:
             continue
     raise InfeasibleStart(f"none of {DRAWS} starts in {case.name} can satisfy the rule", path="initial_pose")

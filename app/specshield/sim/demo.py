@@ -72,4 +72,4 @@ def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: St
         left = (time.monotonic() - began) / done * (runs - done)
         status.say(f"{case.name}: {done} of {runs} episodes, {duration(left)} left")
 
-    return run(client, case, runs, seed, show)
+    return run(client, case, runs, seed, show, named=True)

@@ -93,10 +93,12 @@ def without_shield(
     start: Pose,
     seed: int,
     policy_id: str | None = None,
+    id: str | None = None,
 ) -> Episode:
     """The model's own draws, executed; after its `end` the robot stands still until the rule is decided.
 
-    policy_id: of a policy for the case's rule; the one that came with the case where none is given.
+    policy_id: of a policy for the case's rule; the one that came with the case where none is given. id: of
+    the session.
 
     The verdict is the service's: the poses are recorded into a session that decides nothing.
     """
@@ -115,7 +117,7 @@ def without_shield(
     still = case.task.horizon + 1 - len(episode.poses)
     episode.poses += [robot.pose] * max(still, 0)
     session = client.sessions.create(
-        policy_id=policy_id or case.name, initial_pose=start, allow_infeasible=True
+        policy_id=policy_id or case.name, initial_pose=start, allow_infeasible=True, id=id
     )
     episode.session = session.id
     for pose in episode.poses[:-1]:

@@ -52,12 +52,15 @@ export class Rule {
     this.input.value = this.input.value.replace(new RegExp(`\\b${from}\\b`, "g"), to);
   }
 
-  /** name: of the region that the patterns are about. */
+  /** name: of the region that the patterns are about at first; a room may be chosen as well. */
   show(name) {
-    this.name = name ?? this.name ?? Object.keys(this.regions).at(-1) ?? Object.keys(this.map.rooms)[0];
-    if (!this.name) return this.patterns.replaceChildren();
-    const add = ([words, of]) => button(`${this.name}: ${words}`, () => this.add(of(this.name)));
-    this.patterns.replaceChildren(...PATTERNS.map(add));
+    const names = [...new Set([...Object.keys(this.regions), ...Object.keys(this.map.rooms)])];
+    if (!names.length) return this.patterns.replaceChildren();
+    const kept = name ?? this.place?.value;
+    this.place = el("select", { "aria-label": "Place" }, names.map((each) => el("option", {}, each)));
+    this.place.value = names.includes(kept) ? kept : (Object.keys(this.regions).at(-1) ?? names[0]);
+    const add = ([words, of]) => button(words, () => this.add(of(this.place.value)));
+    this.patterns.replaceChildren(this.place, ...PATTERNS.map(add));
   }
 
   add(part) {

@@ -1,8 +1,9 @@
 // A floor plan: walls, regions, and what is drawn on it. Points are in metres of the map frame; y is up.
 
 import { picture } from "./api.js";
-import { svg } from "./dom.js";
+import { el, svg } from "./dom.js";
 import { Occupancy } from "./occupancy.js";
+import { Zoom } from "./zoom.js";
 
 const at = ([x, y]) => `${x.toFixed(3)},${(-y).toFixed(3)}`;
 export const line = (points) => points.map(at).join(" ");
@@ -39,24 +40,28 @@ function foot(region) {
   return [(Math.min(...xs) + Math.max(...xs)) / 2, Math.min(...ys)];
 }
 
+function middle(part) {
+  if (part.type === "circle") return part.center;
+  const points = corners(part);
+  return [0, 1].map((k) => (Math.min(...points.map((p) => p[k])) + Math.max(...points.map((p) => p[k]))) / 2);
+}
+
 export class Floor {
   /** map: as the API shows it. label: for those who do not see it. */
   constructor(map, label) {
     const [x0, y0, x1, y1] = map.bounds;
     this.map = map;
-    this.rooms = []; // [name, place] of each, once the walls are known
-    this.drawn = new Set(); // names of the regions
-    this.unit = Math.max(x1 - x0, y1 - y0) / 100; // [m] about a hundredth of the picture
+    this.rooms = Object.entries(map.rooms).filter(([, room]) => room.type !== "union");
+    this.drawn = {}; // the regions, by name
     this.layers = Object.fromEntries(
       ["walls", "rooms", "regions", "ways", "robots", "marks"].map((name) => [name, svg("g", { class: name })]),
     );
-    this.element = svg(
-      "svg",
-      { class: "floor", viewBox: `${x0} ${-y1} ${x1 - x0} ${y1 - y0}`, role: "img", "aria-label": label },
-      ...Object.values(this.layers),
-    );
-    this.element.style.setProperty("--unit", `${this.unit}px`);
-    this.element.style.setProperty("--ratio", String((x1 - x0) / (y1 - y0)));
+    const keys = `${label}. Plus and minus zoom, arrows move what is seen.`;
+    this.element = svg("svg", { class: "floor", role: "img", "aria-label": keys }, ...Object.values(this.layers));
+    this.zoom = new Zoom(this.element, [x0, -y1, x1 - x0, y1 - y0]);
+    this.frame = el("div", { class: "frame" }, this.element, this.zoom.buttons); // what a view puts in its place
+    this.frame.style.setProperty("--ratio", String((x1 - x0) / (y1 - y0)));
+    this.layers.rooms.append(this.text([(x0 + x1) / 2, (y0 + y1) / 2], "The map is read …", "room"));
   }
 
   /** Draws the walls, and gives the cells. */
@@ -68,30 +73,38 @@ export class Floor {
     const turned = `translate(${origin[0]} ${-origin[1]}) rotate(${(-180 * origin[2]) / Math.PI})`;
     const walls = { href: await this.occupancy.walls(), x: 0, y: -h, width: w, height: h, transform: turned };
     this.layers.walls.replaceChildren(svg("image", walls));
-    const single = Object.entries(this.map.rooms).filter(([, room]) => room.type !== "union");
-    this.rooms = single.map(([name, room]) => [name, this.roomiest(room)]);
     this.names();
     return this.occupancy;
   }
 
   /** Writes the names of the rooms, each where it has most space; not of those that are drawn as regions. */
   names() {
-    const others = this.rooms.filter(([name]) => !this.drawn.has(name));
-    this.layers.rooms.replaceChildren(...others.map(([name, place]) => this.text(place, name, "room")));
+    if (!this.occupancy) return;
+    const taken = Object.values(this.drawn).flatMap((region) => [foot(region), middle(members(region)[0])]);
+    const others = this.rooms.filter(([name]) => !(name in this.drawn)).reverse(); // the small ones come last
+    const texts = others.map(([name, room]) => {
+      const place = this.roomiest(room, taken);
+      taken.push(place);
+      return this.text(place, name, "room");
+    });
+    this.layers.rooms.replaceChildren(...texts);
   }
 
-  /** A point of a region with much free space around it; its middle where there is none. */
-  roomiest(region) {
+  /** A point of a region with much free space around it, and far from those taken; else its middle. */
+  roomiest(region, taken) {
     const [part] = members(region);
     if (part.type === "circle") return part.center;
     const points = corners(part);
     const [low, high] = [Math.min, Math.max].map((pick) => [0, 1].map((k) => pick(...points.map((p) => p[k]))));
-    let [best, most] = [[(low[0] + high[0]) / 2, (low[1] + high[1]) / 2], 0];
+    let [best, most] = [middle(part), 0];
     for (let i = 1; i < 16; i++) {
       for (let j = 1; j < 16; j++) {
         const at = [low[0] + (i / 16) * (high[0] - low[0]), low[1] + (j / 16) * (high[1] - low[1])];
         if (!inside(points, at)) continue;
-        while (most < 2 && this.occupancy.fits(at, most + 0.1)) [best, most] = [at, most + 0.1];
+        const apart = Math.min(...taken.map((other) => Math.hypot(at[0] - other[0], at[1] - other[1])));
+        let free = 0;
+        while (free < Math.min(2, apart / 2) && this.occupancy.fits(at, free + 0.1)) free += 0.1;
+        if (free > most) [best, most] = [at, free];
       }
     }
     return best;
@@ -101,23 +114,21 @@ export class Floor {
   regions(regions, avoided = []) {
     const bad = new Set(avoided.map((name) => name.replace(/^\w+\((.*)\)$/, "$1")));
     const shown = Object.entries(regions).map(([name, region]) => {
-      const [x, y] = foot(region);
       const group = { class: `region ${bad.has(name) ? "avoid" : "visit"}`, "data-name": name };
-      return svg("g", group, ...members(region).map(shape), this.text([x, y - 2.2 * this.unit], name));
+      return svg("g", group, ...members(region).map(shape), this.text(foot(region), name, "foot"));
     });
     this.layers.regions.replaceChildren(...shown);
-    this.drawn = new Set(Object.keys(regions));
+    this.drawn = { ...regions };
     this.names();
   }
 
   text([x, y], said, kind = "") {
-    return svg("text", { x, y: -y, class: kind, "text-anchor": "middle" }, said);
+    return svg("text", { x, y: -y, class: kind, dy: kind === "foot" ? "1.1em" : null, "text-anchor": "middle" }, said);
   }
 
   /** The point of the map under a pointer. */
   point(event) {
-    const seen = this.element.getScreenCTM().inverse();
-    const { x, y } = new DOMPoint(event.clientX, event.clientY).matrixTransform(seen);
+    const [x, y] = this.zoom.point(event);
     return [x, -y];
   }
 }

@@ -16,7 +16,7 @@ export class Mark {
     this.next = svg("polyline", { class: `next ${color}` });
     this.disc = svg("circle", { r: robot.footprint.radius });
     this.nose = svg("line");
-    this.body = svg("g", { class: `robot ${color}` }, svg("title", {}, name), this.disc, this.nose);
+    this.body = svg("g", { class: `robot ${color}`, hidden: true }, svg("title", {}, name), this.disc, this.nose);
     floor.layers.ways.append(this.next, this.way);
     floor.layers.robots.append(this.body);
     this.fits = (point, radius) => !floor.occupancy || floor.occupancy.fits(point, radius);
@@ -32,6 +32,7 @@ export class Mark {
   }
 
   move(pose) {
+    this.body.removeAttribute("hidden"); // now it is known where the robot is
     const [x, y] = centre(this.robot, pose);
     const far = this.robot.footprint.radius * 1.25;
     this.disc.setAttribute("cx", x);

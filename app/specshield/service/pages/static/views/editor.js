@@ -36,7 +36,7 @@ export async function show(place, { id, signal }) {
     el(
       "div",
       { class: "watch" },
-      el("div", { class: "stack" }, floor.element, regions.element),
+      el("div", { class: "stack" }, floor.frame, regions.element),
       el("div", { class: "stack" }, rule.element, form.element, about(map, rooms)),
     ),
   );

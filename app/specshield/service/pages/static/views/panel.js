@@ -56,7 +56,7 @@ export class Panel {
     const head = el(
       "div",
       { class: "row spread" },
-      el("h2", {}, `Step ${item.t}`, el("small", {}, ` of ${this.session.horizon}`)),
+      el("h2", {}, `Step ${item.t}`, el("small", {}, item.t > this.session.horizon ? `, the rule had ${this.session.horizon}` : ` of ${this.session.horizon}`)),
       decision && el("span", { class: `badge ${decision.spec_status}` }, decision.spec_status),
     );
     if (!decision) {

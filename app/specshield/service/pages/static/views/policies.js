@@ -7,11 +7,11 @@ const EVERY = 2000; // [ms] between two looks
 
 export async function show(place, { signal }) {
   const body = el("tbody");
-  const heads = ["Policy", "Rule", "Method", "Stands"].map((name) => el("th", { scope: "col" }, name));
+  const heads = ["Policy", "Rule", "Method", "State"].map((name) => el("th", { scope: "col" }, name));
   place.append(
     el("h1", {}, "Policies"),
     el("p", {}, "A policy is made for a map, a robot and a rule. ", el("a", { href: "#/maps" }, "Make one: begin with a map.")),
-    el("section", { class: "card scroll" }, el("table", {}, el("thead", {}, el("tr", {}, heads)), body)),
+    el("section", { class: "card scroll" }, el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), body)),
   );
   let before = "";
   while (!signal.aborted) {

@@ -47,7 +47,7 @@ function stands(policy) {
   const any = policy.metrics.feasible_start_any_signal;
   return [
     head,
-    typeof share === "number" ? el("p", {}, `From ${percent(share)} of the places that it looked at, the rule can be kept.`) : null,
+    typeof share === "number" ? el("p", {}, `By its own count, the rule can be kept from ${percent(share)} of the starts that it drew at random.`) : null,
     typeof any === "number" ? el("p", {}, `That is if the signals stay as they are. Whatever they do, it can be kept from ${percent(any)}.`) : null,
     share === 0 ? el("p", { class: "problem", role: "alert" }, "From no place can this rule be kept: its windows may be too short, or a region out of reach.") : null,
     el("p", {}, el("a", { class: "button main", href: `#/try/${policy.id}` }, "Try it")),

@@ -18,6 +18,8 @@ export async function show(place, { id, signal }) {
   await watch.load(signal);
   const { items } = await ask(`${path}/trajectory`, { signal });
   for (const item of items) watch.push(item);
+  const decided = items.findLast((item) => item.decision)?.t;
+  if (session.finished && decided !== undefined) watch.replay.go(decided); // what follows was not decided
   watch.show();
   state(place, session.finished, session.spec_status);
   if (!session.finished) listen(place, watch, id, items, signal);

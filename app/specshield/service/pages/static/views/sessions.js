@@ -39,19 +39,25 @@ function floors(sessions, maps) {
 }
 
 function table(sessions) {
-  const heads = ["Robot", "Rule", "Step", "Stands", ""].map((name) => el("th", { scope: "col" }, name));
+  const heads = ["Robot", "Rule", "Step", "The rule is", "The robot is"].map((name) => el("th", { scope: "col" }, name));
   const rows = sessions.map((session) =>
     el(
       "tr",
       {},
-      el("td", {}, el("a", { href: `#/sessions/${session.id}` }, session.id)),
+      el("th", { scope: "row" }, el("a", { href: `#/sessions/${session.id}`, title: session.id }, short(session.id))),
       el("td", {}, el("code", {}, session.spec.formula)),
-      el("td", { class: "number" }, `${session.next_t} / ${session.horizon}`),
+      el("td", { class: "number" }, step(session)),
       el("td", {}, el("span", { class: `badge ${session.spec_status}` }, session.spec_status)),
       el("td", {}, session.finished ? "over" : session.main_task_done ? "completing the rule" : "under way"),
     ),
   );
-  return el("table", {}, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, rows));
+  return el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, rows));
+}
+
+/** How far a robot is in its rule; a session that was only told where its robot was has no step. */
+function step({ next_t: t, horizon, finished }) {
+  if (t > horizon) return `${t}, the rule had ${horizon}`;
+  return finished && t === 0 ? "none decided" : `${t} of ${horizon}`;
 }
 
 function nobody() {

@@ -31,7 +31,7 @@ export async function show(place, { id, signal }) {
     button("Set it down anywhere", () => begin(null), { class: "main" }),
     told,
   );
-  place.append(el("h1", {}, `Try ${called(policy)}`), el("p", {}, el("code", {}, policy.spec.formula)), el("div", { class: "watch" }, floor.element, setup));
+  place.append(el("h1", {}, `Try ${called(policy)}`), el("p", {}, el("code", {}, policy.spec.formula)), el("div", { class: "watch" }, floor.frame, setup));
   const occupancy = await floor.load(signal);
   floor.element.classList.add("drawing");
   floor.element.addEventListener("click", (event) => begin(floor.point(event)));

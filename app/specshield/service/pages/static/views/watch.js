@@ -23,7 +23,7 @@ export class Watch {
     ];
     this.draw = onceAFrame(() => this.show());
     this.replay = new Replay(this.draw);
-    const left = el("div", { class: "stack" }, this.floor.element, this.replay.element);
+    const left = el("div", { class: "stack" }, this.floor.frame, this.replay.element);
     this.charted = el("section", { class: "card charts", "aria-label": "Over time" });
     this.charted.append(...this.charts.map(([chart]) => chart.element));
     this.side = el("div", { class: "stack side" }, this.panel.element);

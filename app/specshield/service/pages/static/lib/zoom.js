@@ -1,0 +1,104 @@
+// What part of a floor is seen: by wheel, two fingers, buttons and keys. At first all of it.
+
+import { button, el } from "./dom.js";
+
+const STEP = 1.4; // from one press of a button or key to the next; chosen by hand
+const MOST = 40; // times
+const FINE = 1.0015; // a pixel of the wheel
+const SLIPPED = 4; // [px] that a click may move
+const UNIT = [5, 7]; // [px] the least and the most that `--unit`, a hundredth of the picture, becomes on the screen
+
+export class Zoom {
+  /** svg: the picture; bounds: [x0, y0, wide, high] of all of it, in its own units. */
+  constructor(svg, bounds) {
+    Object.assign(this, { svg, bounds, times: 1, middle: [bounds[0] + bounds[2] / 2, bounds[1] + bounds[3] / 2] });
+    this.fingers = new Map();
+    const press = (name, sign, work) => button(sign, work, { "aria-label": name, title: name });
+    this.buttons = el(
+      "div",
+      { class: "zoom", role: "group", "aria-label": "Zoom" },
+      press("Closer", "+", () => this.by(STEP)),
+      press("Farther", "−", () => this.by(1 / STEP)),
+      (this.all = press("All of the floor", "⤢", () => this.by(0))),
+    );
+    svg.setAttribute("tabindex", "0");
+    svg.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
+    svg.addEventListener("pointerdown", (event) => this.fingers.set(event.pointerId, this.down(event)));
+    svg.addEventListener("pointermove", (event) => this.drag(event));
+    for (const kind of ["pointerup", "pointercancel"]) svg.addEventListener(kind, (event) => this.fingers.delete(event.pointerId));
+    svg.addEventListener("keydown", (event) => this.key(event));
+    new ResizeObserver(() => this.show()).observe(svg);
+    this.show();
+  }
+
+  /** Closer by a factor, 0 for all of the floor; `at` stays where it is on the screen. */
+  by(factor, at = this.middle) {
+    const times = factor && Math.min(MOST, Math.max(1, this.times * factor));
+    const kept = this.times / (times || 1);
+    this.middle = this.middle.map((m, k) => at[k] + (m - at[k]) * kept);
+    this.times = times || 1;
+    this.show();
+  }
+
+  moved(dx, dy) {
+    this.middle = [this.middle[0] + dx, this.middle[1] + dy];
+    this.show();
+  }
+
+  show() {
+    const [x0, y0, wide, high] = this.bounds;
+    const [w, h] = [wide / this.times, high / this.times];
+    const within = (value, low, size, seen) => Math.min(low + size - seen / 2, Math.max(low + seen / 2, value));
+    this.middle = [within(this.middle[0], x0, wide, w), within(this.middle[1], y0, high, h)];
+    this.svg.setAttribute("viewBox", `${this.middle[0] - w / 2} ${this.middle[1] - h / 2} ${w} ${h}`);
+    const { width, height } = this.svg.getBoundingClientRect();
+    const pixels = Math.min(width / wide, height / high) || 1; // of a unit of the picture, when all of it is seen
+    const unit = Math.min(UNIT[1], Math.max(UNIT[0], (pixels * Math.max(wide, high)) / 100));
+    this.svg.style.setProperty("--unit", `${unit / pixels / this.times}px`);
+    this.svg.classList.toggle("closer", this.times > 1);
+    this.all.disabled = this.times === 1;
+  }
+
+  /** A point of the screen in the units of the picture. */
+  point({ clientX, clientY }) {
+    const { x, y } = new DOMPoint(clientX, clientY).matrixTransform(this.svg.getScreenCTM().inverse());
+    return [x, y];
+  }
+
+  wheel(event) {
+    const factor = FINE ** -(event.deltaY * (event.deltaMode ? 20 : 1));
+    if (factor < 1 && this.times === 1) return; // all is seen: the page scrolls
+    event.preventDefault();
+    this.by(factor, this.point(event));
+  }
+
+  down({ clientX, clientY }) {
+    return { clientX, clientY, slipped: 0 };
+  }
+
+  /** One finger or the mouse moves what is seen, two fingers zoom; not while something is drawn. */
+  drag(event) {
+    const before = this.fingers.get(event.pointerId);
+    if (!before || this.svg.classList.contains("drawing")) return;
+    const slipped = before.slipped + Math.hypot(event.clientX - before.clientX, event.clientY - before.clientY);
+    const [was, is] = [this.point(before), this.point(event)];
+    const other = [...this.fingers].find(([id]) => id !== event.pointerId)?.[1];
+    this.fingers.set(event.pointerId, { ...this.down(event), slipped });
+    if (other) {
+      const fixed = this.point(other);
+      const far = (p) => Math.hypot(p[0] - fixed[0], p[1] - fixed[1]);
+      if (far(was) > 0) this.by(far(is) / far(was), fixed);
+    } else if (this.times > 1 && slipped > SLIPPED) this.moved(was[0] - is[0], was[1] - is[1]);
+  }
+
+  key(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const far = this.bounds[2] / this.times / 10;
+    const moves = { ArrowLeft: [-far, 0], ArrowRight: [far, 0], ArrowUp: [0, -far], ArrowDown: [0, far] };
+    const zooms = { "+": STEP, "=": STEP, "-": 1 / STEP, 0: 0 };
+    if (event.key in zooms) this.by(zooms[event.key]);
+    else if (event.key in moves && this.times > 1) this.moved(...moves[event.key]);
+    else return;
+    event.preventDefault();
+  }
+}
