@@ -123,10 +123,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     known = Policies(settings, library, claims)
     worker = TrainingWorker(settings) if wants_worker(settings) else None
     heavy, startup = Heavy(settings), Startup()
-    sessions = Sessions(settings, store, known, heavy)
+    watchers = Watchers(store, settings.max_watchers, lambda: startup.stopping)
+    sessions = Sessions(settings, store, known, heavy, watchers.decided)
     own = None if settings.api_key is None else settings.api_key.get_secret_value()
     keys, gauges = Keys(store.redis, own), Gauges(store, jobs)
-    watchers = Watchers(store, settings.max_watchers, lambda: startup.stopping)
     server = Server(
         settings,
         store,

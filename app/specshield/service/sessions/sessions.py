@@ -41,7 +41,7 @@ from specshield.service.sessions.session import (
 )
 from specshield.service.sessions.shields import Shields, refused
 from specshield.service.sessions.state import State
-from specshield.service.sessions.steps import Steps
+from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
@@ -62,11 +62,13 @@ class Sessions:
     which says whose it is (access/owners.py).
     """
 
-    def __init__(self, settings: Settings, store: ArchivingStore, policies: Policies, heavy: Heavy) -> None:
+    def __init__(
+        self, settings: Settings, store: ArchivingStore, policies: Policies, heavy: Heavy, tell: Tell
+    ) -> None:
         self._settings, self._store, self._policies = settings, store, policies
         self._shields = Shields(policies, settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
-        self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl)
+        self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
         self.switches = Switches(store, policies, self._shields, self._threads, heavy, settings)
         self._heavy = heavy
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
+from specshield.arrays import Floats
 from specshield.errors import SpecshieldError
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
@@ -45,6 +46,10 @@ WATCHED = 32  # decisions in threads after a long one. Chosen by hand.
 SHORT = 0.005  # [s]; so long a decision may hold the event loop, as anything else of a request
 LONG = 0.03  # [s] of a processor for one decision
 SEVERAL = 4  # decisions; one or two may be long because kernels are loaded
+
+
+# id, the versions before and after, the state, x_t with its signals, the step's record and what is answered
+Tell = Callable[[str, bytes, bytes, State, Floats, StepRecord, StepAnswer], None]
 
 
 @dataclass(frozen=True)
@@ -95,14 +100,14 @@ class Steps:
     """Short decisions are made on the event loop, others in threads (the rollouts release the interpreter),
     and long ones in other processes.
 
-    ttl: how long a session is kept after its last change [s].
+    ttl: how long a session is kept after its last change [s]. tell: called for each step that is stored.
     """
 
     def __init__(
-        self, store: Store, shields: Shields, threads: ThreadPoolExecutor, heavy: Heavy, ttl: int
+        self, store: Store, shields: Shields, threads: ThreadPoolExecutor, heavy: Heavy, ttl: int, tell: Tell
     ) -> None:
         self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
-        self._heavy = heavy
+        self._heavy, self._tell = heavy, tell
         self._recent, self._paces = RecentSessions(ROOM), files.Recent[Pace](1000)
 
     async def decide(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
@@ -134,10 +139,13 @@ class Steps:
                 written = await self._store.append(id, session.version, change)
             if isinstance(written, bytes):
                 told_later = len(decided.session.rows) - 1 - session.state.length
+                answer = record.told(decided.decision, request.witnesses, request.explain)
+                row = decided.session.rows[-1]
+                self._tell(id, session.version, written, state, row, decided.record, answer)
                 session = replace(decided.session, state=state, version=written)
                 self._recent.put(id, session)
                 metrics.decided(decided.decision, told_later, timing)
-                return record.told(decided.decision, request.witnesses, request.explain)
+                return answer
             self._recent.drop(id)
             if written is None:
                 raise missing(id)

@@ -1,96 +1,50 @@
 """Each decision of a session as it is made, for whoever watches: made here, or by any other server.
 
-A step pays nothing for its watchers. Each server process asks the store which of the sessions watched here
-have gone on, ten times a second and a part of them at a time, and reads what is new once for all who watch.
-A watcher who is behind reads the stored steps itself, a few at a time.
+A step pays next to nothing for its watchers: what this process decides is noted, and written out once for
+all who watch, when their streams are told next. Each server process asks the store which of the other
+sessions watched here have gone on, ten times a second and a part of them at a time; those that are decided
+here it asks for seldom. A watcher who is behind reads the stored steps itself, a few at a time.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
+import itertools
 import logging
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
 
+from specshield.arrays import Floats
 from specshield.errors import LimitReached, NotFound, SpecshieldError
 from specshield.service import metrics
 from specshield.service.access.owners import shown
-from specshield.service.schemas.answers import to_json
-from specshield.service.sessions import record, rules
-from specshield.service.sessions.session import Session, describe, missing
+from specshield.service.schemas.answers import StepAnswer
+from specshield.service.sessions import rules
+from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.session import Session, missing
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import News, Store
+from specshield.service.watch.feed import (
+    KEPT,
+    Feed,
+    Told,
+    begun,
+    events,
+    last_event,
+    last_of_several,
+    outdated,
+    ruled,
+)
 
 EVERY = 0.1  # [s] between two looks at a session; chosen by hand: a page need not be quicker
-TOGETHER = 0.25  # [s] between two messages of a stream of several sessions; by hand: each costs some 0.1 ms
+SELDOM = 10  # looks at the others to one at those that are decided here: whose end, or switch, shows so
+TOGETHER, EACH = 0.1, 0.0125  # [s] between two messages of a stream of several sessions, and more for each of
+# them: 0.5 s for 32. By hand: a message costs some 0.1 ms
 PARTS = 4  # of the sessions, looked at one after the other, so that none of them holds up a decision
-KEPT = 64  # events kept for the watchers of a session, and read at once
 HEARTBEAT = 15.0  # [s] without an event; chosen by hand, below what proxies wait
 FIRST = b"retry: 1000\n\n"
 log = logging.getLogger("specshield")
-
-
-@dataclass(frozen=True)
-class Told:
-    """A decision as it is told. session: its id. switch: events that come before it. asked: x_t, which of the
-    session's rules held, and the logits, as members of a JSON object. answer: what was answered.
-    """
-
-    session: str
-    t: int
-    switch: bytes
-    asked: bytes
-    answer: bytes
-
-    def event(self) -> bytes:
-        return b"%sid: %d\ndata: %s\n\n" % (self.switch, self.t, self.answer)
-
-    @cached_property
-    def whole(self) -> bytes:
-        """The event in a stream of several sessions: made once for all who watch."""
-        head = b'{"session":"%s","t":%d,%s' % (self.session.encode(), self.t, self.asked)
-        return b'data: %s,"decision":%s}\n\n' % (head, self.answer)
-
-
-@dataclass(eq=False)
-class Feed:
-    """A session that is watched here. rules: those that it has had, `told` as the contract shows them. width:
-    bytes of a row.
-
-    recent: the decisions of the steps from `start` to before `end`. version: the one that was read; None for
-    a session that is not in the store.
-    """
-
-    id: str
-    rules: Sequence[Mapping[str, Any]]
-    told: list[dict[str, Any]]
-    width: int
-    version: bytes | None
-    start: int
-    end: int
-    over: bool
-    status: str
-    watchers: int = 0
-    recent: deque[Told] = field(default_factory=lambda: deque(maxlen=KEPT))
-    changed: asyncio.Event = field(default_factory=asyncio.Event)
-
-    def add(self, state: State, found: list[Told], end: int) -> None:
-        for each in found:
-            if len(self.recent) == KEPT:
-                self.start = self.recent[0].t + 1
-            self.recent.append(each)
-        self.end, self.over, self.status = end, state.finished and end >= state.next_t, state.spec_status
-        self.wake()
-
-    def wake(self) -> None:
-        self.changed.set()
-        self.changed = asyncio.Event()
 
 
 class Watchers:
@@ -103,12 +57,13 @@ class Watchers:
 
     async def run(self) -> None:
         """Looks at the sessions that are watched, until it is cancelled."""
-        while True:
+        for number in itertools.count():
             feeds = list(self._feeds.values())
             for part in range(PARTS):
                 await asyncio.sleep(EVERY / PARTS)
+                own = (number + part) % SELDOM == 0
                 try:
-                    await self._look(feeds[part::PARTS])
+                    await self._look([feed for feed in feeds[part::PARTS] if own or not feed.here])
                 except SpecshieldError:
                     pass  # the store is away: what is missed is read when it is back
                 except Exception:
@@ -116,6 +71,26 @@ class Watchers:
             if self._stopping():
                 for feed in feeds:
                     feed.wake()
+
+    def decided(
+        self,
+        id: str,
+        before: bytes,
+        after: bytes,
+        state: State,
+        row: Floats,
+        made: StepRecord,
+        answered: StepAnswer,
+    ) -> None:
+        """Notes a step that this process has decided and stored, see `steps.Tell`. Where more is new
+        to the watchers, they read it from the store.
+        """
+        feed = self._feeds.get(id)
+        if feed is not None and feed.version == before and made.t >= feed.end:
+            rule = rules.at(feed.rules, made.t)
+            each = Told(shown(id), made.t, b"", rule, row[:3].tolist(), made, answered)
+            feed.version, feed.here = after, True
+            feed.add(state, [each], made.t + 1)
 
     async def open(self, id: str, after: int | None) -> AsyncIterator[bytes] | None:
         """The stream of what follows step `after`, by default the last one decided; None where nothing will.
@@ -159,16 +134,16 @@ class Watchers:
                     if t < feed.start:
                         found, t = await self._older(feed, t)
                     else:
-                        found, t = [each for each in feed.recent if each.t >= t], max(t, feed.end)
+                        found, t = feed.since(t), max(t, feed.end)
                     told += [each.whole for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
-                        told.append(_end_of(feed))
+                        told.append(last_of_several(feed))
                         del places[feed]
                 if told or time.monotonic() - told_at > HEARTBEAT:
                     told_at = time.monotonic()
                     yield b"".join(told) or b": alive\n\n"
-                await asyncio.sleep(TOGETHER)
+                await asyncio.sleep(TOGETHER + EACH * len(places))
 
     @contextlib.contextmanager
     def _watching(self, feeds: Sequence[Feed]) -> Iterator[None]:
@@ -193,7 +168,7 @@ class Watchers:
         session = Session.of(found)
         state = session.state
         return Feed(
-            id, *_ruled(session), found.version, state.next_t, state.next_t, state.finished, state.spec_status
+            id, *ruled(session), found.version, state.next_t, state.next_t, state.finished, state.spec_status
         )
 
     async def _stream(self, feed: Feed, t: int) -> AsyncIterator[bytes]:
@@ -205,13 +180,13 @@ class Watchers:
                 if t < feed.start:
                     found, t = await self._older(feed, t)
                 else:
-                    found, t = [each for each in feed.recent if each.t >= t], max(t, feed.end)
+                    found, t = feed.since(t), max(t, feed.end)
                 if found:
-                    yield b"".join(each.event() for each in found)
+                    yield b"".join(each.event for each in found)
                 if t < feed.end:
                     continue
                 if feed.over:
-                    yield _end(feed)
+                    yield last_event(feed)
                     return
                 try:
                     await asyncio.wait_for(changed.wait(), HEARTBEAT)
@@ -221,25 +196,33 @@ class Watchers:
     async def _look(self, feeds: list[Feed]) -> None:
         if not feeds:
             return
+        for feed in feeds:
+            feed.here = False
+        before = [feed.version for feed in feeds]
         versions = await self._store.versions([feed.id for feed in feeds])
-        seen = zip(feeds, versions, strict=True)
-        gone_on = [(feed, version) for feed, version in seen if feed.version != version]
+        seen = zip(feeds, before, versions, strict=True)
+        gone_on = [
+            (feed, version) for feed, known, version in seen if version != known and feed.version == known
+        ]  # one that was decided here meanwhile is looked at next time
         here = [(feed, version) for feed, version in gone_on if version is not None]
         if here:
+            ends = [feed.end for feed, _ in here]
             news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed, _ in here])
-            for (feed, version), new in zip(here, news, strict=True):
-                if new is None or not _outdated(feed, new) or not await self._switched(feed):
+            for (feed, version), end, new in zip(here, ends, news, strict=True):
+                if feed.end != end:
+                    continue
+                if new is None or not outdated(feed, new) or not await self._switched(feed):
                     self._gone_on(feed, version, new)
         for feed, found in gone_on:
             if found is None:
                 await self._left(feed)
 
     def _gone_on(self, feed: Feed, version: bytes, new: News | None) -> None:
-        if new is None or _begun(version) != _begun(feed.version or version):
+        if new is None or begun(version) != begun(feed.version or version):
             feed.over = True  # erased, and perhaps another session of this id was begun
             feed.wake()
             return
-        state, (found, end) = State.of(new.state), _events(feed, feed.end, new)
+        state, (found, end) = State.of(new.state), events(feed, feed.end, new)
         feed.add(state, found, end)
         if end >= state.next_t:  # else there is more, for the next look
             feed.version = version
@@ -247,9 +230,9 @@ class Watchers:
     async def _switched(self, feed: Feed) -> bool:
         """Reads the rules anew; what else is new is for the next look. False where the session is gone."""
         found = await self._store.load(feed.id)
-        if found is None or _begun(found.version) != _begun(feed.version or found.version):
+        if found is None or begun(found.version) != begun(feed.version or found.version):
             return False
-        feed.rules, feed.told, feed.width = _ruled(Session.of(found))
+        feed.rules, feed.told, feed.width = ruled(Session.of(found))
         return True
 
     async def _left(self, feed: Feed) -> None:
@@ -259,9 +242,9 @@ class Watchers:
             feed.over = True
             feed.wake()
         else:
-            feed.rules, feed.told, feed.width = _ruled(Session.of(dump))
+            feed.rules, feed.told, feed.width = ruled(Session.of(dump))
             new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
-            feed.add(State.of(dump.state), *_events(feed, feed.end, new))
+            feed.add(State.of(dump.state), *events(feed, feed.end, new))
         feed.version = None
 
     async def _older(self, feed: Feed, t: int) -> tuple[list[Told], int]:
@@ -271,56 +254,9 @@ class Watchers:
             dump = await self._store.dump(feed.id)
             if dump is None:
                 return [], feed.end
-            feed.rules, feed.told, feed.width = _ruled(Session.of(dump))
+            feed.rules, feed.told, feed.width = ruled(Session.of(dump))
             new = News(dump.state, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
-        elif _outdated(feed, new):
+        elif outdated(feed, new):
             return [], t if await self._switched(feed) else feed.end
-        found, end = _events(feed, t, new)
+        found, end = events(feed, t, new)
         return found, end if end > t else feed.end
-
-
-def _events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
-    """The decisions of the steps from t on that `new` has, and the step that follows them. The first one
-    after a switch brings the switch.
-    """
-    found = []
-    switched = [rule for rule in feed.told[1:] if rule["from"] >= t]
-    for i, step in enumerate(new.steps):
-        if step:
-            row = record.row_of(new.rows[i * feed.width : (i + 1) * feed.width])
-            rule = rules.at(feed.rules, t + i)
-            kept = record.decode(step)
-            answer = to_json(record.answer(kept, row, feed.rules[rule]["actions"]))
-            asked = {"pose": row[:3].tolist(), "rule": rule, "logits": record.logits_json(kept)}
-            switch = b""
-            while switched and switched[0]["from"] <= t + i:
-                switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
-            found.append(Told(shown(feed.id), t + i, switch, json.dumps(asked)[1:-1].encode(), answer))
-    return found, t + len(new.steps)
-
-
-def _outdated(feed: Feed, new: News) -> bool:
-    """Whether the session has had a switch that the feed does not know of; its rows may be wider since."""
-    return len(State.of(new.state).verdicts) >= len(feed.rules)
-
-
-def _ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str, Any]], int]:
-    """`Feed.rules`, `told` and `width`."""
-    told = describe(session.rules, session.state)["rules"]
-    return session.rules, told, 8 * session.rows.shape[1]
-
-
-def _end_of(feed: Feed) -> bytes:
-    """In a stream of several sessions."""
-    told = {"session": shown(feed.id), "next_t": feed.end, "spec_status": feed.status, "finished": True}
-    return b"data: %s\n\n" % json.dumps(told).encode()
-
-
-def _end(feed: Feed) -> bytes:
-    told = {"next_t": feed.end, "spec_status": feed.status, "finished": True}
-    return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
-
-
-def _begun(version: bytes) -> bytes:
-    """What tells one session of an id from another."""
-    return version.partition(b":")[0]

@@ -1,0 +1,146 @@
+"""What is told of one session that is watched: its latest decisions, and how they are written as events."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from specshield.service.access.owners import shown
+from specshield.service.schemas.answers import StepAnswer, to_json
+from specshield.service.sessions import record, rules
+from specshield.service.sessions.record import StepRecord
+from specshield.service.sessions.session import Session, describe
+from specshield.service.sessions.state import State
+from specshield.service.storage.store import News
+
+KEPT = 64  # events kept for the watchers of a session, and read at once
+
+
+@dataclass(frozen=True)
+class Told:
+    """A decision as it is told. session: its id. switch: events that come before it. rule: which of the
+    session's rules held. pose: x_t. made: the record of the step. answered: what was answered.
+
+    It is written when somebody reads it, and once for all who do.
+    """
+
+    session: str
+    t: int
+    switch: bytes
+    rule: int
+    pose: Sequence[float]
+    made: StepRecord
+    answered: StepAnswer
+
+    @cached_property
+    def answer(self) -> bytes:
+        return to_json(self.answered)
+
+    @cached_property
+    def event(self) -> bytes:
+        return b"%sid: %d\ndata: %s\n\n" % (self.switch, self.t, self.answer)
+
+    @cached_property
+    def whole(self) -> bytes:
+        """The event in a stream of several sessions."""
+        asked = {"pose": list(self.pose), "rule": self.rule, "logits": record.logits_json(self.made)}
+        head = b'{"session":"%s","t":%d,%s' % (
+            self.session.encode(), self.t, json.dumps(asked)[1:-1].encode(),
+        )  # fmt: skip
+        return b'data: %s,"decision":%s}\n\n' % (head, self.answer)
+
+
+@dataclass(eq=False)
+class Feed:
+    """A session that is watched here. rules: those that it has had, `told` as the contract shows them. width:
+    bytes of a row.
+
+    recent: the decisions of the steps from `start` to before `end`. version: the one that was read; None for
+    a session that is not in the store. here: whether it was decided in this process since the last look.
+    """
+
+    id: str
+    rules: Sequence[Mapping[str, Any]]
+    told: list[dict[str, Any]]
+    width: int
+    version: bytes | None
+    start: int
+    end: int
+    over: bool
+    status: str
+    watchers: int = 0
+    here: bool = False
+    recent: deque[Told] = field(default_factory=lambda: deque(maxlen=KEPT))
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def add(self, state: State, found: Sequence[Told], end: int) -> None:
+        for each in found:
+            if len(self.recent) == KEPT:
+                self.start = self.recent[0].t + 1
+            self.recent.append(each)
+        self.end, self.over, self.status = end, state.finished and end >= state.next_t, state.spec_status
+        self.wake()
+
+    def since(self, t: int) -> list[Told]:
+        """The decisions from step t on, of those that are kept."""
+        found = []
+        for each in reversed(self.recent):
+            if each.t < t:
+                break
+            found.append(each)
+        return found[::-1]
+
+    def wake(self) -> None:
+        self.changed.set()
+        self.changed = asyncio.Event()
+
+
+def events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
+    """The decisions of the steps from t on that `new` has, and the step that follows them. The first one
+    after a switch brings the switch.
+    """
+    found = []
+    switched = [rule for rule in feed.told[1:] if rule["from"] >= t]
+    for i, step in enumerate(new.steps):
+        if step:
+            row = record.row_of(new.rows[i * feed.width : (i + 1) * feed.width])
+            rule = rules.at(feed.rules, t + i)
+            kept = record.decode(step)
+            answer = record.answer(kept, row, feed.rules[rule]["actions"])
+            switch = b""
+            while switched and switched[0]["from"] <= t + i:
+                switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
+            found.append(Told(shown(feed.id), t + i, switch, rule, row[:3].tolist(), kept, answer))
+    return found, t + len(new.steps)
+
+
+def outdated(feed: Feed, new: News) -> bool:
+    """Whether the session has had a switch that the feed does not know of; its rows may be wider since."""
+    return len(State.of(new.state).verdicts) >= len(feed.rules)
+
+
+def ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str, Any]], int]:
+    """`Feed.rules`, `told` and `width`."""
+    told = describe(session.rules, session.state)["rules"]
+    return session.rules, told, 8 * session.rows.shape[1]
+
+
+def last_of_several(feed: Feed) -> bytes:
+    """In a stream of several sessions."""
+    told = {"session": shown(feed.id), "next_t": feed.end, "spec_status": feed.status, "finished": True}
+    return b"data: %s\n\n" % json.dumps(told).encode()
+
+
+def last_event(feed: Feed) -> bytes:
+    told = {"next_t": feed.end, "spec_status": feed.status, "finished": True}
+    return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
+
+
+def begun(version: bytes) -> bytes:
+    """What tells one session of an id from another."""
+    return version.partition(b":")[0]
