@@ -7,8 +7,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 from pydantic_core import PydanticCustomError
 
-from specshield.service import examples
-
 SpecStatus = Literal["pending", "satisfied", "violated"]
 ID = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
 Id = Annotated[str, Field(pattern=f"^{ID}$")]
@@ -69,7 +67,7 @@ class ProblemConjunct(Answer):
 class Problem(Answer):
     """An error, as RFC 9457 has it. Other members may follow, such as `position` or `expected_t`."""
 
-    model_config = ConfigDict(extra="allow", json_schema_extra={"examples": [examples.PROBLEM]})
+    model_config = ConfigDict(extra="allow")
 
     type: str = Field(description="A stable word to branch on, such as `history-gap`.")
     title: str = Field(description="The word, readable.")

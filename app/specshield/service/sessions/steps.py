@@ -108,10 +108,18 @@ class Steps:
     ) -> None:
         self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
         self._heavy, self._tell = heavy, tell
+        self.deciding = 0  # steps that somebody waits for
         self._recent, self._paces = RecentSessions(ROOM), files.Recent[Pace](1000)
 
     async def decide(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
         """The answer. `timing` collects the seconds of rollout and store."""
+        self.deciding += 1
+        try:
+            return await self._answer(id, request, timing)
+        finally:
+            self.deciding -= 1
+
+    async def _answer(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
         session, step = self._recent.get(id), None
         if session is not None and request.t < session.state.next_t:
             session = None  # a replay, or an error: both are the store's to tell

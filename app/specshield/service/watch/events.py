@@ -39,6 +39,8 @@ from specshield.service.watch.feed import (
 
 EVERY = 0.1  # [s] between two looks at a session; chosen by hand: a page need not be quicker
 SELDOM = 10  # looks at the others to one at those that are decided here: whose end, or switch, shows so
+MOMENT, GIVE_WAY = 0.003, 30  # [s] about a decision, and how many such at most. By hand: nobody sees 0.1 s
+HERE = 3.0  # [s] since a session was decided here; by hand: a robot's next step is due in that time
 TOGETHER, EACH = 0.1, 0.0125  # [s] between two messages of a stream of several sessions, and more for each of
 # them: 0.5 s for 32. By hand: a message costs some 0.1 ms
 PARTS = 4  # of the sessions, looked at one after the other, so that none of them holds up a decision
@@ -48,10 +50,14 @@ log = logging.getLogger("specshield")
 
 
 class Watchers:
-    """limit: of streams at once in this process. stopping: whether the server is on its way out."""
+    """limit: of streams at once in this process. stopping: whether the server is on its way out.
+    deciding: how many steps are being decided here.
+    """
 
-    def __init__(self, store: Store, limit: int, stopping: Callable[[], bool]) -> None:
-        self._store, self._limit, self._stopping = store, limit, stopping
+    def __init__(
+        self, store: Store, limit: int, stopping: Callable[[], bool], deciding: Callable[[], int]
+    ) -> None:
+        self._store, self._limit, self._stopping, self._deciding = store, limit, stopping, deciding
         self._feeds: dict[str, Feed] = {}
         self._open = 0
 
@@ -61,9 +67,11 @@ class Watchers:
             feeds = list(self._feeds.values())
             for part in range(PARTS):
                 await asyncio.sleep(EVERY / PARTS)
-                own = (number + part) % SELDOM == 0
+                all = (number + part) % SELDOM == 0
+                await self._idle()
+                elsewhere = time.monotonic() - HERE
                 try:
-                    await self._look([feed for feed in feeds[part::PARTS] if own or not feed.here])
+                    await self._look([feed for feed in feeds[part::PARTS] if all or feed.here < elsewhere])
                 except SpecshieldError:
                     pass  # the store is away: what is missed is read when it is back
                 except Exception:
@@ -89,7 +97,7 @@ class Watchers:
         if feed is not None and feed.version == before and made.t >= feed.end:
             rule = rules.at(feed.rules, made.t)
             each = Told(shown(id), made.t, b"", rule, row[:3].tolist(), made, answered)
-            feed.version, feed.here = after, True
+            feed.version, feed.here = after, time.monotonic()
             feed.add(state, [each], made.t + 1)
 
     async def open(self, id: str, after: int | None) -> AsyncIterator[bytes] | None:
@@ -115,6 +123,13 @@ class Watchers:
                 feed = self._feeds.get(id) or await self._begin(id)
                 places[feed] = feed.end if t is None else t + 1
         return self._together(places)
+
+    async def _idle(self) -> None:
+        """Lets the steps go first that are being decided here."""
+        for _ in range(GIVE_WAY):
+            if not self._deciding():
+                return
+            await asyncio.sleep(MOMENT)
 
     def _check_room(self) -> None:
         if self._open >= self._limit:
@@ -144,6 +159,7 @@ class Watchers:
                     told_at = time.monotonic()
                     yield b"".join(told) or b": alive\n\n"
                 await asyncio.sleep(TOGETHER + EACH * len(places))
+                await self._idle()
 
     @contextlib.contextmanager
     def _watching(self, feeds: Sequence[Feed]) -> Iterator[None]:
@@ -196,8 +212,6 @@ class Watchers:
     async def _look(self, feeds: list[Feed]) -> None:
         if not feeds:
             return
-        for feed in feeds:
-            feed.here = False
         before = [feed.version for feed in feeds]
         versions = await self._store.versions([feed.id for feed in feeds])
         seen = zip(feeds, before, versions, strict=True)

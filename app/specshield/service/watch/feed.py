@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
+
+import msgspec
 
 from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer, to_json
@@ -48,10 +51,8 @@ class Told:
     @cached_property
     def whole(self) -> bytes:
         """The event in a stream of several sessions."""
-        asked = {"pose": list(self.pose), "rule": self.rule, "logits": record.logits_json(self.made)}
-        head = b'{"session":"%s","t":%d,%s' % (
-            self.session.encode(), self.t, json.dumps(asked)[1:-1].encode(),
-        )  # fmt: skip
+        asked = {"session": self.session, "t": self.t, "pose": self.pose, "rule": self.rule}
+        head = msgspec.json.encode({**asked, "logits": record.logits_json(self.made)})[:-1]
         return b'data: %s,"decision":%s}\n\n' % (head, self.answer)
 
 
@@ -61,7 +62,8 @@ class Feed:
     bytes of a row.
 
     recent: the decisions of the steps from `start` to before `end`. version: the one that was read; None for
-    a session that is not in the store. here: whether it was decided in this process since the last look.
+    a session that is not in the store. here: when it was decided in this process last [s, of
+    time.monotonic].
     """
 
     id: str
@@ -74,7 +76,7 @@ class Feed:
     over: bool
     status: str
     watchers: int = 0
-    here: bool = False
+    here: float = -math.inf
     recent: deque[Told] = field(default_factory=lambda: deque(maxlen=KEPT))
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 

@@ -1,0 +1,142 @@
+"""The API's description: what FastAPI makes of the routes, the answers that are the same for all of them,
+and with examples: of each answer one that a server gave, of each problem one of its type.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from specshield.errors import SpecshieldError
+from specshield.service import examples, problems
+from specshield.service.middleware.guard import guarded
+from specshield.service.routes import policies, specs
+from specshield.service.schemas.base import Problem
+from specshield.service.state import problem_documents
+
+TAGS = [
+    {"name": "specifications", "description": "Formulas of Signal Temporal Logic."},
+    {"name": "maps", "description": "Occupancy grids with named areas."},
+    {"name": "robots", "description": "What the robots that came with the server can do."},
+    {"name": "policies", "description": "What certifies that an action still has a satisfying future."},
+    {"name": "sessions", "description": "Episodes: one robot, one specification, one decision a step."},
+    {"name": "system", "description": "Life, readiness, metrics."},
+]
+
+LINKS = {  # which answers name a thing, by what parameter, and the operations on that thing
+    ("/v1/maps", "201"): ("map_id", ("maps_read", "maps_image")),
+    ("/v1/policies", "202"): ("policy_id", ("policies_read",)),
+    ("/v1/sessions", "201"): (
+        "session_id",
+        ("sessions_read", "sessions_step", "sessions_switch", "sessions_close", "sessions_trajectory"),
+    ),
+}  # fmt: skip
+
+
+# By operation: what the requests of `examples` were answered, as tests/service/test_docs.py records it
+ANSWERS: dict[str, Any] = json.loads((Path(__file__).parent / "answers.json").read_text())
+USUAL = {  # the problem of a status where its description names none
+    "401": "unauthorized", "403": "cross-site", "404": "not-found", "408": "request-timeout",
+    "413": "body-too-large", "415": "unsupported-media-type", "421": "misdirected-request",
+    "422": "invalid-input", "429": "limit-reached", "503": "store-unavailable", "507": "insufficient-storage",
+}  # fmt: skip
+WRONG = {  # what of bad input an operation has of its own
+    "specifications_validate": ["invalid-formula"],
+    "maps_create": ["invalid-map"],
+    "policies_create": ["invalid-formula", "outside-fragment"],
+    "sessions_create": ["infeasible-start"],
+    "sessions_step": ["invalid-logits"],
+    "sessions_switch": ["infeasible-switch"],
+}
+
+
+def described(app: FastAPI) -> dict[str, Any]:
+    """OpenAPI, made once."""
+    if app.openapi_schema is None:
+        schema = get_openapi(
+            title=app.title,
+            version=app.version,
+            description=app.description,
+            routes=app.routes,
+            tags=app.openapi_tags,
+        )
+        schemas = schema["components"]["schemas"]
+        for name in (
+            "HTTPValidationError",
+            "ValidationError",
+        ):  # FastAPI's own, which never leave this server
+            schemas.pop(name, None)
+        for model in (Problem, *specs.MODELS, *policies.MODELS):  # referred to by hand
+            described = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas.update(described.pop("$defs", {}))
+            schemas[model.__name__] = described
+        schema["components"]["securitySchemes"] = {
+            "key": {"type": "http", "scheme": "bearer", "description": "Where the server asks for one."}
+        }
+        schema["security"] = [{}, {"key": []}]
+        for path, methods in schema["paths"].items():  # what the middleware may answer
+            for operation in methods.values():
+                said = {"_403": "`cross-site`: a page of another origin asks."}
+                said["_421"] = "`misdirected-request`: Host does not name this server."
+                if guarded(path):
+                    said["_401"] = "The server asks for a key, and this is not it."
+                    said["_429"] = operation["responses"].get("429", {}).get("description", "")
+                    said["_429"] = f"{said['_429']} `rate-limited`: wait for Retry-After.".strip()
+                if path.startswith("/v1/"):
+                    said["_503"] = operation["responses"].get("503", {}).get("description", "")
+                    said["_503"] = f"{said['_503']} `starting`: the server is not ready yet.".strip()
+                if "requestBody" in operation:
+                    said["_408"] = "The body took too long to arrive."
+                    said["_413"] = "The body is over the limit."
+                    said["_415"] = "The body is not declared as a type that is taken here."
+                added = problem_documents(**said)
+                operation["responses"] |= {str(status): told for status, told in added.items()}
+        for (path, status), (parameter, operations) in LINKS.items():
+            schema["paths"][path]["post"]["responses"][status]["links"] = {
+                name: {"operationId": name, "parameters": {parameter: "$response.body#/id"}}
+                for name in operations
+            }
+        schema["components"]["examples"] = {type: {"value": told} for type, told in PROBLEMS.items()}
+        schema["paths"] = dict(sorted(schema["paths"].items(), key=lambda path: "delete" in path[1]))
+        for path, methods in schema["paths"].items():
+            for method, operation in methods.items():
+                _show(operation, ANSWERS.get(f"{method} {path}"))
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _show(operation: dict[str, Any], answered: Any) -> None:
+    """Puts the examples into the answers of an operation."""
+    for status, response in operation["responses"].items():
+        content = response.get("content", {})
+        if "application/problem+json" in content:
+            named = re.findall(r"`([a-z-]+)`", response["description"])
+            told = [word for word in named if word in PROBLEMS and PROBLEMS[word]["status"] == int(status)]
+            if status == "422":
+                told = [*WRONG.get(operation["operationId"], []), "invalid-input", *told]
+            shown = {type: {"$ref": f"#/components/examples/{type}"} for type in told or [USUAL[status]]}
+            form = content["application/problem+json"]  # one for all statuses, as it comes
+            response["content"] = {"application/problem+json": {**form, "examples": shown}}
+        elif answered is not None:
+            for kind, form in content.items():
+                if kind in answered:
+                    form["example"] = answered[kind]
+
+
+def _problem(told: dict[str, Any]) -> dict[str, Any]:
+    """With the title and the status that its type has."""
+    made = _types(SpecshieldError)[told["type"]]("")
+    return {"type": told["type"], "title": "", "status": 0, **problems.document(made), **told}
+
+
+def _types(kind: type[SpecshieldError]) -> dict[str, type[SpecshieldError]]:
+    below = [_types(each) for each in kind.__subclasses__()]
+    return {kind.type: kind, **{type: each for found in below for type, each in found.items()}}
+
+
+PROBLEMS = {told["type"]: _problem(told) for told in examples.PROBLEMS}
