@@ -13,7 +13,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from specshield.errors import SpecshieldError
-from specshield.service import examples, problems
+from specshield.service import problems
 from specshield.service.middleware.guard import guarded
 from specshield.service.routes import policies, specs
 from specshield.service.schemas.base import Problem
@@ -38,8 +38,12 @@ LINKS = {  # which answers name a thing, by what parameter, and the operations o
 }  # fmt: skip
 
 
+def _read(name: str) -> Any:
+    return json.loads((Path(__file__).parent / name).read_text())
+
+
 # By operation: what the requests of `examples` were answered, as tests/service/test_docs.py records it
-ANSWERS: dict[str, Any] = json.loads((Path(__file__).parent / "answers.json").read_text())
+ANSWERS = _read("answers.json")
 USUAL = {  # the problem of a status where its description names none
     "401": "unauthorized", "403": "cross-site", "404": "not-found", "408": "request-timeout",
     "413": "body-too-large", "415": "unsupported-media-type", "421": "misdirected-request",
@@ -139,4 +143,4 @@ def _types(kind: type[SpecshieldError]) -> dict[str, type[SpecshieldError]]:
     return {kind.type: kind, **{type: each for found in below for type, each in found.items()}}
 
 
-PROBLEMS = {told["type"]: _problem(told) for told in examples.PROBLEMS}
+PROBLEMS = {told["type"]: _problem(told) for told in _read("problems.json")}
