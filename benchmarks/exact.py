@@ -21,6 +21,7 @@ FINE, COARSE = 0.01, 0.1  # [m] what poses are told apart by, near the goal and 
 ABOUT = 0.6  # [m] how far from the goal is near
 DEGREES = 1.0  # what headings are told apart by
 MOST = 3_000_000  # poses of one search
+NOWHERE = np.empty((0, 3))  # no discs to keep out of
 
 
 class Goal(NamedTuple):
@@ -67,8 +68,21 @@ def _is_at(goal: Goal, x: float, y: float, theta: float) -> bool:
 
 
 @njit(cache=True)
-def fewest_steps(body: Body, goal: Goal, x: float, y: float, theta: float, steps: int, most: int) -> int:
-    """The fewest steps found, up to `steps`, to a pose where the goal holds; -1 where none is found."""
+def _is_out(shut: Floats, x: float, y: float) -> bool:
+    out = True
+    for n in range(shut.shape[0]):
+        out = out and math.hypot(x - shut[n, 0], y - shut[n, 1]) > shut[n, 2]
+    return out
+
+
+@njit(cache=True)
+def fewest_steps(
+    body: Body, goal: Goal, x: float, y: float, theta: float, steps: int, most: int, shut: Floats
+) -> int:
+    """The fewest steps found, up to `steps`, to a pose where the goal holds; -1 where none is found.
+
+    shut [n, 3]: discs, as x, y and radius, that no pose before that one is in.
+    """
     if _is_at(goal, x, y, theta):
         return 0
     poses = np.empty((most, 3))
@@ -84,6 +98,8 @@ def fewest_steps(body: Body, goal: Goal, x: float, y: float, theta: float, steps
                 x, y, theta = step(body, poses[here, 0], poses[here, 1], poses[here, 2], m)
                 if _is_at(goal, x, y, theta):
                     return made
+                if not _is_out(shut, x, y):
+                    continue
                 grain = FINE if _is_near(goal, x, y) else COARSE
                 i, j = math.floor(x / grain) + (1 << 20), math.floor(y / grain) + (1 << 20)
                 h = math.floor(math.degrees(theta) / DEGREES + 0.5) + 512

@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from benchmarks.exact import Goal, fewest_steps
+from benchmarks.exact import NOWHERE, Goal, fewest_steps
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.reachability.policy import synthesise
@@ -89,7 +89,7 @@ def found(grid: OccupancyGrid, count: int) -> tuple[int, int, int, int]:
         if not 4.0 < np.hypot(pose[0] - goal.x, pose[1] - goal.y) < 0.2 * DEADLINE:
             continue
         tried += 1
-        least = fewest_steps(body, goal, *map(float, pose), DEADLINE, POSES)
+        least = fewest_steps(body, goal, *map(float, pose), DEADLINE, POSES, NOWHERE)
         if least < 0:
             continue
         accepted = True

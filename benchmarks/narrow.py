@@ -21,7 +21,7 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.exact import MOST, Goal, fewest_steps
+from benchmarks.exact import MOST, NOWHERE, Goal, fewest_steps
 from evaluation.model.floor_plans import random_house
 from evaluation.statistics import clopper_pearson
 from specshield.errors import InfeasibleStart
@@ -104,7 +104,7 @@ def main() -> None:
         regions = {"Dock": {"type": "circle", "center": [goal.x, goal.y], "radius": goal.radius}}
         task = make_task(house.grid, STRETCH, formula, regions if goal.radius < math.inf else {})
         began = time.perf_counter()
-        least = fewest_steps(body, goal, *map(float, pose), by, MOST)
+        least = fewest_steps(body, goal, *map(float, pose), by, MOST, NOWHERE)
         searched = time.perf_counter() - began
         policy = method.synthesise(task)
         made = time.perf_counter() - began - searched

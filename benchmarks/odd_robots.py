@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.exact import MOST, Goal, fewest_steps
+from benchmarks.exact import MOST, NOWHERE, Goal, fewest_steps
 from evaluation.model.floor_plans import random_house
 from evaluation.statistics import clopper_pearson
 from specshield.errors import InfeasibleStart
@@ -64,7 +64,7 @@ def counted(robot: Robot, starts: int, seed: int) -> tuple[Counter[str], float]:
             largest = max(largest, policy.card["metrics"]["size_bytes"] / 1e6)
             shield = make_shield([policy])
             for pose in poses:
-                feasible = fewest_steps(body, goal, *map(float, pose), deadline, MOST) >= 0
+                feasible = fewest_steps(body, goal, *map(float, pose), deadline, MOST, NOWHERE) >= 0
                 try:
                     start(shield, pose.tolist())
                     counts["accepted"] += feasible

@@ -221,9 +221,9 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
 @pytest.mark.parametrize(
     ("why", "line"),
     [
-        ([-0.3, 4], "F[50,100] Region2 could no longer be kept, by 4 steps"),
-        ([-0.3, 1], "F[50,100] Region2 could no longer be kept, by 1 step"),
-        ([-0.3, None], "F[50,100] Region2 could no longer be kept: its robustness would be -0.3"),
+        ([-0.3, 4], "F[50,100] Region2 could no longer be kept: it would come 4 steps too late"),
+        ([-0.3, 1], "F[50,100] Region2 could no longer be kept: it would come 1 step too late"),
+        ([-0.3, None], "F[50,100] Region2 could no longer be kept: it would fail by 0.3"),
         ([None, None], "F[50,100] Region2 could no longer be kept"),
         ([0.05, 2], "F[50,100] Region2 could still be kept, but not with the margin and the slack asked for"),
     ],

@@ -123,8 +123,8 @@ class Explanation:
             return f"{self.conjunct} could still be kept, but not with the margin and the slack asked for"
         told = f"{self.conjunct} could no longer be kept"
         if self.late_by is not None:
-            return f"{told}, by {self.late_by} step{'s' if self.late_by != 1 else ''}"
-        return told if self.robustness is None else f"{told}: its robustness would be {self.robustness:.3g}"
+            return f"{told}: it would come {self.late_by} step{'s' if self.late_by != 1 else ''} too late"
+        return told if self.robustness is None else f"{told}: it would fail by {-self.robustness:.3g}"
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,8 @@ class Decision:
 
     def why(self, action: int | str) -> str:
         """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden:
-        F[50,100] Region2 could no longer be kept, by 4 steps". The step has to have asked: explain=True.
+        F[50,100] Region2 could no longer be kept: it would come 4 steps too late". The step has to have
+        asked: explain=True.
 
         Raises InputError for an action that there is not.
         """

@@ -21,9 +21,9 @@ from specshield.reasons.search import Wanted, search
 from specshield.robot.dynamics import calmest_motion
 from specshield.rule.residual import joined
 from specshield.shield.decision import Shield
-from specshield.shield.explanation import late_by, samples_of, values_of
+from specshield.shield.explanation import ends_later, late_by, samples_of, values_of
 from specshield.shield.feasibility import futures, prefix_of
-from specshield.stl import SATISFIED_ABOVE, Eventually, Formula, Until, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 
 MOST_LATE = 150  # [steps] that a window is tried to end later, at most. Chosen by hand
 MOST_TRIED = 3  # alternatives of one conjunct, or of all, that are searched for
@@ -147,7 +147,7 @@ def _gather(gathered: _Gathered) -> None:
         return
     some = range(min(len(parts), MOST_CONJUNCTS))
     each = [reader.alternatives(parts[i]) for i in some]
-    timed = [isinstance(parts[i], (Eventually, Until)) for i in some]
+    timed = [ends_later(parts[i], 1) is not None for i in some]
     for i in some:
         if not gathered.kept(i):
             look_for(each[i])

@@ -25,7 +25,7 @@ from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.proposal import ask
-from specshield.stl import SATISFIED_ABOVE, Eventually, Formula, Until, robustness
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Implies, Until, robustness
 
 # Chosen by hand; an explanation costs some 10 ms.
 DEPTH = 2  # motions after which a witness is met again
@@ -185,11 +185,11 @@ def late_by(part: Formula, samples: Mapping[str, Floats], above: float) -> int |
     """The fewest steps later that the window of an F or U would have to end for its rho to be above `above`;
     None where no later end that the samples [m] reach would do.
     """
-    if not isinstance(part, (Eventually, Until)):
+    if ends_later(part, 1) is None:
         return None
 
     def kept(late: int) -> bool:
-        return float(values_of(replace(part, b=part.b + late), samples)) > above
+        return float(values_of(ends_later(part, late) or part, samples)) > above
 
     low, high = 0, min(len(values) for values in samples.values()) - 1 - part.horizon
     if high < 1 or not kept(high):
@@ -198,3 +198,15 @@ def late_by(part: Formula, samples: Mapping[str, Floats], above: float) -> int |
         middle = (low + high) // 2
         low, high = (low, middle) if kept(middle) else (middle, high)
     return high
+
+
+def ends_later(part: Formula, late: int) -> Formula | None:
+    """The same with the window of its F or U, alone or below a G as in a patrol, ending so much later."""
+    match part:
+        case Eventually() | Until():
+            return replace(part, b=part.b + late)
+        case Always(child=child) if later := ends_later(child, late):
+            return replace(part, child=later)
+        case Implies(right=right) if later := ends_later(right, late):
+            return replace(part, right=later)
+    return None

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from benchmarks.exact import Goal, fewest_steps
+from benchmarks.exact import NOWHERE, Goal, fewest_steps
 from benchmarks.narrow import runs
 from specshield.errors import InfeasibleStart
 from specshield.policy.methods import load_policy
@@ -62,7 +62,9 @@ def test_the_share_of_feasible_starts_is_over_real_headings():
     policy = synthesise(task_of(goal, 20))
     share = policy.card["metrics"]["feasible_start"]
     body = make_body(STRETCH, policy.task.grid)
-    found = [fewest_steps(body, goal, 4.5, 5.0, h, 20, 10_000) >= 0 for h in random.uniform(-3, 3, 400)]
+    found = [
+        fewest_steps(body, goal, 4.5, 5.0, h, 20, 10_000, NOWHERE) >= 0 for h in random.uniform(-3, 3, 400)
+    ]
     assert abs(share - np.mean(found)) < 0.25  # 64 starts: three standard deviations are 0.19
     assert 0.3 < share < 0.7
 

@@ -9,6 +9,7 @@ from specshield.compiled import kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.planner.approach import BEAM_LENGTH, BEAM_WIDTH
 from specshield.policy.planner.due_dates import foresee, is_open, make_bounds, read_signals
+from specshield.policy.planner.exact import search_exactly
 from specshield.policy.planner.search import MAX_DEPTH, Nodes, search, value
 from specshield.policy.planner.way import Way, World, move, read_at, stay
 from specshield.policy.undo import IMPOSSIBLE, undo_motion
@@ -62,14 +63,15 @@ def _rejoin(world: World, way: Way, base: Ints) -> bool:
 
 @kernel
 def plan_all(
-    world: World, t: int, pose: Floats, signals: Floats, prefix: Floats, effort: float, motions: Ints
-) -> tuple[int, bool]:
+    world: World, t: int, pose: Floats, signals: Floats, prefix: Floats, effort: float, most: int,
+    motions: Ints,
+) -> tuple[int, bool]:  # fmt: skip
     """A way after each first motion, into motions (M, T - t); returns the motion that the plan from x_t
     takes, and whether there is a plan.
 
-    signals (S,): those held; prefix (size,): the formula's leaves to step t. One plan is made from x_t, if
-    there is one. The other first motions only have to be undone to go the same way; those for which that
-    comes too late are planned for by themselves.
+    signals (S,): those held; prefix (size,): the formula's leaves to step t; most: the poses that a search
+    over exact poses may make. One plan is made from x_t, if there is one. The other first motions only have
+    to be undone to go the same way; those for which that comes too late are planned for by themselves.
     """
     count, steps = motions.shape
     way = make_way(world, t, steps, signals)
@@ -94,6 +96,8 @@ def plan_all(
         foresee(world.literals, t + n, way.known, way.held, way.bounds)
         if not found and is_open(world.literals, way.bounds):
             found = search(world, way, nodes, n, effort * (1.0 if n == 0 else SHARE))
+            if not found and root == -2:
+                found = search_exactly(world, way, nodes, effort, most)
         if root == -2 and not found:
             continue
         if root == -2:

@@ -59,6 +59,8 @@ MAX_ENTRIES = 50_000_000  # of all fields: 100 MB
 MAX_FIELDS = 32  # further literals have no field, and no plan goes to where they hold
 USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effort of the settings
 BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
+# Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
+FIRST, ON = 300_000, 20_000
 STARTS = 50  # poses that a new policy is tried from
 
 
@@ -119,10 +121,15 @@ class PlannerPolicy:
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A plan from x_t, and one after each other first motion."""
-        return self._plan(history, signals, margin)[0]
+        return self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)[0]
 
-    def _plan(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> tuple[Proposal, bool]:
-        """The proposal, and whether a plan of it satisfies the formula, or what can still be kept of it."""
+    def _plan(
+        self, history: Floats, signals: Mapping[str, Floats], margin: float, most: int
+    ) -> tuple[Proposal, bool]:
+        """The proposal, and whether a plan of it satisfies the formula, or what can still be kept of it.
+
+        most: poses of a search for a way that the fields miss.
+        """
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
         _, high = look(
             self._world.literals.formula, history, rows, np.empty(self._world.literals.formula.tree.size)
@@ -134,7 +141,7 @@ class PlannerPolicy:
         for part in parts:
             asked = self._asked(part, history, rows, margin) if margin > 0.0 else (part,)
             worlds = (self._world if each is self.task.formula else self._world_of(each) for each in asked)
-            plans = [self._plan_in(world, history, rows, margin) for world in worlds]
+            plans = [self._plan_in(world, history, rows, margin, most) for world in worlds]
             found = any(found for _, found in plans)
             if found:
                 break
@@ -149,7 +156,9 @@ class PlannerPolicy:
         left = still_open(self.task, formula, history, rows, 0)
         return (left,) if lost else (formula, left)
 
-    def _plan_in(self, world: World, history: Floats, rows: Floats, margin: float) -> tuple[Proposal, bool]:
+    def _plan_in(
+        self, world: World, history: Floats, rows: Floats, margin: float, most: int
+    ) -> tuple[Proposal, bool]:
         t = len(history) - 1
         literals = world.literals._replace(margin=margin)
         known = np.empty(literals.formula.tree.size)
@@ -158,7 +167,7 @@ class PlannerPolicy:
         effort = self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
         world = world._replace(literals=literals)
         held = rows[-1] if self.foreseen is None else self.foreseen
-        first, found = plan_all(world, t, history[-1], held, known, effort, motions)
+        first, found = plan_all(world, t, history[-1], held, known, effort, most, motions)
         return Proposal(motions, int(first)), bool(found)
 
     def feasible_start(self, lattice: Lattice, signals: Mapping[str, Floats] | None = None) -> float:
@@ -173,7 +182,7 @@ class PlannerPolicy:
             pose_of(self._body, lattice.pitch, lattice.headings, *map(float, free[i]))
             for i in random.integers(len(free), size=STARTS)
         )
-        return sum(self._plan(np.array([pose]), signals or {}, 0.0)[1] for pose in poses) / STARTS
+        return sum(self._plan(np.array([pose]), signals or {}, 0.0, ON)[1] for pose in poses) / STARTS
 
     def weights(self) -> bytes:
         """The safetensors file."""

@@ -94,7 +94,7 @@ def _add(nodes: Nodes, d: int, key: int, literal: int, before: int, stays: int, 
 
 
 @leaf
-def _guard(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> bool:
+def guard(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> bool:
     """Notes what has to hold from motions[:n] on, at most to step `stop`, until literal k does. Whether
     anything has to hold for a while.
     """
@@ -180,13 +180,13 @@ def _serve(world: World, way: Way, nodes: Nodes, d: int, c: int) -> int:
         move(world, way, n, stays)
         n += 1
     elif k < 0:
-        _guard(world, way, keep, n, way.t + steps, need)
+        guard(world, way, keep, n, way.t + steps, need)
         linger(world, way, keep, n, n + stays, need)
         n += stays
     else:
         by = need[k, DUE]
         stop = min(steps, by - way.t)
-        guarding = _guard(world, way, k, n, way.t + stop, need) or keep >= 0
+        guarding = guard(world, way, k, n, way.t + stop, need) or keep >= 0
         arrived, begin, until = -1, 0, 0
         if keep >= 0:
             begin, until = need[keep, BEGIN], need[keep, UNTIL]

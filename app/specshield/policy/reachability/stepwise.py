@@ -21,8 +21,8 @@ import math
 
 import numpy as np
 
-from specshield.arrays import Bytes, Floats, Int32s, Ints
-from specshield.compiled import kernel, leaf
+from specshield.arrays import Bools, Bytes, Floats, Int32s, Ints
+from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import Lattice, corner
 from specshield.policy.reachability.tables import Tables
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
@@ -91,7 +91,8 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
     of = of.reshape(-1, lattice.headings)
     always = sum(1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS))
     bits = np.zeros((horizon + 1, len(of), lattice.headings, -(-states // 8)), np.uint8)
-    valid = lattice.valid[used]
+    valid: Bytes = lattice.valid[used]
+    last: Bytes | None = None
     bits[horizon, :, :, (states - 1) >> 3] = np.where(valid, 1 << ((states - 1) & 7), 0)
     for t in range(horizon, -1, -1):
         asked = sum(
@@ -102,8 +103,28 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
         before = np.zeros_like(bits[t])
         _before(bits[t], valid, of, after, before)
         if t > 0:
-            _step_back(lattice, valid, row, before, bits[t - 1])
+            changed = used
+            if last is not None:  # where nothing changed in reach, the motions lead to what they did
+                bits[t - 1] = bits[t]
+                changed = _about(row, np.any(before != last, axis=(1, 2)), lattice.reach + 1)
+            _step_back(
+                lattice, valid, row, changed, np.bitwise_or.reduce(before, (0, 1)), before, bits[t - 1]
+            )
+            last = before
     return bits
+
+
+def _about(row: Int32s, changed: Bools, reach: int) -> Bools:
+    """The cells [ny, nx] that have one of those that `changed` [cells] at most `reach` cells away."""
+    about = np.append(changed, False)[row]  # row -1 is no cell
+    for axis in (0, 1):
+        about = np.moveaxis(about, axis, 0)
+        before = about.copy()
+        for n in range(1, reach + 1):
+            about[n:] |= before[:-n]
+            about[:-n] |= before[n:]
+        about = np.moveaxis(about, 0, axis)
+    return about
 
 
 @kernel
@@ -126,17 +147,23 @@ def _before(bits: Bytes, valid: Bytes, pattern: Ints, after: Ints, out: Bytes) -
 
 
 @kernel
-def _step_back(lattice: Lattice, valid: Bytes, row: Int32s, following: Bytes, out: Bytes) -> None:
-    """out(s) = the union over motions of `following` where they lead."""
+def _step_back(
+    lattice: Lattice, valid: Bytes, row: Int32s, changed: Bools, some: Bytes, following: Bytes, out: Bytes
+) -> None:
+    """out(s) = the union over motions of `following` where they lead, in the cells `changed` [ny, nx].
+
+    some (bytes,): the bits that `following` has anywhere; a pose that has them all needs no more motions.
+    """
     ny, nx = row.shape
     headings, size = following.shape[1], following.shape[2]
     at, weight = np.empty(4, np.int64), np.empty(4)
     for j in range(ny):
         for i in range(nx):
             c = row[j, i]
-            if c < 0:
+            if c < 0 or not changed[j, i]:
                 continue
             for h in range(headings):
+                out[c, h] = 0
                 if not valid[c, h]:
                     continue
                 for r in range(lattice.shift.shape[0]):
@@ -144,6 +171,8 @@ def _step_back(lattice: Lattice, valid: Bytes, row: Int32s, following: Bytes, ou
                     for b in range(size):
                         out[c, h, b] |= following[c, w, b]
                 for d in range(lattice.far_u.shape[3]):
+                    if _has_all(out[c, h], some):
+                        break
                     u, v = lattice.far_u[j, i, h, d], lattice.far_v[j, i, h, d]
                     if u == np.float32(-1.0):  # contact: it stays
                         for b in range(size):
@@ -153,6 +182,14 @@ def _step_back(lattice: Lattice, valid: Bytes, row: Int32s, following: Bytes, ou
                     n = _corners(row, valid, v, u, w, at, weight)
                     for b in range(size):
                         out[c, h, b] |= _majority(following, at, weight, n, w, b)
+
+
+@inlined
+def _has_all(bits: Bytes, some: Bytes) -> bool:
+    same = True
+    for b in range(bits.shape[0]):
+        same = same and bits[b] == some[b]
+    return same
 
 
 @leaf
