@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.robot.contact import CHORD, ROUNDING, SKIN
+from specshield.robot.contact import ROUNDING, SKIN
 from specshield.stl import And, Atom, Formula, Not, Or
 from specshield.task import Task
 from specshield.world.regions import Circle, Rectangle, Region
@@ -85,15 +85,28 @@ class World:
             return free
         at = self._centre(x, y, theta)
         near = np.flatnonzero(~self._is_clear(at, self.radius + 2.0 * math.hypot(*self.offset)))
-        for i in near:  # the arc of the footprint's centre as chords
-            n = math.ceil(abs(angle[i]) / CHORD - 1e-9)
-            arc = self._centre(x[i], y[i], theta[i] + angle[i] * np.arange(n + 1) / n)
-            chord = np.diff(arc, axis=0)
-            length = np.hypot(*chord.T)
-            room = np.repeat(self._room(arc[:1]), n)
-            contact = self._first_contact(arc[:-1], chord / length[:, None], length, room)
-            free[i] = np.all(contact == np.inf)
+        for i in near:
+            about, room = np.array([x[i], y[i]]) - self.origin, self._room(at[i : i + 1])
+            free[i] = self._arc_gap(at[i], about, angle[i]) >= room[0]
         return free
+
+    def _arc_gap(self, at: Floats, about: Floats, angle: float) -> float:
+        """The distance of the taken cells from the arc that a point [2] goes about another."""
+        u0, v0, taken = self._boxes(at[None])
+        low = np.stack([u0[taken], v0[taken]], axis=-1)[:, None]  # [squares, 1, 2]
+        reach, start = math.hypot(*(at - about)), math.atan2(*(at - about)[::-1])
+        edges = low + self.h * np.arange(2)[:, None] - about  # [squares, 2, 2]
+        corners = np.arctan2(edges[:, (0, 0, 1, 1), 1], edges[:, (0, 1, 0, 1), 0])
+        crossed = np.arccos(np.clip(edges / reach, -1.0, 1.0))
+        sides = [sign * crossed[..., k] + k * 0.5 * math.pi for sign in (1, -1) for k in (0, 1)]
+        along = np.broadcast_to(0.5 * math.pi * np.arange(4), (len(low), 4))
+        turned = np.concatenate([corners, *sides, along], axis=1) - start
+        passed = np.mod(math.copysign(1.0, angle) * turned, 2.0 * math.pi)
+        passed = np.concatenate([passed, np.zeros((len(low), 1)), np.full((len(low), 1), abs(angle))], axis=1)
+        way = start + math.copysign(1.0, angle) * np.minimum(passed, abs(angle))
+        points = about + reach * np.stack([np.cos(way), np.sin(way)], axis=-1)
+        beyond = np.maximum(np.maximum(low - points, points - low - self.h), 0.0)
+        return float(np.hypot(*np.moveaxis(beyond, -1, 0)).min(initial=np.inf))
 
     def _boxes(self, at: Floats) -> tuple[Floats, Floats, Bools]:
         """The cells around points [N, 2]: lower corners u0, v0 [N, W, W] [m], which are taken."""

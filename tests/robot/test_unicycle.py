@@ -149,6 +149,9 @@ def test_far_off_the_map_everything_ends(far):
     assert np.isfinite(out).all()
 
 
+TURNS = 500  # that are sampled
+
+
 def random_worlds(seed, count):
     random = np.random.default_rng(seed)
     for _ in range(count):
@@ -222,15 +225,52 @@ def test_turns_against_a_disc_sampled_every_millimetre():
                 assert (x, y) == (pose[0], pose[1])
                 angles = pose[2] + rotate * np.linspace(0.0, 1.0, 200)
                 gaps = world.gap(np.array([world.centre((x, y, a)) for a in angles]))
-                bulge = 0.00138 * math.hypot(*robot.offset)  # of an arc over its chords of 6 degrees
+                between = 0.5 * abs(rotate) / 199 * math.hypot(*robot.offset)  # from any point to a sample
                 if theta == pose[2]:
                     refused += 1
-                    assert gaps.min() < allowed + bulge + 0.011 * abs(rotate) * math.hypot(*robot.offset)
+                    assert gaps.min() < allowed + between
                 else:
                     turned += 1
                     assert theta == pytest.approx(wrap(pose[2] + rotate), abs=1e-12)
-                    assert gaps.min() > allowed - bulge - TOUCH
+                    assert gaps.min() > allowed - 2e-9
     assert min(turned, refused) > 30
+
+
+def test_no_certified_turn_overlaps_on_its_true_arc_and_no_free_one_is_refused():
+    """The Stretch in rooms, next to what it may touch; the arc at points 20 micrometres apart or less."""
+    stretch = [math.radians(a) for a in (30, -30, 6, -6)]
+    robot = robot_of(*[(0.0, a) for a in stretch], radius=0.1855, offset=(-0.109, 0.0), on_contact="stay")
+    random, turned, refused = np.random.default_rng(5), 0, 0
+    while turned < TURNS:
+        occupied = random.random((30, 30)) < 0.05
+        grid = OccupancyGrid(occupied, 0.05, (0.0, 0.0, random.uniform(-3, 3)))
+        world, body = (
+            DiscWorld(occupied, 0.05, grid.origin, robot.radius, robot.offset),
+            make_body(robot, grid),
+        )
+        for pose in poses_in(random, grid, 300):
+            gap = world.gap(world.centre(pose))[0]
+            if not world.radius < gap < world.radius + 0.06:  # else it is all the same
+                continue
+            for motion, angle in enumerate(stretch):
+                n = math.ceil(abs(angle) * 0.109 / 2e-5)
+                at = pose[2] + angle * np.linspace(0.0, 1.0, n + 1)
+                nearest = world.gap(_centres(world, pose, at)).min()
+                if step(body, *pose, motion)[2] == pose[2]:
+                    refused += 1
+                    assert nearest < world.radius + 1e-5
+                else:
+                    turned += 1
+                    assert nearest > world.radius - 2e-9
+    assert refused > TURNS // 10
+
+
+def _centres(world, pose, angles):
+    """The footprint's centre at each heading [n, 2], in grid metres."""
+    x0, y0, yaw = world.origin
+    z = complex(*pose[:2]) + complex(*world.offset) * np.exp(1j * angles) - complex(x0, y0)
+    z = z * np.exp(-1j * yaw)
+    return np.column_stack([z.real, z.imag])
 
 
 def test_from_a_free_start_no_chain_of_steps_ends_in_collision():

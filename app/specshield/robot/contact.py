@@ -1,8 +1,8 @@
 """Contact between a circular footprint and the occupied squares of a grid, exactly.
 
 A move sweeps the disc along its straight path against each occupied square, so that no move jumps a thin
-wall. A turn sweeps an off-centre footprint along an arc, which is tested as chords of at most 6 degrees, and
-is all or nothing. From inside an obstacle the robot may do whatever does not lead deeper into it.
+wall. A turn sweeps the centre of an off-centre footprint along an arc, against which each occupied square is
+tested, and is all or nothing. From inside an obstacle the robot may do whatever does not lead deeper into it.
 
 Points are in grid metres: along the columns (u) and rows (v) from the grid's lower-left corner.
 """
@@ -19,7 +19,7 @@ from specshield.robot.body import Body, centre
 TOUCH = 1e-6  # [m] a footprint that overlaps by less than this is not in collision (poses travel as text)
 SKIN = 1e-7  # [m] how far before the first contact a stopped move ends
 ROUNDING = 1e-9  # [m] slack against rounding: sliding along a wall is not a contact
-CHORD = math.radians(6.0)  # [rad] of the arc that an off-centre footprint sweeps in a turn
+CHORD = math.radians(6.0)  # [rad] between the places of a turn at which depths inside obstacles are compared
 MAX_DEPTH = 32  # [cells] deeper inside obstacles than this is all one: what lies beyond is not searched
 
 
@@ -212,6 +212,72 @@ def _escape(body: Body, u: float, v: float, du: float, dv: float, length: float)
 
 
 @leaf
+def _arc_contact(body: Body, ou: float, ov: float, u: float, v: float, angle: float, r: float) -> bool:
+    """Whether a disc of radius r overlaps an occupied square while its centre turns about (ou, ov), by
+    `angle` [rad] from (u, v), where it overlaps none.
+    """
+    h, reach, start = body.resolution, math.hypot(u - ou, v - ov), math.atan2(v - ov, u - ou)
+    mu, mv = ou + reach * math.cos(start + 0.5 * angle), ov + reach * math.sin(start + 0.5 * angle)
+    around = r + reach * min(0.5 * abs(angle), 2.0)  # of the middle of the arc, all that the disc can touch
+    if _is_clear(body, mu, mv, around):
+        return False
+    left, right = _columns(body, mu - around, mu + around)
+    for j in range(*_rows(body, mv - around, mv + around)):
+        for i in range(left, right):
+            if not _is_occupied(body, j, i):
+                continue
+            near = _to_square(mu, mv, i * h, j * h, h)
+            if near < r or (near < around and _arc_nears(ou, ov, reach, start, angle, i * h, j * h, h, r)):
+                return True
+    return False
+
+
+@leaf
+def _arc_nears(
+    ou: float, ov: float, reach: float, start: float, angle: float, u0: float, v0: float, h: float, r: float
+) -> bool:
+    """Whether an arc comes nearer than r to the square of side h whose lower-left corner is (u0, v0).
+
+    The distance to a square is smooth outside of it. So along the arc it is least at an end, or where the
+    arc is square to the way there: towards a corner, or along an axis. Or the arc crosses an edge.
+    """
+    if _nears_at(ou, ov, reach, start, angle, start + angle, u0, v0, h, r, True):
+        return True
+    for k in range(4):
+        cu, cv = u0 + h * (k % 2) - ou, v0 + h * (k // 2) - ov
+        if _nears_at(ou, ov, reach, start, angle, math.atan2(cv, cu), u0, v0, h, r, False):
+            return True
+        if _nears_at(ou, ov, reach, start, angle, 0.5 * math.pi * k, u0, v0, h, r, False):
+            return True
+        # The lines along the edges: u = u0, u = u0 + h, v = v0, v = v0 + h.
+        line, along = (cu, 0.0) if k < 2 else (v0 + h * (k - 2) - ov, 0.5 * math.pi)
+        if abs(line) < reach:
+            off = math.acos(line / reach)
+            for to in (along - off, along + off):
+                if _nears_at(ou, ov, reach, start, angle, to, u0, v0, h, r, False):
+                    return True
+    return False
+
+
+@leaf
+def _nears_at(
+    ou: float, ov: float, reach: float, start: float, angle: float, at: float,
+    u0: float, v0: float, h: float, r: float, is_end: bool,
+) -> bool:  # fmt: skip
+    """Whether the arc's point in the direction `at`, if the arc has it, is nearer than r to a square."""
+    turned = (at - start) % (2.0 * math.pi)
+    passed = turned if angle > 0.0 else (2.0 * math.pi - turned) % (2.0 * math.pi)
+    if not is_end and passed > abs(angle):
+        return False
+    return _to_square(ou + reach * math.cos(at), ov + reach * math.sin(at), u0, v0, h) < r
+
+
+@inlined
+def _to_square(u: float, v: float, u0: float, v0: float, h: float) -> float:
+    return math.hypot(max(u0 - u, 0.0, u - (u0 + h)), max(v0 - v, 0.0, v - (v0 + h)))
+
+
+@leaf
 def can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> bool:
     if body.offset_x == 0.0 and body.offset_y == 0.0:
         return True
@@ -219,21 +285,15 @@ def can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> bool
     if _is_clear(body, u, v, body.radius + 2.0 * math.hypot(body.offset_x, body.offset_y)):
         return True
     gap = free_distance(body, u, v, body.radius)
-    inside = _depth(body, u, v) if gap == 0.0 else 0.0
-    r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
-    n = math.ceil(abs(angle) / CHORD - 1e-9)
+    if gap > 0.0:
+        r = max(min(body.radius - ROUNDING, gap - 1e-12), 0.0)
+        dx, dy = x - body.origin_x, y - body.origin_y
+        ou, ov = body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
+        return not _arc_contact(body, ou, ov, u, v, angle, r)
+    inside, n = _depth(body, u, v), math.ceil(abs(angle) / CHORD - 1e-9)
     for k in range(1, n + 1):
-        eu, ev = centre(body, x, y, theta + angle * k / n)
-        length = math.hypot(eu - u, ev - v)
-        if gap == 0.0:
-            if _depth(body, eu, ev) > inside + ROUNDING:
-                return False
-        elif (
-            length > 0.0
-            and _first_contact(body, u, v, (eu - u) / length, (ev - v) / length, length, r) < np.inf
-        ):
+        if _depth(body, *centre(body, x, y, theta + angle * k / n)) > inside + ROUNDING:
             return False
-        u, v = eu, ev
     return True
 
 
