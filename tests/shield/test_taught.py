@@ -83,6 +83,26 @@ def test_a_robot_without_sensors_learns_from_what_it_runs_into():
     assert last.map_revision >= 1
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_robot_that_something_meets_at_its_side_gets_free(side):
+    """A door of 1 m, and at its one side a thing 0.3 m wide: what stops the robot is not straight ahead."""
+    walls = np.zeros((40, 80), bool)
+    walls[:10, 38:42] = walls[30:, 38:42] = True
+    grid = OccupancyGrid(walls, 0.05)
+    policy = synthesise(make_task(grid, STRETCH, "F[0,70] Goal", {"Goal": GOAL}), Settings(pitch=0.1))
+    real = grid.occupied.copy()
+    rows = slice(24, 30) if side > 0.0 else slice(10, 16)
+    real[rows, 37:43] = True
+    body = make_body(STRETCH, replace(grid, occupied=real))
+    shield, poses, carry = make_shield([policy], Config(learn_map=True)), [(0.6, 1.0 + 0.1 * side, 0.0)], None
+    while len(poses) <= policy.task.horizon:
+        decision = decide(shield, poses, None, main_task_done=True, carry=carry)
+        carry = decision.carry
+        poses.append(step(body, *poses[-1], int(STRETCH.motion_of[decision.action])))
+    assert decision.map_revision >= 1
+    assert decision.spec_status == "satisfied"
+
+
 def test_what_is_free_again_is_unlearned_and_the_policy_never_changes():
     shield = shield_of(30)
     first = decide(shield, [START], None, True, occupied=BOX)

@@ -124,7 +124,7 @@ def test_a_robot_that_slips_is_not_taken_to_be_held(loss, stands, stopped):
     policy = Scripted(world, lambda t, motion: [])
     shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
     seen, lost = Seen(), np.random.default_rng(0).random(60) < loss
-    seen = walked(seen, np.where(lost[:, None], HERE, MOVES[0]))._replace(stands=stands - 1.0)
+    seen = walked(walked(seen, np.where(lost[:, None], HERE, MOVES[0])), [HERE] * (stands - 1))
     pose = world.pose(0, 0, 0)
     nexts = np.array([world.pose(*world.after((0, 0, 0), m)) for m in range(4)])
     carry = Carry(0, nexts, (None,) * 4, residuals=FORMAT.pack(*seen))

@@ -142,12 +142,16 @@ def decide(
         answer = _unmodified(shield, log_prior)
     else:
         shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
-        doubt = None if judged.feasible.any() else doubted(taught, t)
-        if doubt is not None:
+        believed = taught
+        for doubt in () if judged.feasible.any() else doubted(taught, t):
             shield, prefix, judged, withstands = judged_by_signals(
                 on_map(told, doubt.map), prefix, tail, spec_status, care
             )
-            taught, said = doubt, (*said, "no way was left, so what was run into is tried again")
+            taught = doubt
+            if judged.feasible.any():
+                break
+        if taught is not believed:
+            said = (*said, "no way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory

@@ -21,7 +21,9 @@ from specshield.world.occupancy import OccupancyGrid
 
 MAX_POINTS = 2000  # of each kind, in one step
 MAX_CELLS = 100_000  # that differ from the policy's map: 10 x 25 m of 5 cm cells, half a megabyte as bytes
-SENT, CONTACT = 0, 1  # who changed a cell: a point that was sent, or a motion that stopped short
+# Who changed a cell: a point that was sent, or a motion that stopped short. That marks what lies straight
+# ahead, to the left and to the right, and behind that, where the thing that stopped it may reach.
+SENT, CONTACT, LEFT, RIGHT, BEHIND = range(5)
 
 
 def _none() -> Ints:
@@ -33,8 +35,8 @@ class LearnedMap:
     """Changed cells, N of them.
 
     cell [N]: row * width + column, ascending. occupied [N]: as the session has it; the policy's map has the
-    opposite. by [N]: SENT or CONTACT. step [N]: at which each was seen last. revision: how many steps have
-    changed a cell.
+    opposite. by [N]: SENT, CONTACT, LEFT, RIGHT or BEHIND. step [N]: at which each was seen last. revision:
+    how many steps have changed a cell.
     """
 
     revision: int = 0

@@ -38,7 +38,7 @@ MOST_ODDS = 1e6  # so that what changes late is still noticed
 TINY = 1e-9  # [motions]
 FAR = 5.0  # [sigma] what noise does: one motion in 270,000 ends farther off
 
-SELDOM = 1e-3  # a robot that does not move so often in a row is held by something; chosen by hand
+SELDOM = 1e-3  # what slips alone do not do so often is done by something else; chosen by hand
 
 FORMAT = struct.Struct("<9d")
 
@@ -49,8 +49,8 @@ class Seen(NamedTuple):
     moved: how many there were, and lost: how many of them were not executed; both may be fractions. odds: of
     what was seen if motions never slip, to if they do. noisy: how many were measured against f; moves, turns:
     the sums of their squared residuals [m^2], [rad^2]; exact: how many of them had none. standing: the
-    probability, by the last answer, that the robot is not told to move. stands: how many motions in a row did
-    not move it.
+    probability, by the last answer, that the robot is not told to move. slipping: how likely
+    it was to stand, by slips alone, as often in a row as it has now; 1 after a motion that moved it.
     """
 
     moved: float = 0.0
@@ -61,7 +61,7 @@ class Seen(NamedTuple):
     turns: float = 0.0
     exact: float = 0.0
     standing: float = 0.0
-    stands: float = 0.0
+    slipping: float = 1.0
 
 
 def learn(
@@ -88,6 +88,15 @@ def _told(known: Uncertainty) -> Told:
     return known.translation, known.rotation, known.slip, known == ASSUMED
 
 
+def within_noise(shield: Shield, carry: Carry) -> tuple[float, float] | None:
+    """How far [m], [rad] noise leads at most from where f does; None where nothing is learned of it."""
+    known = shield.config.uncertainty
+    if known is None or carry.residuals is None:
+        return None
+    noise = noise_of(_told(known), Seen(*FORMAT.unpack(carry.residuals)))
+    return EXACT + FAR * noise.move, EXACT + FAR * noise.turn
+
+
 def was_stopped(shield: Shield, carry: Carry, poses: Floats) -> bool:
     """Whether a motion that ended short at x_t met something: noise and slips do not explain it."""
     known = shield.config.uncertainty
@@ -98,7 +107,7 @@ def was_stopped(shield: Shield, carry: Carry, poses: Floats) -> bool:
     far = EXACT + FAR * (noise.move + noise.turn)
     miss = min((_gap(end, pose) for end in carry.next_poses if _gap(end, before) > EXACT), default=math.inf)
     if still < miss and still <= far:
-        return bool((noise.slips * noise.lost / (noise.lost + noise.kept)) ** (seen.stands + 1.0) < SELDOM)
+        return seen.slipping * _slip(noise) < SELDOM
     return miss > far
 
 
@@ -180,7 +189,7 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
         return Seen(
             seen.moved + slipped, seen.lost + slipped * min(1.0, miss / way), odds,
             seen.noisy, seen.moves, seen.turns, seen.exact, seen.standing,
-            seen.stands + 1.0 if still < miss else 0.0,
+            seen.slipping * _slip(noise) if still < miss else 1.0,
         )  # fmt: skip
     dx, dy = pose[0] - foreseen[motion, 0], pose[1] - foreseen[motion, 1]
     return Seen(
@@ -192,8 +201,14 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
         seen.turns + wrap(pose[2] - foreseen[motion, 2]) ** 2,
         seen.exact + (1.0 if miss <= EXACT else 0.0),
         seen.standing,
-        0.0,
+        1.0,
     )
+
+
+@leaf
+def _slip(noise: Noise) -> float:
+    """The probability that the next motion is not executed."""
+    return noise.slips * noise.lost / (noise.lost + noise.kept)
 
 
 @leaf

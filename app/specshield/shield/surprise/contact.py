@@ -15,98 +15,126 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
+from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
-# Chosen by hand: five times the noise of a Stretch's controller (0.01 m, 0.5 degrees; DESIGN.md, section 4).
-NEAR_MOVE, NEAR_TURN = 0.05, math.radians(2.5)  # [m], [rad] poses this near may be one, but for noise
-ARC = math.radians(35.0)  # [rad] to both sides of straight ahead: what a contact marks
+Near = tuple[float, float]  # [m], [rad] poses this near may be one, but for noise
+# Of a robot of which nothing is known: five times the noise of a Stretch's controller (0.01 m, 0.5 degrees;
+# DESIGN.md, section 4). Chosen by hand.
+NEAR: Near = (0.05, math.radians(2.5))
+
+ARC = math.radians(25.0)  # [rad] to both sides of straight ahead: where a contact is most likely. By hand.
+ASIDE = math.radians(75.0)  # [rad] to both sides: where it may be. Chosen by hand.
+THING = 0.3  # [m] how wide and deep a thing is taken to be that is on no map; chosen by hand
+UNDER = 0.03  # [m] a footprint that covers a cell by more than this shows it free: three times the noise
 
 
 @dataclass(frozen=True)
 class Followed:
     """What is known of how the caller follows: the motion drawn last (-1: none), whether all steps so far can
-    be what was drawn, and the drawn motion that did nothing in the step before (-1: none).
+    be what was drawn, and the drawn motion that did nothing in the step before (-1: none). met: how many
+    contacts there were at this very pose.
     """
 
     drawn: int = -1
     follows: bool = True
     halted: int = -1
+    met: int = 0
 
 
 def contact_of(
-    body: Body, followed: Followed, before: Floats, after: Floats, foreseen: Floats
+    body: Body, followed: Followed, before: Floats, after: Floats, foreseen: Floats, near: Near = NEAR
 ) -> tuple[int, Followed]:
     """The motion that stopped short between two poses (3,), -1 for none, and what is known of the caller now.
 
-    foreseen [M, 3]: where f leads from `before`.
+    foreseen [M, 3]: where f leads from `before`. near: what noise explains.
     """
     drawn = followed.drawn
-    if drawn >= 0 and _near(foreseen[drawn : drawn + 1], after)[0]:
-        return -1, followed if followed.halted < 0 else replace(followed, halted=-1)
-    near = _near(foreseen, after)
-    if _near(before[None], after)[0]:  # it stands where it stood
+    if drawn >= 0 and _near(foreseen[drawn : drawn + 1], after, near)[0]:
+        return -1, replace(followed, halted=-1, met=0)
+    if _near(before[None], after, near)[0]:  # it stands where it stood
         if drawn < 0 or not followed.follows:
             return -1, followed
-        again = followed.halted == drawn
-        return (drawn, replace(followed, halted=-1)) if again else (-1, replace(followed, halted=drawn))
-    if near.any():
-        return -1, replace(followed, follows=False, halted=-1)
-    short = _short(body, before, after, foreseen)
-    if drawn >= 0 and short[drawn]:
-        return drawn, replace(followed, halted=-1)
-    return int(np.argmax(short)) if short.any() else -1, replace(followed, halted=-1)
+        if followed.halted == drawn or followed.met:  # what stopped it a moment ago does so again
+            return drawn, replace(followed, halted=-1, met=followed.met + 1)
+        return -1, replace(followed, halted=drawn)
+    if _near(foreseen, after, near).any():
+        return -1, replace(followed, follows=False, halted=-1, met=0)
+    short = _short(body, before, after, foreseen, near)
+    if not short.any():
+        return -1, replace(followed, halted=-1, met=0)
+    motion = drawn if drawn >= 0 and short[drawn] else int(np.argmax(short))
+    return motion, replace(followed, halted=-1, met=1)
 
 
-def _near(poses: Floats, pose: Floats) -> Bools:
+def _near(poses: Floats, pose: Floats, near: Near) -> Bools:
     """Which of poses [n, 3] are the pose (3,), but for noise."""
     turn = np.abs(np.remainder(poses[:, 2] - pose[2] + math.pi, 2.0 * math.pi) - math.pi)
-    near: Bools = (np.hypot(*(poses[:, :2] - pose[:2]).T) <= NEAR_MOVE) & (turn <= NEAR_TURN)
-    return near
+    found: Bools = (np.hypot(*(poses[:, :2] - pose[:2]).T) <= near[0]) & (turn <= near[1])
+    return found
 
 
-def _short(body: Body, before: Floats, after: Floats, foreseen: Floats) -> Bools:
+def _short(body: Body, before: Floats, after: Floats, foreseen: Floats, near: Near) -> Bools:
     """Which motions [M] lead straight through `after` and on."""
     cos, sin = math.cos(before[2]), math.sin(before[2])
     dx, dy = after[:2] - before[:2]
     ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
     found = np.zeros(len(foreseen), np.bool_)
-    if abs(aside) > NEAR_MOVE or abs(wrap(after[2] - before[2])) > NEAR_TURN:
+    if abs(aside) > near[0] or abs(wrap(after[2] - before[2])) > near[1]:
         return found
     for motion in range(len(foreseen)):
         far, _ = displacement(body, motion)
         reached = math.hypot(*(foreseen[motion, :2] - before[:2]))
-        found[motion] = far * ahead > 0.0 and abs(ahead) < reached - NEAR_MOVE
+        found[motion] = far * ahead > 0.0 and abs(ahead) < reached - near[0]
     return found
 
 
-def cells_ahead(body: Body, pose: Floats, motion: int) -> Ints:
-    """The cells, ascending, that begin within a cell's side of the footprint where a motion leads from a pose
-    (3,): straight ahead, or for a turn the way that the footprint's centre swings.
+def cells_met(body: Body, pose: Floats, motion: int, driven: Floats) -> list[tuple[int, Ints]]:
+    """The cells, ascending, of what a motion may have run into at a pose (3,), by where they lie.
+
+    CONTACT, LEFT and RIGHT begin within a cell's side of the footprint: straight ahead of where its centre
+    goes (a turn swings it), and to both sides of that. BEHIND them lies the rest of a thing of the usual
+    size. What the footprint covered at the poses driven [n, 3] is none of it.
     """
+    cells, gap, bearing = _around(body, pose, THING)
+    aside = np.remainder(bearing - _direction(body, pose, motion) + math.pi, 2.0 * math.pi) - math.pi
+    far = gap + body.radius
+    x, y = far * np.cos(aside), far * np.sin(aside)
+    rim = (gap > -TOUCH) & (gap <= body.resolution)
+    thing = np.hypot(x - body.radius - 0.5 * THING, y) <= 0.5 * THING
+    clear = np.unique(np.concatenate([cells_under(body, at, UNDER) for at in driven]))
+    parts = (
+        (BEHIND, thing & ~rim),
+        (LEFT, rim & (aside > ARC) & (aside <= ASIDE)),
+        (RIGHT, rim & (aside < -ARC) & (aside >= -ASIDE)),
+        (CONTACT, rim & (np.abs(aside) <= ARC)),
+    )
+    return [(by, np.setdiff1d(cells[part], clear)) for by, part in parts]
+
+
+def _direction(body: Body, pose: Floats, motion: int) -> float:
+    """Where the footprint's centre goes [rad]."""
     far, turn = displacement(body, motion)
-    direction = pose[2] + (0.0 if far > 0.0 else math.pi)
     if far == 0.0:
-        direction = pose[2] + math.atan2(body.offset_y, body.offset_x) + math.copysign(0.5 * math.pi, turn)
-    cells, gap, bearing = _around(body, pose)
-    aside = np.abs(np.remainder(bearing - direction + math.pi, 2.0 * math.pi) - math.pi)
-    touched: Ints = cells[(gap > -TOUCH) & (gap <= body.resolution) & (aside <= ARC)]
-    return touched
+        swing: float = pose[2] + math.atan2(body.offset_y, body.offset_x) + math.copysign(0.5 * math.pi, turn)
+        return swing
+    return float(pose[2]) + (0.0 if far > 0.0 else math.pi)
 
 
 def cells_under(body: Body, pose: Floats, deep: float) -> Ints:
     """The cells, ascending, that the footprint at a pose (3,) covers by more than `deep` [m]."""
-    cells, gap, _ = _around(body, pose)
+    cells, gap, _ = _around(body, pose, 0.0)
     under: Ints = cells[gap < -deep]
     return under
 
 
-def _around(body: Body, pose: Floats) -> tuple[Ints, Floats, Floats]:
-    """The cells about the footprint, how far each is from it [m], and in which direction from its centre."""
+def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floats]:
+    """The cells within `beyond` [m] of the footprint, how far each is from it, and where from its centre."""
     x, y, theta = pose
     c, s, h = math.cos(theta), math.sin(theta), body.resolution
     dx = x + body.offset_x * c - body.offset_y * s - body.origin_x
     dy = y + body.offset_x * s + body.offset_y * c - body.origin_y
     u, v = body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
-    reach = body.radius + 2.0 * h
+    reach = body.radius + beyond + h
     height, width = body.occupied.shape
     rows = np.arange(max(math.floor((v - reach) / h), 0), min(math.floor((v + reach) / h) + 1, height))
     columns = np.arange(max(math.floor((u - reach) / h), 0), min(math.floor((u + reach) / h) + 1, width))
