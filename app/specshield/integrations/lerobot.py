@@ -3,11 +3,9 @@
     shielded = ShieldedPolicy(policy, shield, row_of)
     action = shielded.select_action(batch)                   # [1, D], as the policy's own
 
-For policies whose `predict_action_chunk` draws a new sample at each call from the batch alone (pi0, SmolVLA).
-A Diffusion policy keeps a queue of observations that its own `select_action` fills, so its
-`predict_action_chunk` cannot be asked several times: it does not fit here yet. ACT gives the same chunk each
-time, so that a forbidden one is replaced by the certified continuation at once (see `samples`). A policy with
-discrete actions needs none of this: give its logits to `session.step`.
+For policies that draw a new sample at each call (pi0, SmolVLA, Diffusion, TD-MPC). ACT gives the same chunk
+each time, so that a forbidden one is replaced by the certified continuation at once (see `samples`). A policy
+with discrete actions needs none of this: give its logits to `session.step`.
 """
 
 from __future__ import annotations
@@ -26,7 +24,8 @@ from specshield.integrations.samples import SampleShield
 class Policy(Protocol):
     """What is used of lerobot's PreTrainedPolicy (0.4)."""
 
-    def predict_action_chunk(self, batch: dict[str, torch.Tensor]) -> torch.Tensor: ...
+    def predict_action_chunk(self, batch: dict[str, Any]) -> torch.Tensor: ...
+    def select_action(self, batch: dict[str, Any]) -> torch.Tensor: ...
     def reset(self) -> None: ...
 
 
@@ -44,17 +43,30 @@ class ShieldedPolicy:
         self.decision: Decision | None = None
 
     @torch.no_grad()
-    def select_action(self, batch: Mapping[str, Any]) -> torch.Tensor:
+    def select_action(self, observation: Mapping[str, Any]) -> torch.Tensor:
         """One action [1, D] for a batch of one observation."""
+        batch = self._observed(observation)
         chunks = [self._policy.predict_action_chunk(dict(batch)) for _ in range(self._samples)]
         rows = [chunk[0, 0].double().cpu().numpy() for chunk in chunks]
-        chosen = self._shield.choose(rows, batch)
+        chosen = self._shield.choose(rows, observation)
         self.decision = chosen.decision
         if chosen.sample is not None:
             return chunks[chosen.sample][:, 0]
         action = self._shield.robot.actions[chosen.action]
         row = self._row_of(action.translate, action.rotate, rows[0])
         return torch.as_tensor(np.asarray(row)[None]).to(chunks[0])
+
+    def _observed(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What `predict_action_chunk` is to be given. A policy that looks at several observations keeps them
+        in queues, which its own `select_action` fills; of a batch it then reads the names alone.
+        """
+        queues: dict[str, Any] = getattr(self._policy, "_queues", None) or {}
+        kept = [name for name in queues if name != "action"]
+        if not kept:
+            return observation
+        queues["action"].clear()  # else it would run an older chunk to its end, and draw no new one
+        self._policy.select_action(dict(observation))
+        return dict.fromkeys(kept)
 
     def reset(self) -> None:
         """Of the policy; a session is for one episode, so a new one takes a new wrapper."""
