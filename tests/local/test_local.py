@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from specshield.client import ShieldClient
-from specshield.errors import HistoryConflict, InfeasibleStart, NotFound, SessionFinished
+from specshield.errors import HistoryConflict, InfeasibleStart, InfeasibleSwitch, NotFound, SessionFinished
 from specshield.local import LocalShield
 from specshield.world.occupancy import OccupancyGrid
 from tests.serving import RunningServer
@@ -45,7 +45,7 @@ def test_a_server_decides_the_same_to_the_bit(server: RunningServer, settings: d
         remote = client.sessions.create(policy_id="case1", **options)
         local = LocalShield.shipped("case1").session(**options)
         assert replace(remote.info, id="", expires_at="", map_id="", spec={}, rules=()) == replace(
-            local.info, id="", expires_at="", map_id="", spec={}
+            local.info, id="", expires_at="", map_id="", spec={}, rules=()
         )
         pose = START
         while not local.finished:
@@ -74,6 +74,45 @@ def test_a_server_decides_the_same_to_the_bit(server: RunningServer, settings: d
             json.loads(json.dumps([each.t, each.pose, each.signals, each.decision]))
             for each in remote.trajectory()
         ]
+
+
+def test_a_server_switches_the_same(server: RunningServer) -> None:
+    """The same rule with a new clock, then by another policy with the clock kept; then one that cannot be."""
+    random = np.random.default_rng(3)
+    with ShieldClient(server.url, timeout=300.0) as client:
+        remote = client.sessions.create(policy_id="case1", initial_pose=START, seed=5)
+        local = LocalShield.shipped("case1").session(initial_pose=START, seed=5)
+        pose = START
+        for t in range(60):
+            if t == 20:
+                told = (
+                    remote.switch("case1", clock="restart", pose=pose),
+                    local.switch(LocalShield.shipped("case1"), clock="restart", pose=pose),
+                )
+            if t == 40:
+                told = remote.switch("case1-dqn"), local.switch(LocalShield.shipped("case1-dqn"))
+            if t in (20, 40):
+                there, here = told
+                assert [rule["spec_status"] for rule in there.rules] == [
+                    rule["spec_status"] for rule in here.rules
+                ]
+                assert (there.spec_status, there.next_t, there.any_signal) == (
+                    here.spec_status, here.next_t, here.any_signal,
+                )  # fmt: skip
+            logits = random.normal(0.0, 1.0, 20)
+            logits[4] = -np.inf
+            decision = local.step(pose, logits, deadline=0.1)
+            assert decision == replace(remote.step(pose, logits), timings={})
+            pose = decision.next_poses[decision.execute]
+        assert [(each.t, each.rule) for each in local.trajectory()] == [
+            (each.t, each.rule) for each in remote.trajectory()
+        ]
+        assert [decision.t for decision in local.events(55)] == [56, 57, 58, 59]
+        wall = LocalShield.make(LocalShield.shipped("case1").task.grid, "F[0,3] x > 9 and F[0,3] x < 1")
+        with pytest.raises(InfeasibleSwitch):
+            local.switch(wall, clock="restart")
+        assert local.info.rules[-1]["policy_ids"] == local.info.policy_ids
+        assert local.close(pose) == remote.close(pose)
 
 
 def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -> None:

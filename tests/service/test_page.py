@@ -145,6 +145,42 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
     assert len(complaints) - len(unasked) <= 2
 
 
+def test_a_floor_with_robots_that_are_over(server, client, begin, step):
+    """Walls, ways and steps are there; what is seen follows the wheel, the mouse and the keys."""
+    sessions = [begin(), begin()]
+    for session in sessions:
+        for t, pose in enumerate(ahead(3)):
+            assert step(session, t, [pose]).status_code == 200
+        client.post(f"/v1/sessions/{session['id']}/close", json={})
+    with browsing() as (page, complaints):
+        page.goto(f"{server.url}/#/floor?sessions={','.join(session['id'] for session in sessions)}")
+        page.locator(".walls image").wait_for(state="attached")
+        page.get_by_text("3 / 3").wait_for()
+        assert page.locator(".robot:not([hidden])").count() == 2
+        assert page.locator("tbody td.number").first.inner_text() == "3"
+        floor = page.locator("svg.floor")
+
+        def seen():
+            return [float(value) for value in floor.get_attribute("viewBox").split()]
+
+        whole, box = seen(), floor.bounding_box()
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.mouse.wheel(0, -500)
+        page.wait_for_function("document.querySelector('svg.closer')")
+        closer = seen()
+        assert closer[2] < whole[2] / 2
+        page.mouse.down()
+        page.mouse.move(box["x"] + 20, box["y"] + box["height"] / 2, steps=3)
+        page.mouse.up()
+        assert seen()[0] > closer[0]
+        floor.focus()
+        page.keyboard.press("0")
+        assert seen() == whole
+        page.get_by_role("button", name="Closer").click()
+        assert seen()[2] < whole[2]
+    assert complaints == []
+
+
 def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step):
     session = begin()
     with browsing() as (page, complaints):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from specshield import handover
 from specshield.client.models import (
     Decision,
     Explanation,
@@ -23,25 +24,39 @@ from specshield.client.models import (
 )
 from specshield.client.wire import Logits, Numbers, Points, logit_values, point_values, pose_values
 from specshield.errors import HistoryConflict, SessionFinished, StepConflict
+from specshield.local.rule import Rule
+from specshield.reasons import refusal
 from specshield.robot.dynamics import wrap
 from specshield.shield import decision as core
 from specshield.shield import episode
 from specshield.shield.decision import Carry, Shield
+from specshield.shield.signals import any_signal
 from specshield.task import Task, check_signals
+
+if TYPE_CHECKING:
+    from specshield.local.shield import LocalShield
 
 OWN = ("execute", "timings", "source", "action_names")  # what the SDK adds to the answer of the contract
 ASKED = ("witnesses", "explanations", "any_signal")  # what an answer has where there is something to say
 
 
 class LocalSession:
-    """As `specshield.client.Session`: `t` is the next step, and a `step` that raises leaves all as it was."""
+    """As `specshield.client.Session`: `t` is the next step, and a `step` that raises leaves all as it was.
 
-    def __init__(self, shield: Shield, info: SessionInfo, initial_pose: Pose) -> None:
+    What differs, since nobody is asked and nothing waited for: `switch` takes a LocalShield; `events` ends
+    with what is decided by now; a decision cannot be broken off, so that a `deadline` is taken and not kept.
+    """
+
+    def __init__(
+        self, policy: LocalShield, shield: Shield, shaping: str, info: SessionInfo, initial_pose: Pose
+    ) -> None:
         self.info = info
         self.t = 0
         self.spec_status: SpecStatus = info.spec_status
         self.finished = self.main_task_done = self.closed = False
-        self._shield, self._initial = shield, initial_pose
+        self._shaping, self._initial = shaping, initial_pose
+        self._rules = [Rule(policy, shield)]
+        self._first = dict(shield.task.signals)
         self._carry: Carry | None = None
         self._poses: list[Pose] = []
         self._signals: dict[str, list[float]] = {name: [] for name in shield.task.signals}
@@ -54,7 +69,11 @@ class LocalSession:
     @property
     def task(self) -> Task:
         """The map, the robot and the rule."""
-        return self._shield.task
+        return self._rule.shield.task
+
+    @property
+    def _rule(self) -> Rule:
+        return self._rules[-1]
 
     def __enter__(self) -> LocalSession:
         return self
@@ -76,30 +95,31 @@ class LocalSession:
         occupied: Points | None = None,
         free: Points | None = None,
         explain: bool = False,
+        deadline: float | None = None,
     ) -> Decision:
         """Decide step t from x_t = (x, y, theta) and one logit an action; run `decision.execute`.
 
-        The arguments are those of the SDK's `Session.step`, but for its `deadline`: nothing is waited for.
-        Raises what that raises where the caller is wrong.
+        The arguments are those of the SDK's `Session.step`, so that one loop serves both; `deadline` does
+        nothing here. Raises what that raises where the caller is wrong.
         """
         over = self.main_task_done if main_task_done is None else main_task_done
         self._check(over)
-        check_signals(self._shield.task, signals or {})
+        check_signals(self.task, signals or {})
         x_t = self._at(pose)
         held = self._held(signals or {})
         made = episode.decide(
-            self._shield,
-            np.array([*self._poses, x_t]),
+            self._rule.shield,
+            self._rule.since([*self._poses, x_t]),
             None if logits is None else _log(logits),
             over,
-            {name: np.array(values) for name, values in held.items()},
+            self._rule.signals(held),
             self._carry,
             witnesses,
             None if occupied is None else np.array(point_values(occupied, "occupied")).reshape(-1, 2),
             None if free is None else np.array(point_values(free, "free")).reshape(-1, 2),
             explain,
         )
-        answer = _answer(made, self.info, over, witnesses, explain)
+        answer = _answer(replace(made, t=self.t), self.info, over, witnesses, explain)
         self._poses.append(x_t)
         self._signals, self._carry, self._decisions[self.t] = held, made.carry, answer
         self.t += 1
@@ -115,13 +135,53 @@ class LocalSession:
         self._signals = self._held({}, len(self._poses))
         self.t += 1
 
+    def switch(
+        self, policy: LocalShield, *, clock: Literal["keep", "restart"] = "keep", pose: Numbers | None = None
+    ) -> SessionInfo:
+        """Go on under another rule, on another map or for another robot, from the next step on.
+
+        `clock` and `pose` are those of the SDK's `Session.switch`. Raises InfeasibleSwitch where the new rule
+        cannot be kept from there; nothing is changed then.
+        """
+        self._check(self.main_task_done)
+        x_t = self._foreseen() if pose is None else self._at(pose)
+        old, rule = self._rule, self._rule.followed_by(policy, self._shaping, self.t, clock)
+        first = {**policy.task.signals, **self._first}
+        held = self._held({}, self.t + 1, first)
+        seen, signals = rule.since([*self._poses, x_t]), rule.signals(held)
+        same_map = self.info.map_id == policy.task.grid.content_hash
+        same_robot = old.policy.card["robot"] == policy.card["robot"]
+        carry = handover.carried_over(self._carry, same_map, same_robot, rule.origin - old.origin)
+        refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
+        known = self._poses if pose is None else [*self._poses, x_t]
+        ended = old.told(old.verdict(known, held)[0])
+        self._rules.append(rule)
+        self._carry, self._first = carry, first
+        self._signals = {name: values[: self.t] for name, values in held.items()}
+        self.spec_status, _ = rule.verdict(known, held)
+        self.info = replace(
+            self.info, **policy.about(), next_t=self.t, feasible=True, spec_status=self.spec_status,
+            rules=(*self.info.rules[:-1], ended, rule.told(self.spec_status)),
+            any_signal=any_signal(rule.shield, seen, signals),
+        )  # fmt: skip
+        return self.info
+
+    def events(self, after: int | None = None) -> Iterator[Decision]:
+        """The decisions after step `after`, by default those that follow; -1: from the first. It ends with
+        what is decided when it is asked for the next.
+        """
+        t = self.t if after is None else after + 1
+        while t < self.t:
+            if t in self._decisions:
+                yield self._decisions[t]
+            t += 1
+
     def close(self, pose: Numbers | None = None) -> Verdict:
         """End the session; `pose` is the state the last action led to. Closing again changes nothing."""
         if not self.closed and pose is not None:
             self.record(pose)
         poses = self._poses or [self._initial]
-        signals = {name: np.array(values) for name, values in self._signals.items()}
-        status, bounds = episode.close(self._shield, poses, signals)
+        status, bounds = self._rule.verdict(poses, self._held({}, len(poses)))
         self.closed = self.finished = True
         self.spec_status = status
         low, high = (value if math.isfinite(value) else None for value in bounds)
@@ -131,8 +191,9 @@ class LocalSession:
         """The states x_0..x_t, and the answers by the contract's names."""
         held = self._held({}, len(self._poses))
         return tuple(
-            TrajectoryItem(t, pose, {name: values[t] for name, values in held.items()}, self._told(t))
+            TrajectoryItem(t, pose, {name: values[t] for name, values in held.items()}, self._told(t), rule)
             for t, pose in enumerate(self._poses)
+            for rule in [max(i for i, each in enumerate(self._rules) if each.begins <= t)]
         )
 
     def _check(self, over: bool) -> None:
@@ -149,6 +210,13 @@ class LocalSession:
                 path="main_task_done", got=False, expected="true",
             )  # fmt: skip
 
+    def _foreseen(self) -> Pose:
+        """Where the last decision's action leads."""
+        last = self._decisions.get(self.t - 1)
+        if last is None:
+            return self._poses[-1] if self._poses else self._initial
+        return self._poses[-1] if last.execute is None else last.next_poses[last.execute]
+
     def _at(self, pose: Numbers) -> Pose:
         """x_t. Raises HistoryConflict where x_0 is not where the session began."""
         x_t = pose_values(pose)
@@ -161,14 +229,17 @@ class LocalSession:
             )
         return self._initial
 
-    def _held(self, sent: Mapping[str, float], length: int | None = None) -> dict[str, list[float]]:
+    def _held(
+        self, sent: Mapping[str, float], length: int | None = None, first: Mapping[str, float] | None = None
+    ) -> dict[str, list[float]]:
         """The signals up to `length` steps, by default those with the step that is decided now. A signal
-        that is not sent holds its last value.
+        that is not sent holds its last value, at first that of `first`, by default the rules' own.
         """
-        n, first = len(self._poses) + 1 if length is None else length, self._shield.task.signals
+        n = len(self._poses) + 1 if length is None else length
         held = {}
-        for name, values in self._signals.items():
-            known = values[-1] if values else first[name]
+        for name, begins in (self._first if first is None else first).items():
+            values = self._signals.get(name, [])
+            known = values[-1] if values else begins
             grown = values + [known] * (n - len(values))
             held[name] = [*grown[:-1], float(sent[name])] if name in sent else grown
         return held

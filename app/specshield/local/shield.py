@@ -15,6 +15,7 @@ import numpy as np
 from specshield.client.models import SessionInfo
 from specshield.client.wire import pose_values
 from specshield.errors import MapError, NotFound, PolicyError
+from specshield.local.rule import Rule
 from specshield.local.session import LocalSession
 from specshield.lookahead.preferences import PROJECTION, check_shaping, prepare
 from specshield.policy.methods import DEFAULT, METHODS, Run, load_policy
@@ -161,21 +162,15 @@ class LocalShield:
         known = (
             (Uncertainty() if told == "learned" else None) if isinstance(told, str) else Uncertainty(**told)
         )
-        shield = replace(self.shield, config=Config(**settings, uncertainty=known, any_signal=told != "none"))
+        config = Config(**settings, uncertainty=known, any_signal=told != "none")
         if shaping != PROJECTION:
-            check_preferring(shield.config)
-            shield = replace(shield, preference=self._preference(shaping))
+            check_preferring(config)
+        shield = self.configured(config, shaping)
         feasible = refusal.begin(shield, pose, allowed)
         status, _ = episode.close(shield, [pose])
-        task = self.task
         info = SessionInfo(
             id=id,
-            policy_ids=(str(self.card["id"]),),
-            map_id=task.grid.content_hash,
-            spec={"formula": str(task.formula), "regions": self.card["spec"].get("regions", {})},
-            horizon=task.horizon,
-            actions=task.robot.action_names,
-            terminal_actions=tuple(np.flatnonzero(task.robot.terminal).tolist()),
+            **self.about(),
             next_t=0,
             feasible=feasible,
             spec_status=status,
@@ -183,9 +178,27 @@ class LocalShield:
             finished=False,
             expires_at="",
             margin=shield.config.margin,
+            rules=(Rule(self, shield).told(status),),
             any_signal=any_signal(shield, np.array([pose], np.float64)),
         )
-        return LocalSession(shield, info, pose)
+        return LocalSession(self, shield, shaping, info, pose)
+
+    def configured(self, config: Config, shaping: str) -> Shield:
+        """The shield with a session's settings."""
+        shield = replace(self.shield, config=config)
+        return shield if shaping == PROJECTION else replace(shield, preference=self._preference(shaping))
+
+    def about(self) -> dict[str, Any]:
+        """What a session's info holds of its policy, and of the task that it is for."""
+        task = self.task
+        return {
+            "policy_ids": (str(self.card["id"]),),
+            "map_id": task.grid.content_hash,
+            "spec": {"formula": str(task.formula), "regions": self.card["spec"].get("regions", {})},
+            "horizon": task.horizon,
+            "actions": task.robot.action_names,
+            "terminal_actions": tuple(np.flatnonzero(task.robot.terminal).tolist()),
+        }
 
     @cache  # noqa: B019  a preference takes seconds to prepare, and shields are few
     def _preference(self, name: str) -> Any:

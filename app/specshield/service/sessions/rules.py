@@ -13,16 +13,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from specshield import handover
 from specshield.arrays import Floats
 from specshield.shield.decision import Carry
-from specshield.shield.taught import Taught
 
-NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
 MOST_RULES = 256  # of one session; chosen by hand: every load of the session reads their lines
 Config = Mapping[str, Any]
 
@@ -68,35 +66,9 @@ def widened(rows: Floats, names: Sequence[str], signals: Mapping[str, float]) ->
 
 
 def carried_over(carry: Carry | None, old: Config, new: Config) -> Carry | None:
-    """What the last decision under the old rule hands to the first one under the new.
-
-    What the map has learned stays where the map is the same, what is known of the robot where the robot is;
-    where both are and the clock goes on, so does what the last motion should have led to. Continuations are
-    of the old rule.
-    """
-    if carry is None:
-        return None
+    """What the last decision under the old rule hands to the first one under the new."""
     same_map, same_robot = old["map_id"] == new["map_id"], old["robot"] == new["robot"]
-    stays = same_map and same_robot and origin(old) == origin(new)
-    return replace(
-        carry,
-        t=carry.t if stays else NEVER,
-        next_poses=carry.next_poses if stays else np.empty((0, 3)),
-        witnesses=(None,) * len(carry.witnesses) if stays else (),
-        memory=None,
-        residuals=carry.residuals if same_robot else None,
-        threshold_left=None,
-        learned=_learned(carry.learned, origin(new) - origin(old)) if same_map else None,
-        action=carry.action if stays else None,
-    )
-
-
-def _learned(learned: bytes | None, later: int) -> bytes | None:
-    """What the map has learned, by a clock that begins so many steps later."""
-    if not learned or not later:
-        return learned
-    known = Taught.from_bytes(learned)
-    return replace(known, map=replace(known.map, step=known.map.step - later)).to_bytes()
+    return handover.carried_over(carry, same_map, same_robot, origin(new) - origin(old))
 
 
 def told(rules: Sequence[Config], verdicts: Sequence[str]) -> list[dict[str, Any]]:

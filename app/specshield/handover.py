@@ -1,0 +1,44 @@
+"""What a session takes along when another rule, map or robot holds from some step on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from specshield.shield.decision import Carry
+from specshield.shield.taught import Taught
+
+NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
+
+
+def carried_over(carry: Carry | None, same_map: bool, same_robot: bool, later: int) -> Carry | None:
+    """What the last decision under the old rule hands to the first one under the new, whose windows count
+    from `later` steps later.
+
+    What the map has learned stays where the map is the same, what is known of the robot where the robot is;
+    where both are and the clock goes on, so does what the last motion should have led to. Continuations are
+    of the old rule.
+    """
+    if carry is None:
+        return None
+    stays = same_map and same_robot and later == 0
+    return replace(
+        carry,
+        t=carry.t if stays else NEVER,
+        next_poses=carry.next_poses if stays else np.empty((0, 3)),
+        witnesses=(None,) * len(carry.witnesses) if stays else (),
+        memory=None,
+        residuals=carry.residuals if same_robot else None,
+        threshold_left=None,
+        learned=_learned(carry.learned, later) if same_map else None,
+        action=carry.action if stays else None,
+    )
+
+
+def _learned(learned: bytes | None, later: int) -> bytes | None:
+    """What the map has learned, by a clock that begins so many steps later."""
+    if not learned or not later:
+        return learned
+    known = Taught.from_bytes(learned)
+    return replace(known, map=replace(known.map, step=known.map.step - later)).to_bytes()

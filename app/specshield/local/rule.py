@@ -1,0 +1,67 @@
+"""A rule that a session in process has, or had."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.client.models import Pose, SpecStatus
+from specshield.errors import InputError
+from specshield.shield import episode
+from specshield.shield.decision import Shield
+
+if TYPE_CHECKING:
+    from specshield.local.shield import LocalShield
+
+CLOCKS = ("keep", "restart")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """begins: the first step that it decides. origin: the step from which its windows count, and its history.
+    shield: with the session's settings, told in steps from `origin`, as the core counts them.
+    """
+
+    policy: LocalShield
+    shield: Shield
+    begins: int = 0
+    origin: int = 0
+    clock: str = "restart"
+
+    def followed_by(self, policy: LocalShield, shaping: str, t: int, clock: str) -> Rule:
+        """The rule that holds from step t on. Each origin has a seed of its own, as on a server."""
+        if clock not in CLOCKS:
+            raise InputError("no such clock", path="clock", got=clock, expected=" or ".join(CLOCKS))
+        origin, config = t if clock == "restart" else self.origin, self.shield.config
+        last = max(self.shield.max_steps + self.origin, origin + policy.task.horizon + 1)
+        settings = replace(config, seed=config.seed - self.origin + origin, max_steps=last - origin)
+        return Rule(policy, policy.configured(settings, shaping), t, origin, clock)
+
+    def since(self, poses: Sequence[Pose]) -> Floats:
+        """The poses that it looks at."""
+        return np.array(poses[self.origin :]).reshape(-1, 3)
+
+    def signals(self, held: Mapping[str, Sequence[float]]) -> dict[str, Floats]:
+        return {name: np.array(held[name][self.origin :]) for name in self.shield.task.signals}
+
+    def verdict(
+        self, poses: Sequence[Pose], held: Mapping[str, Sequence[float]]
+    ) -> tuple[SpecStatus, tuple[float, float]]:
+        if len(poses) <= self.origin:
+            return "pending", (-math.inf, math.inf)
+        return episode.close(self.shield, self.since(poses), self.signals(held))
+
+    def told(self, status: SpecStatus) -> dict[str, Any]:
+        """As the contract shows it."""
+        about = self.policy.about()
+        return {
+            "from": self.begins, "origin": self.origin, "clock": self.clock,
+            "policy_ids": about["policy_ids"], "map_id": about["map_id"],
+            "formula": about["spec"]["formula"], "horizon": about["horizon"], "actions": about["actions"],
+            "terminal_actions": about["terminal_actions"], "spec_status": status,
+        }  # fmt: skip
