@@ -47,6 +47,9 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
         sys.exit(f"This command needs Python 3.11 or later; this is {sys.version.split()[0]}")
     if typer is None:
         sys.exit(NEEDS_SERVER)
+    kernels = Path(sys.prefix) / "numba-cache"  # where `make` keeps them: what it compiled serves here too
+    if kernels.is_dir():
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(kernels))
     app = typer.Typer(
         help="Keeps robot foundation models inside their operating rules.",
         epilog="The commands evaluate and report come with evaluation/, from a checkout: make install.",

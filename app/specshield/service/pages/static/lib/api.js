@@ -25,14 +25,25 @@ export async function fetched(path, options = {}) {
     const key = sessionStorage.getItem(KEY);
     const headers = { ...options.headers, ...(key ? { Authorization: `Bearer ${key}` } : {}) };
     const response = await fetch(path, { ...options, headers });
-    if (response.ok) return response;
+    if (response.ok) {
+      starting("");
+      return response;
+    }
     const told = await response.json().catch(() => ({ status: response.status, detail: response.statusText }));
     if (response.status === 401) {
       await askForKey(wrong || key !== null);
       wrong = true;
-    } else if (told.type === "starting") await wait(Number(response.headers.get("Retry-After")) || 1);
-    else throw new Problem(told);
+    } else if (told.type === "starting") {
+      starting(`One moment: ${told.detail}.`);
+      await wait(Number(response.headers.get("Retry-After")) || 1);
+    } else throw new Problem(told);
   }
+}
+
+/** Says how far a server is that is not ready yet. */
+function starting(text) {
+  const place = document.getElementById("starting");
+  if (place.textContent !== text) place.textContent = text;
 }
 
 /** JSON of an answer. json: a body to send; form: files to send. */
