@@ -1,10 +1,11 @@
 """Narrow predicates: of the starts that an exact search finds feasible, how many are accepted, and kept.
 
-    python -m benchmarks.narrow [--n 500] [--seed 0] [--method reachability] [--episodes 1]
+    python -m benchmarks.narrow [--n 500] [--seed 0] [--method reachability] [--robot restless] [--episodes 1]
 
 Houses are drawn (evaluation/model/floor_plans.py), a new one for every ten rules. A rule asks the Stretch to
 be, once or for some steps, where a narrow predicate holds: a disc with a radius from 0.02 m, a strip, a
-window of headings from 2 degrees, or a disc with such a window. Start and deadline are random. The search
+window of headings from 2 degrees, or a disc with such a window. Start and deadline are random. The restless
+robot is a Stretch that cannot wait; it is asked to be there once. The search
 (exact.py) shares no code with the policies. Of the accepted starts, an episode of a model that draws its
 logits at random is run to the end. Prints Markdown, one row for each kind of predicate, with 95 % intervals.
 """
@@ -26,7 +27,7 @@ from evaluation.model.floor_plans import random_house
 from evaluation.statistics import clopper_pearson
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
-from specshield.robot import STRETCH
+from specshield.robot import STRETCH, Robot, robot_from_json
 from specshield.robot.dynamics import make_body
 from specshield.shield.episode import Shield, decide, make_shield, start
 from specshield.task import make_task
@@ -64,13 +65,26 @@ KINDS: dict[str, Callable[[Random, Floats], Goal]] = {
 }
 
 
+def restless() -> Robot:
+    """The motions of the Stretch without the one that waits."""
+    motions = [motion for motion in STRETCH.motions if motion != (0.0, 0.0)]
+    actions = [
+        {"name": f"{move:g} {turn:.3f}", "translate": move, "rotate": turn} for move, turn in motions
+    ] + [{"name": "end", "terminal": True}]
+    footprint = {"radius": STRETCH.radius, "offset": list(STRETCH.offset)}
+    return robot_from_json({"footprint": footprint, "on_contact": "stop", "actions": actions})
+
+
+ROBOTS = {"stretch": lambda: STRETCH, "restless": restless}
+
+
 def runs(
     shield: Shield, pose: Floats, goal: Goal, dwell: int, by: int, random: Random
 ) -> tuple[bool, list[float]]:
     """Whether an episode from a pose keeps the rule, by the goal's own geometry; [ms] of each decision."""
-    poses, carry, took = [pose], None, list[float]()
+    poses, carry, took, robot = [pose], None, list[float](), shield.task.robot
     while len(poses) <= shield.task.horizon:
-        logits = np.where(STRETCH.terminal, -np.inf, random.normal(0.0, 3.0, len(STRETCH.actions)))
+        logits = np.where(robot.terminal, -np.inf, random.normal(0.0, 3.0, len(robot.actions)))
         began = time.perf_counter()
         decision = decide(shield, poses, logits, carry=carry)
         took.append(1e3 * (time.perf_counter() - began))
@@ -86,23 +100,25 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--method", default="reachability", choices=("reachability", "planner"))
+    parser.add_argument("--robot", default="stretch", choices=tuple(ROBOTS))
     parser.add_argument("--episodes", type=int, default=1, help="0 or 1 for each accepted start")
     asked = parser.parse_args()
+    robot = ROBOTS[asked.robot]()
     method = import_module(f"specshield.policy.{asked.method}.policy")
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     times: dict[str, list[float]] = defaultdict(list)
     for n in range(asked.n):
         random = np.random.default_rng([asked.seed, n])
         house = random_house(np.random.default_rng([asked.seed, n // 10, 1]))
-        body = make_body(STRETCH, house.grid)
+        body = make_body(robot, house.grid)
         kind = list(KINDS)[n % len(KINDS)]
-        plain = make_task(house.grid, STRETCH, "F[0,1] x > 0")
+        plain = make_task(house.grid, robot, "F[0,1] x > 0")
         pose, at = free_poses(plain, body, 2, random)
         goal, by = KINDS[kind](random, at), int(random.integers(20, 121))
-        dwell = DWELL if random.random() < 0.3 else 0
+        dwell = DWELL if random.random() < 0.3 and robot.wait_motion >= 0 else 0
         formula = f"F[0,{by}] G[0,{dwell}] {goal.formula()}" if dwell else f"F[0,{by}] {goal.formula()}"
         regions = {"Dock": {"type": "circle", "center": [goal.x, goal.y], "radius": goal.radius}}
-        task = make_task(house.grid, STRETCH, formula, regions if goal.radius < math.inf else {})
+        task = make_task(house.grid, robot, formula, regions if goal.radius < math.inf else {})
         began = time.perf_counter()
         least = fewest_steps(body, goal, *map(float, pose), by, MOST, NOWHERE)
         searched = time.perf_counter() - began

@@ -63,8 +63,8 @@ def test_steps_to_go_after_each_motion(leading):
 
 
 def test_what_cannot_be_reached_is_out_of_reach():
-    """The cell in the corner is free and walled in: no motion leads there or away."""
-    cells = cells_of("F[0,9] B", places={"B": (4, 0)})
+    """B lies off the map, and not right beside it: what the lattice just misses counts as narrow."""
+    cells = cells_of("F[0,9] B", places={"B": (7, 0)})
     world, _, _ = plan_from(cells, (0, 0, NORTH))
     f = int(world.field[literal_of(cells, "B", 1), 0])
     assert to_go_at(cells.body, world.fields, f, *cells.pose(0, 0, NORTH)) >= OUT_OF_REACH

@@ -23,7 +23,8 @@ from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, r
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.
-GRAIN = 0.1  # [m] poses that differ by less, and by less than a degree, count once
+NEAR = 3.0  # [steps] from where the field leads: nearer than this, poses are told apart by the finer grain
+GRAIN, FINE = 0.1, 0.02  # [m] poses that differ by less, and by less than a degree, count once
 ASTRAY = 6.0  # [steps] by which the fields may err
 OPTIMISM = 1.05  # the fields say a little less than there is to go
 DEEPER = 1e-3  # [steps] by which a pose farther on its way goes before one that is as good
@@ -119,7 +120,7 @@ def _reach(
                 continue
             tree.pose[count, 0], tree.pose[count, 1], tree.pose[count, 2] = x, y, theta
             tree.made[count], tree.parent[count], tree.motion[count] = made, here, m
-            if not _is_new(tree, count):
+            if not _is_new(tree, count, FINE if ahead < NEAR else GRAIN):
                 continue
             read_pose(world.literals, x, y, theta, way.values, way.stack, way.rho)
             if not keeps(world, k, way.t + n + made, need, way.rho):
@@ -145,14 +146,14 @@ def _write(world: World, way: Way, n: int, tree: Tree, row: int) -> None:
 
 
 @leaf
-def _is_new(tree: Tree, row: int) -> bool:
+def _is_new(tree: Tree, row: int, grain: float) -> bool:
     """Whether nothing nearly the same as a row was reached in as few steps; the row is then remembered."""
-    x, y, h = _rounded(tree.pose, row)
+    x, y, h = _rounded(tree.pose, row, grain)
     key = x * 73856093 ^ y * 19349663 ^ h * 83492791
     slot = (key ^ key >> 15) & (tree.table.shape[0] - 1)
     while tree.table[slot] >= 0:
         other = tree.table[slot]
-        if _rounded(tree.pose, other) == (x, y, h):
+        if _rounded(tree.pose, other, grain) == (x, y, h):
             if tree.made[other] <= tree.made[row]:
                 return False
             break
@@ -162,8 +163,8 @@ def _is_new(tree: Tree, row: int) -> bool:
 
 
 @leaf
-def _rounded(pose: Floats, row: int) -> tuple[int, int, int]:
-    x, y, h = pose[row, 0] / GRAIN, pose[row, 1] / GRAIN, math.degrees(pose[row, 2])
+def _rounded(pose: Floats, row: int, grain: float) -> tuple[int, int, int]:
+    x, y, h = pose[row, 0] / grain, pose[row, 1] / grain, math.degrees(pose[row, 2])
     return math.floor(x), math.floor(y), math.floor(h + 0.5)
 
 

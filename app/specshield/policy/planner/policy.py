@@ -40,6 +40,7 @@ from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
+from specshield.policy.reachability.sight import BESIDE, about
 from specshield.policy.recall import residuals
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
@@ -198,7 +199,7 @@ def synthesise(
     pitch = _pitch(task, settings)
     packed, literals = literals_of(task, task.formula)
     lattice = make_lattice(make_body(task.robot, task.grid), pitch)
-    holds, free = _holding(task, lattice, literals), lattice.valid == 1
+    (holds, near), free = _holding(task, lattice, literals), lattice.valid == 1
     used = free.any(axis=2)
     codes: dict[tuple[int, tuple[int, ...]], Codes] = {}
     chosen = np.full((len(literals), 2), -1, np.int32)
@@ -209,8 +210,8 @@ def synthesise(
                 allowed = free.copy()
                 for g in keeps:  # the left of an `until` need not hold where the right does
                     ended = (literals[k].predicate, literals[k].side) in literals[g].ends
-                    allowed &= holds[g] | holds[k] if ended else holds[g]
-                codes[k, keeps] = steps_to(lattice, holds[k], allowed)[used]
+                    allowed &= holds[g] | near[k] if ended else holds[g]
+                codes[k, keeps] = steps_to(lattice, near[k], allowed)[used]
             chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
     cell = number_cells(used)
     code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
@@ -276,14 +277,18 @@ def _pitch(task: Task, settings: Settings) -> float:
     return pitch
 
 
-def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> Bools:
-    """Where each literal holds, [L, ny, nx, H], with the signals at their initial values."""
+def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> tuple[Bools, Bools]:
+    """Where each literal holds, [L, ny, nx, H], with the signals at their initial values; and the same with
+    what the lattice does not see (reachability/sight.py): about narrow places, where it may hold close by.
+    """
     known, body = places(task), make_body(task.robot, task.grid)
     programs = pack([compile_predicate(each.predicate, known) for each in literals])
     values = values_at(body, lattice, regions_of(task), programs, initial_signals(task))
     sides = np.array([each.side for each in literals]).reshape(-1, 1, 1, 1)
-    holds: Bools = (values * sides > SATISFIED_ABOVE) & (lattice.valid == 1)
-    return holds
+    rho, valid, beside = values * sides, lattice.valid == 1, BESIDE * lattice.pitch
+    holds: Bools = (rho > SATISFIED_ABOVE) & valid
+    missed = [(rho[k] > -beside) & ~about(holds[k]) & valid for k in range(len(literals))]
+    return holds, holds | np.array(missed, np.bool_).reshape(holds.shape)
 
 
 def _kept(task: Task, packed: PackedLiterals, literals: tuple[Literal, ...]) -> tuple[list[int], list[int]]:

@@ -38,7 +38,7 @@ def look_closely(body: Body, rules: Rules, lattice: Lattice, holds: Bytes) -> tu
         outer, inner = _views(body, rules, lattice, k)
         if rules.kind[k] == ALWAYS and inner.any():
             continue
-        missed = outer & ~_about(inner) & (lattice.valid == 1)
+        missed = outer & ~about(inner) & (lattice.valid == 1)
         if missed.any():
             narrow[k] = True
             holds = holds.copy() if not narrow[:k].any() else holds
@@ -93,7 +93,7 @@ def _look(
                 inner[j, i, h] = least > rules.margin + beside
 
 
-def _about(inner: Bools) -> Bools:
+def about(inner: Bools) -> Bools:
     """Where some pose of `inner` is at most CELLS_ABOUT cells and HEADINGS_ABOUT headings away."""
     found = inner.copy()
     for axis in (0, 1):
