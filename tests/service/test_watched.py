@@ -115,3 +115,6 @@ def test_a_rule_says_when_its_windows_are_and_what_it_avoids(client):
     windows = [(w["operator"], w["begin"], w["end"], w["depth"]) for w in told["windows"]]
     assert windows == [("F", 0, 60, 0), ("G", 0, 65, 1), ("G", 0, 9, 0), ("U", 2, 8, 0)]
     assert told["avoided"] == ["b"]
+    assert told["methods"] == ["planner"]
+    told = client.post("/v1/specs/validate", json={"formula": "F[0,60] a > 1"}).json()
+    assert told["methods"] == ["dqn", "planner", "reachability"]

@@ -19,11 +19,14 @@ SpecStatus = Literal["pending", "satisfied", "violated"]
 
 @dataclass(frozen=True)
 class Spec:
-    """A formula the server has parsed: canonical text, horizon [steps], the names it uses."""
+    """A formula the server has parsed: canonical text, horizon [steps], the names it uses, the methods that
+    take such a rule.
+    """
 
     formula: str
     horizon: int
     names: tuple[str, ...]
+    methods: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

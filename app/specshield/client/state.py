@@ -70,6 +70,10 @@ class SessionState:
         self._circuit = Circuit()
         self._unanswered = -1  # the step that was asked for last without an answer, and not passed over
 
+    def __repr__(self) -> str:
+        over = "over" if self.finished else f"next step {self.t}"
+        return f"<{type(self).__name__} {self.id}: {over}, the rule is {self.spec_status}>"
+
     @property
     def id(self) -> str:
         return self.info.id

@@ -168,7 +168,16 @@ def explain(maps: Maps, settings: Settings, content: bytes, owner: str) -> dict[
         "names": list(formula.names),
         "windows": [asdict(window) for window in windows(formula)][:MOST_WINDOWS],
         "avoided": sorted(avoided(formula)),
+        "methods": _methods(formula),
     }
+
+
+def _methods(formula: stl.Formula) -> list[str]:
+    try:
+        stl.obligations(formula)
+    except FragmentError:
+        return ["planner"]
+    return ["dqn", "planner", "reachability"]
 
 
 def is_multipart(content_type: str) -> bool:

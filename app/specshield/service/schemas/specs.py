@@ -98,6 +98,10 @@ class SpecResponse(Answer):
     names: list[str] = Field(description="The names it uses, sorted.")
     windows: list[Window] = Field(description="When each temporal operator is looked at, outermost first.")
     avoided: list[str] = Field(description="Those of the names that it asks not to hold.")
+    methods: list[str] = Field(
+        description="The methods that take such a rule, of those that come with the server. Whether one can "
+        "serve it on a map shows when a policy is made."
+    )
 
 
 class Spec(Strict):

@@ -77,7 +77,8 @@ export class Rule {
     const body = { formula: this.input.value, regions: this.regions, map_id: this.map.id };
     try {
       const answer = await ask("v1/specs/validate", { json: body, signal: this.asked.signal });
-      this.tell(`It looks at ${answer.horizon + 1} states: steps 0 to ${answer.horizon}.`, answer);
+      const only = answer.methods.length === 1 ? ` Of the methods only ${answer.methods[0]} takes such a rule.` : "";
+      this.tell(`It looks at ${answer.horizon + 1} states: steps 0 to ${answer.horizon}.${only}`, answer);
     } catch (error) {
       if (error.name === "AbortError") return;
       this.tell(error.told?.() ?? error.message, null, error.position ?? 0);
