@@ -32,9 +32,9 @@ class Squares:
     """The occupied cells of a grid, and the ring about it, as squares in grid metres."""
 
     def __init__(self, grid: OccupancyGrid) -> None:
-        rows, columns = np.nonzero(np.pad(grid.occupied, 1, constant_values=True))
-        self.low = (np.column_stack([columns, rows]) - 1.0) * grid.resolution
         self.h, (self.x, self.y, self.yaw) = grid.resolution, grid.origin
+        self.window = math.ceil(0.7 / self.h)  # more than a disc reaches on its arc from where it begins
+        self.taken = np.pad(grid.occupied, self.window + 1, constant_values=True)
 
     def centres(self, pose: Floats, headings: Floats) -> Floats:
         """The centre of the footprint at each heading [n, 2], in grid metres."""
@@ -43,9 +43,15 @@ class Squares:
         return np.column_stack([turned.real, turned.imag])
 
     def gap(self, points: Floats) -> float:
-        """The least distance of points [n, 2], all near the first, from a square."""
-        near = np.all(np.abs(self.low - points[0]) < 0.7, axis=1)
-        low = self.low[near][None] - points[:, None]
+        """The least distance of points [n, 2], all near the first, from a square; inf for a long one."""
+        column, row = np.floor(points[0] / self.h).astype(int)
+        size = 2 * self.window + 1
+        rows, columns = np.nonzero(self.taken[row + 1 : row + 1 + size, column + 1 : column + 1 + size])
+        squares = (np.column_stack([columns + column, rows + row]) - self.window) * self.h
+        low = squares - points[0]
+        reach = np.hypot(*(points - points[0]).T).max() + STRETCH.radius + NEAR
+        squares = squares[np.hypot(*np.maximum(0.0, np.maximum(low, -low - self.h)).T) < reach]
+        low = squares[None] - points[:, None]
         outside = np.maximum(0.0, np.maximum(low, -low - self.h))
         return float(np.sqrt((outside**2).sum(axis=-1).min(initial=np.inf)))
 

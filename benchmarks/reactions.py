@@ -117,6 +117,8 @@ def drive(shield: Shield, model: Away, begun: Run, signals: Mapping[str, Floats]
         decision = decide(shield, poses, model.logits(poses[-1]), signals=seen, carry=carries[-1])
         carries.append(decision.carry)
         poses.append(decision.next_poses[decision.action])
+        if decision.spec_status != "pending":  # whatever follows
+            poses += [poses[-1]] * (shield.task.horizon + 1 - len(poses))
     return Run(poses, signals, carries)
 
 

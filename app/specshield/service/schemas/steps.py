@@ -144,9 +144,9 @@ class StepResponse(Answer):
     )
     any_signal: bool | None = Field(
         None,
-        description="Whether what `distribution` allows keeps the rule whatever the signals do from here on. "
-        "False: if they stay as they are. Left out where the rule reads no signals, and with `uncertainty` "
-        "`none`, which takes them to stay as they are.",
+        description="Whether each action that J allows has a future that keeps the rule whatever the signals "
+        "do from here on. False: only if they stay as they are. Left out where the rule reads no signals, "
+        "and with `uncertainty` `none`, which takes them to stay as they are.",
     )
     explanations: list[Explanation | None] | None = Field(
         None, description="Why each action is forbidden, if asked for; null for one that is allowed."
