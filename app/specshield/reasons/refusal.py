@@ -119,10 +119,11 @@ def _wrong(conjuncts: Sequence[Conjunct]) -> str:
 
 
 def _fails(conjunct: Conjunct) -> str:
-    told = f"{_shown(conjunct)} was not found to be kept even alone"
-    if conjunct.late_by is None:
+    told = f"no way was found to keep {_shown(conjunct)} even alone"
+    late = conjunct.late_by
+    if late is None:
         return f"{told}: its robustness is {conjunct.robustness:.3g} at most"
-    return f"{told}, but would be if {_ends_later(conjunct)}"
+    return f"{told}: the best one comes {late} step{'s' if late != 1 else ''} too late"
 
 
 def _ends_later(conjunct: Conjunct) -> str:
