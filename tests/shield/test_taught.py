@@ -18,6 +18,7 @@ from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield.episode import Config, decide, make_shield
 from specshield.shield.taught import Taught, on_map
 from specshield.task import make_task
+from specshield.world.learned import CONTACT, LearnedMap, learn
 from specshield.world.occupancy import OccupancyGrid
 
 GOAL = {"type": "circle", "center": [3.5, 1.0], "radius": 0.4}
@@ -101,6 +102,27 @@ def test_a_robot_that_something_meets_at_its_side_gets_free(side):
         poses.append(step(body, *poses[-1], int(STRETCH.motion_of[decision.action])))
     assert decision.map_revision >= 1
     assert decision.spec_status == "satisfied"
+
+
+def test_no_motion_is_certified_because_a_mere_mark_would_stop_it():
+    """The place right of x = 1.2 is forbidden, and a mark, not a wall, stops the robot before it."""
+    grid = room().task.grid
+    regions = {
+        "Goal": GOAL | {"center": [0.5, 1.0]},
+        "Right": {"type": "rectangle", "min": [1.2, 0.0], "max": [4.0, 2.0]},
+    }
+    task = make_task(grid, STRETCH, "G[0,20] not Right and F[10,20] Goal", regions)
+    shield = make_shield([synthesise(task, Settings(pitch=0.1))], Config(learn_map=True))
+    poses = [(1.05, 1.0, 0.0)]
+    assert decide(shield, poses, None, True).j_values[AHEAD] == 0.0
+    wall = learn(grid, LearnedMap(revision=1), 0, np.arange(15 * 80 + 24, 25 * 80, 80), True, CONTACT)
+    marked = Taught(wall)
+    carry = replace(decide(shield, poses, None, True).carry, t=0, learned=marked.to_bytes())
+    found = decide(shield, [*poses, *poses], None, True, carry=carry)
+    ends = on_map(shield, marked.map).body
+    assert step(ends, *poses[0], AHEAD)[0] < 1.2
+    assert found.j_values[AHEAD] == 0.0
+    assert max(found.j_values) == 1.0
 
 
 def test_what_is_free_again_is_unlearned_and_the_policy_never_changes():

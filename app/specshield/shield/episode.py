@@ -32,10 +32,11 @@ from specshield.shield.judgement import (
     feasible_mass_of,
     j_values_of,
     robustness_of,
+    without,
     witnesses_of,
 )
 from specshield.shield.signals import judged_by_signals
-from specshield.shield.taught import doubted, handed_on, on_map, teach, wary
+from specshield.shield.taught import doubted, doubtful, handed_on, on_map, teach, wary
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
@@ -153,6 +154,7 @@ def decide(
         if taught is not believed:
             said = (*said, "no way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
+        judged = without(judged, shield, doubtful(told, taught, poses[-1]))
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior)

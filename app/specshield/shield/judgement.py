@@ -72,6 +72,18 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     return Judged(tried, best, feasible, *by_action, completion, aimed.margin, aimed.slack, aimed.lowered)
 
 
+def without(judged: Judged, shield: Shield, doubtful: Bools) -> Judged:
+    """Without the motions [M] that are doubtful, unless no other is feasible."""
+    robot, sure = shield.task.robot, judged.feasible_motion & ~doubtful
+    if not sure.any() or sure.sum() == judged.feasible_motion.sum():
+        return judged
+    completion = judged.completion
+    if not sure[robot.motion_of[completion]]:
+        completion = int(robot.representative[np.argmax(np.where(sure, judged.best.robustness, -np.inf))])
+    feasible = judged.feasible & np.append(sure, False)[robot.motion_of]
+    return replace(judged, feasible_motion=sure, feasible=feasible, completion=completion)
+
+
 @kernel
 def _by_action(
     motion_of: Ints, feasible: Bools, values: Floats, row: Ints, rho: Floats

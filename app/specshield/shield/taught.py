@@ -15,8 +15,8 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike
 
-from specshield.arrays import Floats
-from specshield.robot.dynamics import Body, make_body, overlap
+from specshield.arrays import Bools, Floats
+from specshield.robot.dynamics import Body, make_body, overlap, successors
 from specshield.shield.caution.experience import was_stopped, within_noise
 from specshield.shield.decision import Carry, Config, Shield
 from specshield.shield.surprise.contact import NEAR, UNDER, Followed, cells_met, cells_under, contact_of
@@ -145,6 +145,22 @@ def doubted(taught: Taught, t: int) -> Iterator[Taught]:
             yield replace(taught, map=revised(known, forget(known, ~stays)))
     if not (seen | young).all():
         yield replace(taught, map=revised(known, forget(known, ~(seen | young))))
+
+
+def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
+    """[M]: the motions from a pose (3,) that lead elsewhere if contacts are believed than if they are not.
+
+    told: the shield on the policy's map. A motion that only a mark stops may go on in truth, into what the
+    rule forbids.
+    """
+    known, motions = taught.map, len(told.task.robot.motions)
+    marks = known.occupied & (known.by != SENT)
+    if not marks.any():
+        return np.zeros(motions, np.bool_)
+    ends = np.empty((2, motions, 3))
+    for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
+        successors(body_on(told, believed), pose, end)
+    return np.any(ends[0] != ends[1], axis=1)
 
 
 def on_map(shield: Shield, known: LearnedMap) -> Shield:
