@@ -160,7 +160,8 @@ def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
     ends = np.empty((2, motions, 3))
     for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
         successors(body_on(told, believed), pose, end)
-    return np.any(ends[0] != ends[1], axis=1)
+    differ: Bools = np.any(ends[0] != ends[1], axis=1)
+    return differ
 
 
 def on_map(shield: Shield, known: LearnedMap) -> Shield:
