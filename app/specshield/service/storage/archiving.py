@@ -26,7 +26,7 @@ R = TypeVar("R")
 TURN = "specshield:archive:turn"  # the name of the server whose turn it is to move sessions
 SIZE = "specshield:archive:bytes"
 FENCE = 600  # [s]; longer than any server takes from reading a file to bringing it back. Chosen by hand.
-TRIES = 5  # of reading a file that a newer one replaces
+TRIES = 5  # of reading a file that a newer one replaces, and of bringing a session back
 AT_ONCE = 8  # reads and writes of files of one server process; more would wait for the same disk
 
 # KEYS of all: session, rows, steps, fence.  ARGV: version, FENCE.  Returns 1 where the session has left the
@@ -85,10 +85,11 @@ class ArchivingStore(Store):
         return Record(dump.config, dump.state, dump.version, dump.rows, step or None)
 
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
-        """Brings the session back first where it lies in the archive."""
-        found = await super().append(id, version, change)
-        if found is not None or not await self._bring_back(id):
-            return found
+        """Brings the session back first where it lies in the archive, again if it is put away meanwhile."""
+        for _ in range(TRIES):
+            found = await super().append(id, version, change)
+            if found is not None or not await self._bring_back(id):
+                return found
         return await super().append(id, version, change)
 
     async def dump(self, id: str) -> Dump | None:
