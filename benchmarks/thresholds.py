@@ -3,7 +3,8 @@
     python -m benchmarks.thresholds [--episodes 2000] [--seed 0]
 
 The episodes are shared out among small worlds of benchmarks/worlds.py from whose start the rule can be kept.
-The model nearly always stands still, where that breaks the rule: alone it keeps it in the share shown.
+The model nearly always stands still, where that breaks the rule: alone it keeps it in the share shown. Some
+worlds leave no time for slips and noise; how often the rule is kept where 1 is asked bounds what can be had.
 The verdict is that of benchmarks/judge.py. The world is exact; or every twentieth motion is not executed, as
 the session was told; or motions end off by 0.5 cm and half a degree, as the session was told. The interval is
 of 99 %, by Clopper and Pearson.
@@ -29,7 +30,7 @@ from specshield.shield.episode import Carry, Config, Shield, decide, make_shield
 from specshield.shield.uncertainty import Uncertainty
 
 Floats = NDArray[np.float64]
-ASKED = (0.5, 0.8, 0.9, 0.95)
+ASKED = (0.5, 0.8, 0.9, 0.95, 1.0)
 STANDS = 4.0  # [nats] by which the model prefers to stand still; beside noise of one nat
 WORLDS = 20
 
