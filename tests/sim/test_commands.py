@@ -59,9 +59,20 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     )
 
 
+def listens_to_interrupts():
+    """In a child: what a background shell starts ignores SIGINT, and so do its own children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_demo_leaves_its_page_up_when_asked(tmp_path):
     command = [*SPECSHIELD, "demo", "--runs", "1", "--seed", "4", "--open", "--out", str(tmp_path)]
-    running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    running = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        preexec_fn=listens_to_interrupts,
+    )
     try:
         page = next(line for line in running.stdout if line.startswith("page of both")).split(": ", 1)[1]
         url, _, ids = page.strip().partition("/#/floor?sessions=")
@@ -90,7 +101,7 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background shell ignores it
+        preexec_fn=listens_to_interrupts,
     )
     try:
         if command == "demo":

@@ -128,12 +128,13 @@ def changes_map(learned: bytes | None) -> bool:
 
 
 def doubted(taught: Taught, t: int) -> Iterator[Taught]:
-    """What was inferred from contacts, believed less and less.
+    """What may be believed of contacts where no way is left, in the order in which it is to be tried.
 
-    A motion that stopped short met something, but it is not known where along its front, nor how large that
-    is. So where no way is left, less of what may be there is believed to be: nothing behind what was touched;
-    only what lies straight ahead; only what lies to the left; or to the right; and no contact that was made
-    DOUBTED_AFTER steps ago or earlier, since nothing that only runs into things ever sees that one is gone.
+    A motion that stopped short met something, but nobody knows where along its front, nor how large it is. So
+    less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
+    lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
+    before was wrong, and the next one is tried first. Last, contacts that were made DOUBTED_AFTER steps ago
+    or earlier are forgotten, since nothing that only runs into things ever sees that one is gone.
     """
     known = taught.map
     young = t - known.step < DOUBTED_AFTER

@@ -16,6 +16,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Int32s, Ints
 from specshield.compiled import kernel, leaf
+from specshield.policy.heap import Heap, pop, push
 from specshield.policy.planner.due_dates import NO_DATE, read_pose
 from specshield.policy.planner.fields import to_go_at
 from specshield.policy.planner.search import Nodes, guard, search
@@ -32,16 +33,15 @@ LEGS = 8  # literals that one way may go to like this, one after the other
 
 
 class Tree(NamedTuple):
-    """Poses [N, 3], the motions made up to each [N], its parent and the motion that led to it [N]; a heap of
-    them: rows [N] and their rank [N], the least first; table: where poses are looked up.
+    """Poses [N, 3], the motions made up to each [N], its parent and the motion that led to it [N]. heap: of
+    those to go on from; table: where poses are looked up.
     """
 
     pose: Floats
     made: Int32s
     parent: Int32s
     motion: Int32s
-    row: Int32s
-    rank: Floats
+    heap: Heap
     table: Int32s
 
 
@@ -56,7 +56,7 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
         slots *= 2
     tree = Tree(
         np.empty((most, 3)), np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32),
-        np.empty(most, np.int32), np.empty(most), np.empty(slots, np.int32),
+        Heap(np.empty(most, np.int32), np.empty(most)), np.empty(slots, np.int32),
     )  # fmt: skip
     n, left = 0, most
     for _ in range(LEGS):
@@ -102,10 +102,10 @@ def _reach(
     for c in range(3):
         tree.pose[0, c] = way.poses[n, c]
     tree.made[0], tree.parent[0], tree.motion[0] = 0, -1, -1
-    count, size = 1, _push(tree, 0, 0, 0.0)
+    count, size = 1, push(tree.heap, 0, 0, 0.0)
     while size > 0 and count + motion_count(body) <= most:
-        here = tree.row[0]
-        size = _pop(tree, size)
+        here = tree.heap.row[0]
+        size = pop(tree.heap, size)
         made = tree.made[here] + 1
         if n + made > stop:
             continue
@@ -128,7 +128,7 @@ def _reach(
             if holds(world, k, way.rho):
                 _write(world, way, n, tree, count)
                 return n + made, count
-            size = _push(tree, size, count, made + OPTIMISM * ahead - DEEPER * made)
+            size = push(tree.heap, size, count, made + OPTIMISM * ahead - DEEPER * made)
             count += 1
     return -1, count
 
@@ -166,30 +166,3 @@ def _is_new(tree: Tree, row: int, grain: float) -> bool:
 def _rounded(pose: Floats, row: int, grain: float) -> tuple[int, int, int]:
     x, y, h = pose[row, 0] / grain, pose[row, 1] / grain, math.degrees(pose[row, 2])
     return math.floor(x), math.floor(y), math.floor(h + 0.5)
-
-
-@leaf
-def _push(tree: Tree, size: int, row: int, rank: float) -> int:
-    """Puts a row into a heap of `size`; its new size."""
-    at = size
-    while at > 0 and tree.rank[(at - 1) // 2] > rank:
-        tree.row[at], tree.rank[at] = tree.row[(at - 1) // 2], tree.rank[(at - 1) // 2]
-        at = (at - 1) // 2
-    tree.row[at], tree.rank[at] = row, rank
-    return size + 1
-
-
-@leaf
-def _pop(tree: Tree, size: int) -> int:
-    """Takes the row of the least rank out of a heap of `size`; its new size."""
-    size -= 1
-    row, rank, at = tree.row[size], tree.rank[size], 0
-    while 2 * at + 1 < size:
-        child = 2 * at + 1
-        child += child + 1 < size and tree.rank[child + 1] < tree.rank[child]
-        if rank <= tree.rank[child]:
-            break
-        tree.row[at], tree.rank[at] = tree.row[child], tree.rank[child]
-        at = child
-    tree.row[at], tree.rank[at] = row, rank
-    return size

@@ -16,6 +16,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import kernel, leaf
+from specshield.policy.heap import Heap, pop, push
 from specshield.policy.lattice import reads_heading
 from specshield.policy.reachability.guide import (
     Guide,
@@ -44,7 +45,7 @@ LEGS = 8  # searches for one way, each to the next goal
 
 class Tree(NamedTuple):
     """The poses that a search has come to, N of them, with how: step [N], parent [N], motion [N], and the
-    progress there. best [N]: the rows in a heap, by rank [N].
+    progress there, and its rank [N]. heap: of those to go on from, the highest rank first.
     """
 
     pose: Floats
@@ -54,7 +55,7 @@ class Tree(NamedTuple):
     parent: Int32s
     motion: Int32s
     rank: Floats
-    best: Int32s
+    heap: Heap
 
 
 @kernel
@@ -77,7 +78,7 @@ def go_around(
     tree = Tree(
         np.empty((POSES, 3)), np.empty((POSES, k_count), np.int8), np.empty((POSES, k_count), np.int64),
         np.empty(POSES, np.int32), np.empty(POSES, np.int32), np.empty(POSES, np.int32), np.empty(POSES),
-        np.empty(POSES, np.int32),
+        Heap(np.empty(POSES, np.int32), np.empty(POSES)),
     )  # fmt: skip
     seen = np.empty(4 * POSES, np.int32)
     way, led = np.empty(steps, np.int64), np.empty((steps, 3))
@@ -166,10 +167,10 @@ def _reach(
     _put(tree, 0, x, y, theta, scratch, 0, -1, -1)
     tree.rank[0] = 0.0
     count, size = 1, 0
-    size = _push(tree, size, 0)
+    size = push(tree.heap, size, 0, 0.0)
     while size > 0:
-        size = _pop(tree, size)
-        here = tree.best[size]
+        here = tree.heap.row[0]
+        size = pop(tree.heap, size)
         s = tree.step[here]
         if s > 0 and _arrived(guide, t + s, here, tree, scratch):
             return int(here)
@@ -200,7 +201,7 @@ def _reach(
             if ahead < BAND:
                 continue
             tree.rank[count] = ahead + ONWARD * (s + 1)
-            size = _push(tree, size, count)
+            size = push(tree.heap, size, count, -tree.rank[count])
             count += 1
     return -1
 
@@ -258,30 +259,3 @@ def _rounded(pose: Floats, i: int) -> tuple[int, int, int]:
         math.floor(PLACE_GRAIN * pose[i, 1]),
         math.floor(HEADING_GRAIN * pose[i, 2] + 0.5),
     )
-
-
-@leaf
-def _push(tree: Tree, size: int, row: int) -> int:
-    at = size
-    while at > 0 and tree.rank[tree.best[(at - 1) // 2]] < tree.rank[row]:
-        tree.best[at] = tree.best[(at - 1) // 2]
-        at = (at - 1) // 2
-    tree.best[at] = row
-    return size + 1
-
-
-@leaf
-def _pop(tree: Tree, size: int) -> int:
-    """Takes the row of the highest rank out of the heap, and leaves it right behind. The new size."""
-    best, row, at = tree.best[0], tree.best[size - 1], 0
-    size -= 1
-    while 2 * at + 1 < size:
-        child = 2 * at + 1
-        child += child + 1 < size and tree.rank[tree.best[child + 1]] > tree.rank[tree.best[child]]
-        if tree.rank[row] >= tree.rank[tree.best[child]]:
-            break
-        tree.best[at] = tree.best[child]
-        at = child
-    tree.best[at] = row
-    tree.best[size] = best
-    return size

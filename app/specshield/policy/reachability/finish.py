@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Int32s, Ints
-from specshield.compiled import inlined, kernel, leaf
+from specshield.compiled import kernel, leaf
+from specshield.policy.heap import Heap, pop, push
 from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, predicate_at, read_due
 from specshield.policy.reachability.tables import is_broken, slack
 from specshield.robot.dynamics import around, motion_count, step_from
@@ -48,13 +49,6 @@ class Nodes(NamedTuple):
     motion: Int32s
 
 
-class Queue(NamedTuple):
-    """Nodes and their slack [steps], as a binary heap."""
-
-    node: Int32s
-    slack: Floats
-
-
 @kernel
 def finish(
     guide: Guide, narrow: Bools, search: Search, t: int, pose: Floats, status: Int8s, run: Ints, way: Ints,
@@ -80,17 +74,17 @@ def finish(
         np.empty((most, 3)), np.empty((most, k_count), np.int8), np.empty((most, k_count), np.int64),
         np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32),
     )  # fmt: skip
-    queue = Queue(np.empty(most, np.int32), np.empty(most))
+    queue = Heap(np.empty(most, np.int32), np.empty(most))  # the most slack first
     slots = 4
     while slots < 2 * most:
         slots *= 2
     table = np.full(slots, -1, np.int32)
     nodes.pose[0], nodes.status[0], nodes.run[0] = pose, status, run
     nodes.made[0], nodes.parent[0], nodes.motion[0] = 0, -1, -1
-    count, size = 1, _push(queue, 0, 0, 0.0)
+    count, size = 1, push(queue, 0, 0, 0.0)
     while size > 0 and count + motion_count(body) <= most:
-        here = queue.node[0]
-        size = _pop(queue, size)
+        here = queue.row[0]
+        size = pop(queue, size)
         made = nodes.made[here]
         if made >= way.shape[0]:
             continue
@@ -118,7 +112,7 @@ def finish(
             if _serves(rules, goal, wait, now, x, y, theta, status, scratch):
                 _trace(nodes, count, way)
                 return int(made + 1)
-            size = _push(queue, size, count, left)
+            size = push(queue, size, count, -left)
             count += 1
     return 0
 
@@ -140,34 +134,6 @@ def _serves(
         if wait >= 0 and t <= by and predicate_at(rules, k, x, y, theta, scratch) > rules.margin:
             return True
     return False
-
-
-@inlined
-def _push(queue: Queue, size: int, node: int, slack: float) -> int:
-    """Puts a node into queue[:size]; its new size."""
-    at = size
-    while at > 0 and queue.slack[(at - 1) // 2] < slack:
-        queue.node[at], queue.slack[at] = queue.node[(at - 1) // 2], queue.slack[(at - 1) // 2]
-        at = (at - 1) // 2
-    queue.node[at], queue.slack[at] = node, slack
-    return size + 1
-
-
-@inlined
-def _pop(queue: Queue, size: int) -> int:
-    """Takes the first node out of queue[:size]; its new size."""
-    size -= 1
-    node, slack, at = queue.node[size], queue.slack[size], 0
-    while 2 * at + 1 < size:
-        child = 2 * at + 1
-        if child + 1 < size and queue.slack[child + 1] > queue.slack[child]:
-            child += 1
-        if queue.slack[child] <= slack:
-            break
-        queue.node[at], queue.slack[at] = queue.node[child], queue.slack[child]
-        at = child
-    queue.node[at], queue.slack[at] = node, slack
-    return size
 
 
 @leaf

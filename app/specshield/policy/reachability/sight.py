@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from specshield.arrays import Bools, Bytes, Floats
 from specshield.compiled import kernel
@@ -95,15 +96,14 @@ def _look(
 
 def about(inner: Bools) -> Bools:
     """Where some pose of `inner` is at most CELLS_ABOUT cells and HEADINGS_ABOUT headings away."""
-    found = inner.copy()
+    near = cells_about(inner, CELLS_ABOUT)
+    found: Bools = maximum_filter1d(near, 2 * HEADINGS_ABOUT + 1, axis=2, mode="wrap")
+    return found
+
+
+def cells_about(inner: Bools, reach: int) -> Bools:
+    """The cells [ny, nx, ...] that have one of `inner` at most `reach` cells away along both axes."""
+    found = inner
     for axis in (0, 1):
-        found = np.moveaxis(found, axis, 0)
-        before = found.copy()
-        for n in range(1, CELLS_ABOUT + 1):
-            found[n:] |= before[:-n]
-            found[:-n] |= before[n:]
-        found = np.moveaxis(found, 0, axis)
-    before = found.copy()
-    for n in range(1, HEADINGS_ABOUT + 1):
-        found |= np.roll(before, n, axis=2) | np.roll(before, -n, axis=2)
+        found = maximum_filter1d(found, 2 * reach + 1, axis=axis, mode="constant")
     return found

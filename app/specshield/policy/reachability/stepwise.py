@@ -24,6 +24,7 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Floats, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import Lattice, corner
+from specshield.policy.reachability.sight import cells_about
 from specshield.policy.reachability.tables import Tables
 from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
@@ -106,25 +107,13 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
             changed = used
             if last is not None:  # where nothing changed in reach, the motions lead to what they did
                 bits[t - 1] = bits[t]
-                changed = _about(row, np.any(before != last, axis=(1, 2)), lattice.reach + 1)
+                differs = np.append(np.any(before != last, axis=(1, 2)), False)  # row -1 is no cell
+                changed = cells_about(differs[row], lattice.reach + 1)
             _step_back(
                 lattice, valid, row, changed, np.bitwise_or.reduce(before, (0, 1)), before, bits[t - 1]
             )
             last = before
     return bits
-
-
-def _about(row: Int32s, changed: Bools, reach: int) -> Bools:
-    """The cells [ny, nx] that have one of those that `changed` [cells] at most `reach` cells away."""
-    about = np.append(changed, False)[row]  # row -1 is no cell
-    for axis in (0, 1):
-        about = np.moveaxis(about, axis, 0)
-        before = about.copy()
-        for n in range(1, reach + 1):
-            about[n:] |= before[:-n]
-            about[:-n] |= before[n:]
-        about = np.moveaxis(about, 0, axis)
-    return about
 
 
 @kernel
