@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
+from evaluation.baselines import Completed, RuleFirst, Switching
 from evaluation.decoding import HardDecoding, RobustDecoding
 from evaluation.disturbance import believed, check
 from evaluation.houses import load_house_case
@@ -29,9 +30,12 @@ from specshield.sim.learned.model import FOLDER, WEIGHTS, read
 from specshield.sim.model import FoundationModel
 from specshield.task import Task
 
-METHODS = ("unmodified", "hcd", "rcd", "simplex", "paper", "ours", "lookahead")
-CERTIFYING = ("simplex", "paper", "ours", "lookahead")
-CAREFUL = ("simplex", "paper", "ours", "lookahead")  # NAME@M/K: a margin of M metres, K steps of slack
+METHODS = (
+    "unmodified", "hcd", "hcd+", "rcd", "rcd+", "simplex", "switching", "rule-first", "paper", "ours",
+    "lookahead",
+)  # fmt: skip
+CERTIFYING = ("simplex", "switching", "rule-first", "paper", "ours", "lookahead")
+CAREFUL = CERTIFYING  # NAME@M/K: a margin of M metres, K steps of slack
 
 
 SESSIONS = {  # NAME@default: what a session is where nobody says anything; /D after either: a threshold
@@ -148,8 +152,12 @@ class Setting:
         make: dict[str, Callable[[], Method]] = {
             "unmodified": lambda: Decoding(self.task),
             "hcd": lambda: Decoding(self.task, HardDecoding(self.task)),
+            "hcd+": lambda: Completed(Decoding(self.task, HardDecoding(self.task)), self.ours),
             "rcd": lambda: Decoding(self.task, RobustDecoding(self.task)),
+            "rcd+": lambda: Completed(Decoding(self.task, RobustDecoding(self.task)), self.ours),
             "simplex": lambda: Simplex(make_shield(self.policies, careful)),
+            "switching": lambda: Switching(make_shield(self.policies, careful)),
+            "rule-first": lambda: RuleFirst(make_shield(self.policies, careful)),
             "paper": lambda: Shielded(replace(self.paper, config=careful), carries=False),
             "ours": lambda: Shielded(make_shield(self.policies, careful)),
             "lookahead": lambda: Shielded(

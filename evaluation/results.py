@@ -10,7 +10,7 @@ from typing import Any
 from evaluation.evaluation import read, read_about
 from evaluation.experiment import METHODS, Experiment, split
 from evaluation.runs import MAX_STEPS, Record
-from evaluation.statistics import costs_beside, summary
+from evaluation.statistics import beside, summary
 
 
 def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]:
@@ -18,7 +18,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
 
     refused_starts: starts that were drawn and could not be used. left: how many steps a run has after the
     rule's horizon, and in how many of its runs the unmodified model does its task within so many steps.
-    lookahead_beside_ours: `costs_beside`, None where one of the two methods was not run.
+    beside_ours: each other method beside `ours`, run by run; empty where `ours` was not run.
     """
     by_method: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda r: r.run):
@@ -28,7 +28,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
     plain = by_method.get("unmodified", [])
     case = experiment.setting.case
     left = MAX_STEPS - case.task.horizon
-    pair = by_method.get("lookahead", []), by_method.get("ours", [])
+    ours = by_method.get("ours", [])
     in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain]
     return {
         "experiment": experiment.to_json(),
@@ -39,7 +39,9 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
         "refused_starts": sum({record.run: record.refused for record in records}.values()),
         "left": {"steps": left, "done": sum(in_time), "of": len(plain)},
         "methods": [summary(name, by_method[name], plain) for name in ranked],
-        "lookahead_beside_ours": costs_beside(*pair, plain) if all(pair) else None,
+        "beside_ours": {
+            name: beside(by_method[name], ours, plain) for name in ranked if ours and name != "ours"
+        },
     }
 
 

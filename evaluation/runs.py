@@ -32,7 +32,6 @@ Floats = NDArray[np.float64]
 
 MAX_STEPS = 600
 DRAWS = 100  # starts tried for one run before giving up
-PERCENTILES = (("p50", 50.0), ("p99", 99.0), ("max", 100.0))
 MODEL, DRAW, START, MISMATCH = range(4)  # streams of a run's seed
 
 
@@ -45,7 +44,7 @@ class Record:
     within 1 m of its target before MAX_STEPS; ended_at: the step of its `end`. broken: the conjuncts that
     were not kept. modes, reasons: how many decisions had each mode and each reason. kl: summed over the
     decisions made for the model, `asked` of them [nats]. residual: the largest surprise of a step
-    (conformal.py) [m]. decision_ms: p50, p99 and max. mass: pi_FM(S_t) step by step; certified: rho of the
+    (conformal.py) [m]. decision_ms: of each decision. mass: pi_FM(S_t) step by step; certified: rho of the
     future that certified what was executed; None where there was none.
     poses: x_0, x_1, ...
     """
@@ -66,7 +65,7 @@ class Record:
     kl: float
     asked: int
     residual: float
-    decision_ms: dict[str, float]
+    decision_ms: list[float] = field(repr=False)
     mass: list[float | None] = field(repr=False)
     certified: list[float | None] = field(repr=False)
     poses: list[list[float]] = field(repr=False)
@@ -205,7 +204,7 @@ class _Tally:
         self.kl, self.asked, self.residual = 0.0, 0, 0.0
         self.mass: list[float | None] = []
         self.certified: list[float | None] = []
-        self._seconds: list[float] = []
+        self.milliseconds: list[float] = []
 
     def count(self, answer: Answer, seconds: float, for_model: bool) -> None:
         self.modes[answer.mode] += 1
@@ -216,11 +215,7 @@ class _Tally:
             self.kl += math.inf if answer.kl is None else answer.kl
         self.mass.append(_rounded(answer.feasible_mass))
         self.certified.append(_rounded(answer.robustness))
-        self._seconds.append(seconds)
-
-    @property
-    def milliseconds(self) -> dict[str, float]:
-        return {name: round(1e3 * float(np.percentile(self._seconds, q)), 4) for name, q in PERCENTILES}
+        self.milliseconds.append(round(1e3 * seconds, 3))
 
 
 def _rounded(value: float | None) -> float | None:

@@ -26,10 +26,18 @@ METHODS = {
     "hcd": """next-step masking, SafeDec's hard constrained decoding: a logit becomes minus infinity where the
   states so far and the next one leave some conjunct no chance, whatever follows. After the model's `end` the
   robot stands still.""",
+    "hcd+": """hcd, and from the model's `end` on the certified continuation until the rule is decided; where
+  none was found, the policy's best try.""",
     "rcd": """SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)), with rho of the
   predicates that are asked for at the next step; alpha = {alpha:g} per metre, beta = {beta:g}, the best of 24
   pairs by runs that kept the rule, on other seeds. After the model's `end` the robot stands still.""",
+    "rcd+": "rcd, with the same completion after the model's `end` as hcd+.",
     "simplex": "the model's own draw where it is feasible, else the certified continuation.",
+    "switching": """the model's own draws until one is not feasible, which is when the slack has run out; then
+  the plan drives until it has met the next obligation, and hands back. A draw that would break a G at once is
+  only replaced. While the plan drives, the model may still say `end`.""",
+    "rule-first": """the certified continuation until the rule is decided, and then the model alone. Its KL is
+  that of the plan's actions from what the model wanted meanwhile.""",
     "paper": """the paper's decision rule with our DQN as pi_phi, rolled out literally after every action;
   hard projection. It is not the paper's policy: the shipped DQNs learned from the reward `progress`, not
   from the paper's funnels (`models/*/card.json`).""",
@@ -38,6 +46,7 @@ METHODS = {
     "lookahead": """ours, with the feasible actions weighted by what the rule will still cost the model from
   there, as far as a surrogate fitted to its logits can tell.""",
 }
+OUTCOMES = {"satisfied": "rule", "main_done": "main task"}
 CAREFUL = "- **NAME@M/K**: that method with a margin of M metres, each deadline aimed at K steps early."
 NOISES = {
     "none": "the world is as the shield was told",
@@ -118,8 +127,9 @@ def _sections(
         "Written by `specshield report`; every figure is from a campaign's `results.json`. Shares carry "
         "their 95 % Clopper-Pearson intervals. All methods share starts, model seeds, draws and "
         "disturbances, run by run. The main task is done when the model says `end` within 1 m of its target "
-        "before 600 steps. The p50 and p99 of a decision are medians over the runs of each run's own "
-        "percentile."
+        "before 600 steps. The p50 and p99 of a decision are over all decisions of all runs. Means and "
+        "ratios have 95 % intervals of a bootstrap over runs, or over whole pairs of runs; shares of the same runs "
+        "are compared by McNemar's exact test."
     )
     there = {split(one["method"])[0] for r in found.values() for one in r["methods"]}
     legend = [f"- **{name}**: {text}" for name, text in METHODS.items() if name in there]
@@ -216,7 +226,7 @@ def _short(results: Results) -> str:
             parts.append(f"main task {points:+.1f} points below unmodified{over}")
         if parts:
             lines.append(f"- {one['method']}: {'; '.join(parts)}.")
-    lines += _look_ahead(results["lookahead_beside_ours"])
+    lines += _beside_ours(results["beside_ours"])
     left = results["left"]
     if left["of"]:
         lines.append(
@@ -226,19 +236,29 @@ def _short(results: Results) -> str:
     return "\n".join(lines)
 
 
-def _look_ahead(beside: Mapping[str, Mapping[str, float] | None] | None) -> Iterator[str]:
-    """What look-ahead costs as a share of the projection's costs, where both were run and those are not 0."""
+def _beside_ours(beside: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> Iterator[str]:
+    """What each certifying method costs beside the projection, run by run, whatever it says."""
     names = {"kl": "KL a run", "extra_steps": "mean extra steps"}
-    parts = [
-        f"{names[name]} {one['share']:.2f} ({one['low']:.2f} to {one['high']:.2f})"
-        for name, one in (beside or {}).items()
-        if one is not None
-    ]
-    if parts:
-        yield (
-            f"- lookahead, as a share of ours: {', '.join(parts)}; "
-            "with 95 % intervals of a bootstrap over runs."
-        )
+    for method, found in beside.items():
+        if split(method)[0] not in CERTIFYING:
+            continue
+        parts = [f"{names[name]} {_compared(found[name])}" for name in names]
+        tests = [f"{name} p = {found[key]['p']:.2g}" for key, name in OUTCOMES.items()]
+        yield f"- {method}, beside ours: {', '.join(parts)}; McNemar: {', '.join(tests)}."
+
+
+def _compared(cost: Mapping[str, Any]) -> str:
+    """Both means, the difference with its interval, and the share where there is one."""
+    if not cost["pairs"]:
+        return "in no pair of runs"
+    said = (
+        f"{cost['mine']:.1f} and {cost['other']:.1f} in {cost['pairs']} pairs, difference "
+        f"{cost['difference']:+.1f} ({cost['difference_low']:+.1f} to {cost['difference_high']:+.1f})"
+    )
+    if cost["share"] is None:
+        return said
+    within = "not bounded" if cost["low"] is None else f"{cost['low']:.2f} to {cost['high']:.2f}"
+    return f"{said}, ratio {cost['share']:.2f} ({within})"
 
 
 def _noise_table(experiments: Sequence[Results]) -> str:
