@@ -108,7 +108,7 @@ def met(task: Task, history: Floats) -> int:
     """How many conjuncts of the rule hold already, whatever follows."""
     prefix = task.samples(history)
     return sum(
-        robustness_bounds(part, {name: prefix[name] for name in part.names})[0] > SATISFIED_ABOVE
+        bool(robustness_bounds(part, {name: prefix[name] for name in part.names})[0] > SATISFIED_ABOVE)
         for part in conjuncts(task.formula)
     )
 

@@ -128,8 +128,8 @@ def _sections(
         "their 95 % Clopper-Pearson intervals. All methods share starts, model seeds, draws and "
         "disturbances, run by run. The main task is done when the model says `end` within 1 m of its target "
         "before 600 steps. The p50 and p99 of a decision are over all decisions of all runs. Means and "
-        "ratios have 95 % intervals of a bootstrap over runs, or over whole pairs of runs; shares of the same runs "
-        "are compared by McNemar's exact test."
+        "ratios have 95 % intervals of a bootstrap over runs, or over whole pairs of runs; shares of the "
+        "same runs are compared by McNemar's exact test."
     )
     there = {split(one["method"])[0] for r in found.values() for one in r["methods"]}
     legend = [f"- **{name}**: {text}" for name, text in METHODS.items() if name in there]
