@@ -73,34 +73,13 @@ reliability: .venv-bench/.done
 	-$(RELIABILITY) fuzz
 	$(RELIABILITY) report
 
-# docs/results*.md; hours. What is in RESULTS already is not done again. To try every line in minutes:
-# make results ARGS='--runs 2' RESULTS=/tmp/try PAGES=/tmp/try-pages
+# docs/results.md and docs/results/; 90 minutes on two free cores at most. What is in RESULTS already is not done
+# again. A first look at all of it: make results ARGS='--share 0.1' RESULTS=/tmp/try PAGES=/tmp/try-pages
 RESULTS ?= out/results
 PAGES ?= docs
-MODEL ?= learned
-EVALUATE = $(BIN)/specshield evaluate --runs 200 --model $(MODEL) --out $(RESULTS)
+HOUSES ?= ../shared/data/houses
 results: .venv/.dev
-	$(EVALUATE) --case 1 $(ARGS)
-	$(EVALUATE) --case 2 $(ARGS)
-	for case in 1 2; do \
-	  $(EVALUATE) --case $$case --noise gaussian \
-	    --methods unmodified,paper,ours,ours@conformal/8 $(ARGS) || exit 1; \
-	  $(EVALUATE) --case $$case --noise slip,obstacle,shift,collider --runs 50 \
-	    --methods paper,ours,ours@0.04/8 $(ARGS) || exit 1; \
-	  $(EVALUATE) --case $$case --model goal-seeker --runs 800 --seed 1 --out $(RESULTS)-goal-seeker \
-	    --methods unmodified,ours,lookahead $(ARGS) || exit 1; \
-	  for model in decoyed drifter jumper; do \
-	    $(EVALUATE) --case $$case --model $$model --seed 1 --out $(RESULTS)-unknown-models/$$model \
-	      --methods unmodified,ours,lookahead $(ARGS) || exit 1; \
-	  done; \
-	done
-	for house in drawn_0 drawn_3; do \
-	  $(EVALUATE) --case house --house $$house --runs 60 --methods unmodified,hcd,ours,lookahead $(ARGS) \
-	    || exit 1; \
-	done
-	$(BIN)/specshield report $(RESULTS) --out $(PAGES)/results.md
-	$(BIN)/specshield report $(RESULTS)-goal-seeker --out $(PAGES)/results-goal-seeker.md
-	$(BIN)/specshield report $(RESULTS)-unknown-models --out $(PAGES)/results-unknown-models.md
+	$(BIN)/python -m evaluation results --out $(RESULTS) --page $(PAGES)/results.md --houses $(HOUSES) $(ARGS)
 
 openapi: .venv/.server
 	$(BIN)/specshield openapi > openapi.json

@@ -13,27 +13,31 @@ from evaluation.experiment import Experiment
 
 RUNS = 60  # of a calibration campaign; ALPHA asks for 19 at least
 ALPHA = 0.05  # share of the episodes that may hold a surprise larger than the margin
+JUDGED = "ours"
 OTHER_SEED = 1_000_003  # added to the seed: no calibration run is a run of the experiment
 
 
 def calibrated(experiment: Experiment, method: str, folder: Path | None, processes: int) -> str:
     """The method with its margin as a number, rounded up to millimetres; other methods as they are.
 
-    The calibration campaign is the same experiment with another seed, run by the method without a margin.
-    What it found is kept in `folder`, if one is given, as calibration.json.
+    The calibration campaign is the same experiment with another seed, run by JUDGED without a margin. All
+    methods of the experiment that ask for the same slack are given what it found, so that none has the better
+    margin. It is kept in `folder`, if one is given, as calibration.json.
     """
     kind, _, asked = method.partition("@conformal")
     if kind == method:
         return method
     path = None if folder is None else folder / "calibration.json"
     found = json.loads(path.read_text()) if path is not None and path.exists() else {}
-    if method not in found:
+    name = f"conformal{asked}"
+    if name not in found:
         others = replace(experiment, seed=experiment.seed + OTHER_SEED)
-        scores = [r.residual for r in evaluate(others, RUNS, [f"{kind}@0{asked}"], None, processes)]
+        scores = [r.residual for r in evaluate(others, RUNS, [f"{JUDGED}@0{asked}"], None, processes)]
         margin = conformal_margin(scores, ALPHA)
-        found[method] = {
-            "method": f"{kind}@{math.ceil(1e3 * margin) / 1e3:g}{asked}",
+        found[name] = {
+            "asked": asked,
             "margin": margin,
+            "rounded": math.ceil(1e3 * margin) / 1e3,
             "alpha": ALPHA,
             "runs": RUNS,
             "seed": others.seed,
@@ -41,4 +45,4 @@ def calibrated(experiment: Experiment, method: str, folder: Path | None, process
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps(found, indent=1) + "\n")
-    return str(found[method]["method"])
+    return f"{kind}@{found[name]['rounded']:g}{asked}"

@@ -96,6 +96,31 @@ def worlds(
     compare(trials, runs, out, processes or os.cpu_count() or 1)
 
 
+def results(
+    out: Annotated[Path, typer.Option(help="Folder to keep results in and to take them up from.")] = Path(
+        "out/results"
+    ),
+    page: Annotated[Path, typer.Option(help="The page that summarises; others go beside it.")] = Path(
+        "docs/results.md"
+    ),
+    houses: Annotated[Path, typer.Option(help="A folder with ProcTHOR houses, if there is one.")] = Path(
+        "../shared/data/houses"
+    ),
+    only: Annotated[str, typer.Option(help="Some of cases, noise, bodies, houses, models, tasks.")] = "",
+    share: Annotated[
+        float, typer.Option(help="Share of the runs, for a first look.", min=0.0, max=1.0)
+    ] = 1.0,
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+) -> None:
+    """Run every campaign of the results pages, and write them."""
+    from evaluation.houses import houses_in
+    from evaluation.plan import carry_out
+
+    kinds = only.split(",") if only else []
+    failed = carry_out(out, page, houses_in(houses), kinds, share, processes or os.cpu_count() or 1)
+    raise typer.Exit(1 if failed else 0)
+
+
 def report(
     results: Annotated[Path, typer.Argument(help="Folder that evaluate has kept results in.")],
     out: Annotated[Path, typer.Option(help="The page to write; figures go into a folder beside it.")] = Path(

@@ -32,6 +32,7 @@ RESOLUTION = 0.05  # [m] of a ProcTHOR house's map
 OTHERS = (
     2**31 + 1
 )  # beside the seed: the draws of training begin with a small number alone, and share no house
+SIZES = "asset-sizes.json"  # beside the houses
 TO_FIND = "remote"  # in a drawn house: it lies beside a sofa, in none of NAMED
 
 
@@ -40,13 +41,19 @@ def located(house: str | None, folder: Path | None) -> str | None:
     return house if house is None or folder is None else str(folder / f"{house}.json")
 
 
+def houses_in(folder: Path) -> list[str]:
+    """The paths of the houses in a folder, by name; none where there is no such folder."""
+    found = sorted(path for path in folder.glob("*.json") if path.name != SIZES)
+    return [str(path) for path in found]
+
+
 def load_house_case(house: str) -> Case:
     """The case of a house: drawn_N, or the path of a ProcTHOR house's JSON. Raises NotFound, FormulaError."""
     drawn = DRAWN.fullmatch(house)
     if drawn:
         return _drawn_case(house, int(drawn[1]))
     path = Path(house)
-    sizes = path.with_name("asset-sizes.json")
+    sizes = path.with_name(SIZES)
     if not (path.suffix == ".json" and path.is_file() and sizes.is_file()):
         raise NotFound(
             f"there is no house {house!r}", path="house", got=house,

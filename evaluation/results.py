@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
 
     refused_starts: starts that were drawn and could not be used. left: how many steps a run has after the
     rule's horizon, and in how many of its runs the unmodified model does its task within so many steps.
-    beside_ours: each other method beside `ours`, run by run; empty where `ours` was not run.
+    beside_ours: each other method beside `ours`, run by run: beside ours@M/K where it has that margin too and
+    ours was run with it. `other` names it; there is nothing where it was not run.
     """
     by_method: dict[str, list[Record]] = {}
     for record in sorted(records, key=lambda r: r.run):
@@ -28,7 +30,6 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
     plain = by_method.get("unmodified", [])
     case = experiment.setting.case
     left = MAX_STEPS - case.task.horizon
-    ours = by_method.get("ours", [])
     in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain]
     return {
         "experiment": experiment.to_json(),
@@ -40,9 +41,17 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
         "left": {"steps": left, "done": sum(in_time), "of": len(plain)},
         "methods": [summary(name, by_method[name], plain) for name in ranked],
         "beside_ours": {
-            name: beside(by_method[name], ours, plain) for name in ranked if ours and name != "ours"
+            name: {"other": other, **beside(by_method[name], by_method[other], plain)}
+            for name in ranked
+            if (other := _ours(name, by_method)) is not None
         },
     }
+
+
+def _ours(name: str, there: Container[str]) -> str | None:
+    """What of `there` a method is compared with."""
+    alike = re.sub("^[^@]+", "ours", name)
+    return next((other for other in (alike, "ours") if other in there and other != name), None)
 
 
 def write(folder: Path) -> dict[str, Any]:

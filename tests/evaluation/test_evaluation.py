@@ -176,12 +176,14 @@ def test_a_margin_is_calibrated_on_other_runs_and_kept(monkeypatch, tmp_path):
     monkeypatch.setattr(calibration, "RUNS", 19)
     asked = "ours@conformal/8"
     chosen = calibration.calibrated(EXPERIMENT, asked, tmp_path, 1)
-    kept = json.loads((tmp_path / "calibration.json").read_text())[asked]
-    assert kept["method"] == chosen == f"ours@{math.ceil(1e3 * kept['margin']) / 1e3:g}/8"
+    kept = json.loads((tmp_path / "calibration.json").read_text())["conformal/8"]
+    assert chosen == f"ours@{math.ceil(1e3 * kept['margin']) / 1e3:g}/8"
     assert 0.03 < kept["margin"] < 0.06  # some 100 motions of sigma 0.01 m and 0.5 degrees
     assert kept["seed"] != EXPERIMENT.seed
     monkeypatch.setattr(calibration, "evaluate", None)  # not asked again
     assert calibration.calibrated(EXPERIMENT, asked, tmp_path, 1) == chosen
+    others = calibration.calibrated(EXPERIMENT, "paper@conformal/8", tmp_path, 1)
+    assert others == chosen.replace("ours", "paper")  # no method has a margin of its own
     assert calibration.calibrated(EXPERIMENT, "ours@0.1", tmp_path, 1) == "ours@0.1"
 
 

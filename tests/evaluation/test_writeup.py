@@ -1,14 +1,18 @@
 """The page and its figures, from records made by hand."""
 
 import json
+import math
 
 import pytest
 
 pytest.importorskip("matplotlib")
 
-from evaluation import figures, writeup
+from evaluation import figures, results, writeup
 from evaluation.experiment import METHODS, Experiment
 from evaluation.models import MODELS
+from evaluation.pages import words
+from evaluation.pages.houses import overlaps
+from evaluation.pages.tables import beside_ours
 from evaluation.runs import Record
 from specshield.errors import NotFound
 from specshield.sim.cases import load_case
@@ -34,7 +38,7 @@ def test_methods_of_other_runs_are_compared_over_those_in_common(tmp_path):
     lines = [json.dumps(each.to_json()) + "\n" for each in plain + fewer + others]
     (folder / "runs.jsonl").write_text("".join(lines))
     writeup.write_up(tmp_path, tmp_path / "page.md")
-    page = (tmp_path / "page.md").read_text()
+    page = (tmp_path / "page" / "cases.md").read_text()
     assert "- ours: main task -50.0 points below unmodified.\n" in page
     assert "main task +50.0 points below unmodified over the 2 runs that both have.\n" in page
     assert "unmodified does its task in 5 of 6 runs." in page
@@ -54,14 +58,61 @@ def test_several_models_share_a_page(tmp_path):
         lines = [json.dumps(record(0, name).to_json()) + "\n" for name in ("ours", "lookahead")]
         (kept / "runs.jsonl").write_text("".join(lines))
     writeup.write_up(folder, tmp_path / "two.md")
-    page = (tmp_path / "two.md").read_text()
+    page = (tmp_path / "two" / "models.md").read_text()
     for model in ("jumper", "drifter"):
-        assert page.count(f"## case1, {model}: method by method\n") == 1
+        assert page.count(f"## case1, {model}\n") == 1
         assert f"| case1, {model} | lookahead |" in page
-        assert f"![ways of case1, {model}](two/{model}/case1/ways.png)" in page
-        assert (tmp_path / "two" / model / "case1" / "ways.png").is_file()
         assert f"--model {model} --noise none --methods ours,lookahead --out out/results-two/{model}" in page
-    assert "specshield report out/results-two --out docs/two.md\n" in page
+    assert "- [Other models](two/models.md)\n" in (tmp_path / "two.md").read_text()
+
+
+def test_what_the_summary_says_is_in_the_records(tmp_path):
+    """Two tiny campaigns: rule-first is quicker than ours; with noise, paper keeps the rule more often."""
+    for noise, lost in (("none", 0), ("gaussian", 3)):
+        kept = tmp_path / "out" / "learned" / "case1" / noise
+        kept.mkdir(parents=True)
+        (kept / "experiment.json").write_text(json.dumps(Experiment("case1", noise=noise).to_json()))
+        records = [
+            record(i, method, ended_at=end + i, kl=kl, satisfied=method != "ours" or i >= lost)
+            for method, end, kl in (
+                ("unmodified", 5, 0.0),
+                ("ours", 30, 4.0),
+                ("rule-first", 20, 9.0),
+                ("paper", 30, 4.0),
+            )
+            for i in range(8)
+        ]
+        lines = [json.dumps(each.to_json()) + "\n" for each in records]
+        (kept / "runs.jsonl").write_text("".join(lines))
+    writeup.write_up(tmp_path / "out", tmp_path / "results.md")
+    page = (tmp_path / "results.md").read_text()
+    row = "| case1, learned | rule-first | 8 of 8 (63.1 to 100.0 %) | 8 of 8 (63.1 to 100.0 %) "
+    assert f"{row}| 9.0 (9.0 to 9.0) | +15.0 (+15.0 to +15.0), n 8 |" in page
+    assert "- **rule-first** (case1, learned): steps -10.0 (-10.0 to -10.0), n 8." in page
+    said = "ours 5 of 8 (24.5 to 91.5 %), paper 8 of 8 (63.1 to 100.0 %), p = 0.25."
+    assert f"  - case1, learned, gaussian noise, rule kept: {said}" in page
+    assert "| case1, learned | unmodified | 0 % | 93.5 % | 8 of 8" in page
+    assert (tmp_path / "results" / "learned" / "case1" / "ways.png").is_file()
+    assert "](results/cases.md)" in page
+    assert "](results/noise.md)" in page
+    assert (
+        "rule 3 runs it alone, 0 the other alone, of 8, p = 0.25"
+        in (tmp_path / "results" / "noise.md").read_text()
+    )
+    cases = (tmp_path / "results" / "cases.md").read_text()
+    assert "KL a run 9.0 and 4.0, difference +5.0 (+5.0 to +5.0), n 8, ratio 2.25 (2.25 to 2.25)" in cases
+    assert "](learned/case1/ways.png)" in cases
+
+
+def test_bodies_are_measured_by_the_distance_of_the_footprint(tmp_path):
+    """Forbidden's left edge is at x0; the footprint's centre is 0.109 m behind an origin that faces it."""
+    case = load_case("2b")
+    (x0, y0), (_, y1) = (case.spec["regions"]["Forbidden"][corner] for corner in ("min", "max"))
+    far = [x0 - 2.0, (y0 + y1) / 2, 0.0]
+    near = [x0 - 0.01, (y0 + y1) / 2, 0.0]
+    backwards = [x0 - 0.01, (y0 + y1) / 2, math.pi]
+    found = overlaps(case, [record(0, "ours", poses=[far, pose]) for pose in (far, near, backwards)])
+    assert found == pytest.approx([0.1855 - 2.109, 0.1855 - 0.119, 0.1855 + 0.099], abs=1e-4)
 
 
 def test_a_folder_without_results_is_said_to_be(tmp_path):
@@ -78,7 +129,7 @@ def test_a_folder_without_results_is_said_to_be(tmp_path):
 
 
 def test_every_model_is_described():
-    assert set(writeup.MODELS) == set(MODELS)
+    assert set(words.MODELS) == set(MODELS)
 
 
 @pytest.mark.parametrize("make", [figures._robustness, figures._mass])
@@ -92,16 +143,23 @@ def test_every_method_has_a_curve_of_its_own(make):
 
 
 def test_every_method_is_described():
-    assert set(writeup.METHODS) == set(METHODS)
+    assert set(words.METHODS) == set(METHODS)
 
 
 def test_a_method_is_told_beside_ours_with_few_pairs_too():
     cost = {"pairs": 2, "mine": 5.0, "other": 4.0, "difference": 1.0, "difference_low": -1.0,
             "difference_high": 3.0, "share": 1.25, "low": None, "high": None}  # fmt: skip
     test = {"pairs": 4, "only": 1, "only_other": 0, "p": 1.0}
-    none = {"pairs": 0, "mine": None, "share": None}
-    found = {"satisfied": test, "main_done": test, "kl": cost, "extra_steps": none}
-    assert list(writeup._beside_ours({"lookahead": found, "hcd": found})) == [
-        "- lookahead, beside ours: KL a run 5.0 and 4.0 in 2 pairs, difference +1.0 (-1.0 to +3.0), ratio "
-        "1.25 (not bounded), mean extra steps in no pair of runs; McNemar: rule p = 1, main task p = 1."
+    found = {"other": "ours", "satisfied": test, "main_done": test, "kl": cost, "extra_steps": {"pairs": 0}}
+    assert list(beside_ours({"beside_ours": {"lookahead": found, "hcd": found}})) == [
+        "- lookahead, beside ours: KL a run 5.0 and 4.0, difference +1.0 (-1.0 to +3.0), n 2, ratio 1.25 "
+        "(not bounded); extra steps in no pair of runs; rule 1 runs it alone, 0 the other alone, of 4, p = 1"
+        "; main task 1 runs it alone, 0 the other alone, of 4, p = 1."
     ]
+
+
+def test_a_margin_is_compared_with_the_same_margin():
+    there = ("ours", "ours@0.04/8", "ours@default", "paper", "lookahead")
+    asked = ("paper@0.04/8", "paper", "paper@0.1", "ours@0.04/8", "ours")
+    others = ["ours@0.04/8", "ours", "ours", "ours", None]
+    assert [results._ours(name, there) for name in asked] == others

@@ -1,0 +1,104 @@
+"""What all pages share: a row a method with intervals, how a method does beside `ours`, and the commands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from evaluation.experiment import CERTIFYING, split
+from evaluation.results import markdown, share
+
+Results = dict[str, Any]
+Found = Mapping[Path, Results]  # the folder that each experiment's results lie in
+
+HEADS = ("case, model", "method", "rule kept", "main task done", "KL a run [nats]", "extra steps")
+OUTCOMES = {"satisfied": "rule", "main_done": "main task"}
+COSTS = {"kl": "KL a run", "extra_steps": "extra steps"}
+
+
+def title(results: Results) -> str:
+    return f"{results['case']}, {results['experiment']['model']}"
+
+
+def summary_table(found: Iterable[Results]) -> str:
+    """A row for each experiment and method, under HEADS."""
+    return markdown(HEADS, [(title(results), *row(one)) for results in found for one in results["methods"]])
+
+
+def row(one: Mapping[str, Any]) -> tuple[str, ...]:
+    """A method and its figures, each with its interval: shares as counts, means over runs."""
+    return one["method"], share(one["satisfied"]), share(one["main_done"]), kl(one), steps(one["extra_steps"])
+
+
+def kl(one: Mapping[str, Any]) -> str:
+    low, high = one["kl_interval"]
+    return f"{one['kl']:.1f} ({low:.1f} to {high:.1f})"
+
+
+def steps(later: Mapping[str, Any]) -> str:
+    """The mean of the runs in which both did the main task, of which it says how many there are."""
+    if later["mean"] is None:
+        return "no run"
+    return f"{later['mean']:+.1f} ({later['low']:+.1f} to {later['high']:+.1f}), n {later['both']}"
+
+
+def beside_ours(results: Results) -> Iterator[str]:
+    """A line for each other certifying method: what it does beside `ours`, run by run, whatever that says."""
+    for method, found in results["beside_ours"].items():
+        if split(method)[0] in CERTIFYING:
+            costs = [f"{name} {compared(found[key])}" for key, name in COSTS.items()]
+            tests = [f"{name} {test(found[key])}" for key, name in OUTCOMES.items()]
+            yield f"- {method}, beside {found['other']}: {'; '.join([*costs, *tests])}."
+
+
+def test(found: Mapping[str, Any]) -> str:
+    """McNemar's, in words."""
+    return (
+        f"{found['only']} runs it alone, {found['only_other']} the other alone, of {found['pairs']}, "
+        f"p = {found['p']:.2g}"
+    )
+
+
+def compared(cost: Mapping[str, Any]) -> str:
+    """Both means, the difference with its interval, and the ratio where there is one."""
+    if not cost["pairs"]:
+        return "in no pair of runs"
+    said = f"{cost['mine']:.1f} and {cost['other']:.1f}, difference {difference(cost)}"
+    if cost["share"] is None:
+        return f"{said}, no ratio to a cost of {cost['other']:.1f}"
+    within = "not bounded" if cost["low"] is None else f"{cost['low']:.2f} to {cost['high']:.2f}"
+    return f"{said}, ratio {cost['share']:.2f} ({within})"
+
+
+def difference(cost: Mapping[str, Any]) -> str:
+    low, high = cost["difference_low"], cost["difference_high"]
+    return f"{cost['difference']:+.1f} ({low:+.1f} to {high:+.1f}), n {cost['pairs']}"
+
+
+def about(results: Results) -> str:
+    """The rule, the model, and how many starts were refused."""
+    asked = results["experiment"]
+    return (
+        f'`{results["formula"]}`, model {asked["model"]} ("{results["instruction"]}"), '
+        f"{results['runs']} runs, seed {asked['seed']}; {results['refused_starts']} more starts were drawn "
+        "and refused, because no future that keeps the rule was found from there."
+    )
+
+
+def commands(folder: Path, found: Found) -> str:
+    """A block with the command of each experiment. folder: what was written up, taken for a part of out/."""
+    top, lines = Path("out") / folder.resolve().name, []
+    for kept, results in found.items():
+        asked, case = results["experiment"], results["case"]
+        if asked["house"]:
+            of = "" if asked["house"] == case else " --houses FOLDER"
+            case = f"house --house {case}{of}"
+        out = top / kept.parent.parent.relative_to(folder)
+        for runs in dict.fromkeys(one["runs"] for one in results["methods"]):
+            methods = ",".join(one["method"] for one in results["methods"] if one["runs"] == runs)
+            lines.append(
+                f"specshield evaluate --case {case} --runs {runs} --seed {asked['seed']} "
+                f"--model {asked['model']} --noise {asked['noise']} --methods {methods} --out {out}"
+            )
+    return "```sh\n" + "\n".join(lines) + "\n```"
