@@ -50,7 +50,7 @@ def draw(case: Case, records: Sequence[Record], folder: Path) -> list[Path]:
         by_method.setdefault(record.method, []).append(record)
     folder.mkdir(parents=True, exist_ok=True)
     written = [folder / "ways.png"]
-    _ways(case, by_method).save(written[0])
+    _ways(case, by_method).quantize(64).save(written[0])  # few colours, a third of the bytes
     with plt.rc_context(STYLE):
         for name, make in (("robustness", _robustness), ("mass", _mass), ("modes", _modes)):
             figure = make(case, by_method)

@@ -22,16 +22,19 @@ from evaluation.results import write
 from specshield.errors import NotFound
 from specshield.sim.cases import Case
 
-TITLES = {  # of the pages beside the summary; the last ones are written by commands of their own
+TITLES = {  # of the pages in a folder beside the summary
     "cases": "The cases, method by method",
     "models": "Other models",
     "tasks": "Harder main tasks",
     "noise": "Noise, and worlds that are not as told",
     "houses": "Other apartments",
     "bodies": "Keep-outs for the body and for the origin",
-    "rewards": "Rewards and seeds",
+}
+OTHERS = {  # pages beside the summary that commands of their own write
+    "rewards": "The paper's reward to the letter, and seeds",
     "curves": "Thresholds below 1",
-    "habits": "Does closeness to the model matter?",
+    "lookahead": "Look-ahead",
+    "related": "The neighbours",
 }
 
 
@@ -77,6 +80,7 @@ def write_up(folder: Path, page: Path) -> None:
                 ],
             )
     others = {title: beside / f"{name}.md" for name, title in TITLES.items()}
+    others |= {title: page.with_name(f"{name}.md") for name, title in OTHERS.items()}
     told = summary(parts["cases"], linked(page, others), parts["noise"])
     _write(page, [*told, legend(_methods(parts["cases"].values())), WHY_NEXT_STEP])
 

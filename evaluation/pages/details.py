@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.experiment import CERTIFYING, split
-from evaluation.pages.tables import Found, Results, about, beside_ours, summary_table, title
+from evaluation.pages.tables import Found, Results, about, beside_ours, better, summary_table, title
 from evaluation.pages.words import MODELS
 from evaluation.results import table
 
@@ -16,6 +16,7 @@ def overview(found: Found) -> Iterator[str]:
     """One table of all experiments, who the models are, and how methods do beside `ours` in each."""
     yield summary_table(found.values())
     yield models(found)
+    yield from better(found)
     for results in found.values():
         yield f"## {title(results)}"
         yield about(results)

@@ -9,7 +9,7 @@ import numpy as np
 
 from evaluation.evaluation import read
 from evaluation.experiment import Experiment
-from evaluation.pages.tables import Found, Results, beside_ours, row, title
+from evaluation.pages.tables import Found, Results, beside_ours, better, row, title
 from evaluation.results import markdown, share
 from evaluation.runs import Record
 from evaluation.statistics import clopper_pearson
@@ -38,6 +38,7 @@ def houses(found: Found) -> Iterator[str]:
         for one in results["methods"]
     ]
     yield markdown(heads, rows)
+    yield from better(found)
     for results in found.values():
         yield f"## {title(results)}"
         yield "\n".join(beside_ours(results))

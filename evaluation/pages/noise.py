@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from evaluation.disturbance import DISTURBANCES
 from evaluation.evaluation import read
-from evaluation.pages.tables import Found, Results, beside_ours, kl, title
+from evaluation.pages.tables import Found, Results, beside_ours, better, kl, title
 from evaluation.pages.words import NOISES, WHY_SLACK
 from evaluation.results import markdown, share
 
@@ -15,6 +15,7 @@ from evaluation.results import markdown, share
 def noise(found: Found) -> Iterator[str]:
     yield "\n".join(f"- **{name}**: {NOISES[name]}." for name in DISTURBANCES[1:])
     yield WHY_SLACK
+    yield from better(found)
     for name in dict.fromkeys(map(title, found.values())):
         of = [results for results in found.values() if title(results) == name]
         of.sort(key=lambda results: DISTURBANCES.index(results["experiment"]["noise"]))

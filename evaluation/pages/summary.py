@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from evaluation.experiment import CERTIFYING, split
-from evaluation.pages.tables import Found, Results, difference, summary_table, title
+from evaluation.experiment import split
+from evaluation.pages.tables import Found, better, summary_table, title
 from evaluation.pages.words import CAVEATS, HOW, NOT_THE_SAME, PAPER
 from evaluation.results import markdown, share
-
-UNLIKELY = 0.05  # a p below it is told
 
 
 def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterator[str]:
@@ -19,12 +17,7 @@ def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterato
     yield HOW
     yield summary_table(found.values())
     yield "\n".join([CAVEATS, *_noise(noisy)])
-    yield "## What does better than ours"
-    yield (
-        "Methods that keep the rule as well, where the 95 % interval of the difference, run by run, lies "
-        "below 0, or McNemar's test of the main task has p < 0.05:"
-    )
-    yield "\n".join(line for results in found.values() for line in better(results)) or "- None was found."
+    yield from better(found)
     yield "## Beside the paper's Table II"
     yield NOT_THE_SAME
     yield _beside(found)
@@ -33,27 +26,8 @@ def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterato
     yield "`make results` makes all of it again; each page ends with its own commands."
 
 
-def better(results: Results) -> Iterator[str]:
-    """What other methods do better than `ours`, of those that keep the rule as well."""
-    for method, found in results["beside_ours"].items():
-        kept = found["satisfied"]
-        if found["other"] != "ours" or split(method)[0] not in CERTIFYING:
-            continue
-        if kept["p"] < UNLIKELY and kept["only"] < kept["only_other"]:
-            continue
-        said = []
-        for key, name in (("extra_steps", "steps"), ("kl", "KL")):
-            if found[key]["pairs"] and found[key]["difference_high"] < 0.0:
-                said.append(f"{name} {difference(found[key])}")
-        done = found["main_done"]
-        if done["p"] < UNLIKELY and done["only"] > done["only_other"]:
-            said.append(f"main task +{done['only']} and -{done['only_other']} runs, p = {done['p']:.2g}")
-        if said:
-            yield f"- **{method}** ({title(results)}): {'; '.join(said)}."
-
-
 def _noise(noisy: Found) -> Iterator[str]:
-    """The rule under gaussian noise by `ours` and by `paper`, each pair with the same margin."""
+    """The rule under gaussian noise by `ours` and by others, each pair with the same margin."""
     for results in noisy.values():
         if results["experiment"]["noise"] != "gaussian":
             continue
@@ -62,7 +36,7 @@ def _noise(noisy: Found) -> Iterator[str]:
             f"{(ours := found['other'])} {kept[ours]}, {method} {kept[method]}, "
             f"p = {found['satisfied']['p']:.2g}"
             for method, found in results["beside_ours"].items()
-            if split(method)[0] == "paper"
+            if split(method)[0] in ("paper", "rule-first")
         ]
         if parts:
             yield f"  - {title(results)}, gaussian noise, rule kept: {'; '.join(parts)}."

@@ -14,6 +14,7 @@ Found = Mapping[Path, Results]  # the folder that each experiment's results lie 
 
 HEADS = ("case, model", "method", "rule kept", "main task done", "KL a run [nats]", "extra steps")
 OUTCOMES = {"satisfied": "rule", "main_done": "main task"}
+UNLIKELY = 0.05  # a p below it counts as a difference
 COSTS = {"kl": "KL a run", "extra_steps": "extra steps"}
 
 
@@ -50,6 +51,38 @@ def beside_ours(results: Results) -> Iterator[str]:
             costs = [f"{name} {compared(found[key])}" for key, name in COSTS.items()]
             tests = [f"{name} {test(found[key])}" for key, name in OUTCOMES.items()]
             yield f"- {method}, beside {found['other']}: {'; '.join([*costs, *tests])}."
+
+
+def better(found: Found) -> Iterator[str]:
+    """A section: what other methods do better than `ours`, of those that keep the rule as well."""
+    yield "## What does better than ours"
+    yield (
+        "Methods that keep the rule as often, as far as McNemar's test tells (p >= 0.05), or more often, where "
+        "the 95 % interval of the difference in steps or KL, run by run, lies below 0, or more of them keep "
+        "the rule or do the main task (p < 0.05). Of so many comparisons, some are so by chance."
+    )
+    yield "\n".join(line for results in found.values() for line in _better(results)) or "- None was found."
+
+
+def _better(results: Results) -> Iterator[str]:
+    for method, found in results["beside_ours"].items():
+        kept = found["satisfied"]
+        if split(method)[0] not in CERTIFYING or (kept["p"] < UNLIKELY and kept["only"] < kept["only_other"]):
+            continue
+        said = [
+            f"{name} {difference(found[key])}"
+            for key, name in COSTS.items()
+            if found[key]["pairs"] and found[key]["difference_high"] < 0.0
+        ]
+        said += [
+            f"{name} {test(found[key])}"
+            for key, name in OUTCOMES.items()
+            if found[key]["p"] < UNLIKELY and found[key]["only"] > found[key]["only_other"]
+        ]
+        if said:
+            world = results["experiment"]["noise"]
+            where = title(results) if world == "none" else f"{title(results)}, {world}"
+            yield f"- **{method}**, beside {found['other']} ({where}): {'; '.join(said)}."
 
 
 def test(found: Mapping[str, Any]) -> str:
