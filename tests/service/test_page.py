@@ -13,7 +13,7 @@ import pytest
 from tests.browsing import browsing, needs_chromium
 from tests.service.world import ahead
 from tests.serving import serving
-from tests.world.test_procthor import SIZES, house
+from tests.world.test_procthor import HOUSES, SIZES, house
 
 pytestmark = needs_chromium
 SHOTS = os.environ.get("SPECSHIELD_SCREENSHOTS")  # a folder for pictures of every screen
@@ -143,6 +143,32 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
     unasked = [text for text in complaints if "422" not in text]  # the rule that was wrong
     assert unasked == []
     assert len(complaints) - len(unasked) <= 2
+
+
+@pytest.mark.skipif(not HOUSES.exists(), reason="the folder of real houses is not here")
+def test_a_real_house(own):
+    """A ProcTHOR house with its rooms as regions: the rule is kept to its end."""
+    with browsing() as (page, complaints):
+        page.goto(f"{own.url}/#/maps")
+        page.get_by_label("Name").fill("real-house")
+        page.locator("#files").set_input_files([HOUSES / "house_0.json", HOUSES / "asset-sizes.json"])
+        page.get_by_role("heading", name="real-house").wait_for()
+        page.locator(".walls image").wait_for(state="attached")
+        rule = page.get_by_role("textbox", name="Rule")
+        rule.fill("F[0,80] LivingRoom and G[0,100] not Bathroom")
+        page.get_by_text("steps 0 to 100").first.wait_for()
+        page.get_by_label("Name", exact=True).fill("living-room")
+        page.get_by_role("button", name="Make it").click()
+        page.locator(".badge.ready").wait_for()
+        page.get_by_role("link", name="Try it").click()
+        page.locator(".walls image").wait_for(state="attached")
+        Floor(page).click(9.75, 7.25)  # in the kitchen, where the house has its agent
+        page.get_by_role("heading", name="Step 0").wait_for()
+        page.get_by_role("button", name="Run", exact=True).click()
+        page.get_by_text("The episode is over").wait_for()
+        page.get_by_role("link", name="This session's own page").click()
+        page.get_by_text("over, the rule is satisfied").wait_for()
+    assert complaints == []
 
 
 def test_a_floor_with_robots_that_are_over(server, client, begin, step):

@@ -36,9 +36,8 @@ from specshield.world.learned import (
     revised,
 )
 
-# [steps] what a way around something takes that only contacts show. Chosen by hand: with 12, of 60 runs of
-# `evaluation worlds --case CASE --world obstacle --sensing contact` in case 1 and of 60 in case 2, 58 and 52
-# were kept, with 20 it was 59 and 57.
+# [steps] what a way around something takes that only contacts show. Chosen by hand: of 60 runs in cases 1 and
+# 2, `evaluation worlds --world obstacle --sensing contact` keeps 58 and 52 with 12, and 59 and 57 with 20.
 AROUND = 20
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand

@@ -208,6 +208,17 @@ def test_an_until_stays_in_a_corridor_up_to_where_it_leads():
     assert all(np.logical_or(inside["Up"], inside["Along"])[:there])
 
 
+def test_who_waits_for_a_policy_is_told_how_far_it_is():
+    told = []
+    task = make_task(ROOM, STRETCH, "G[0,20] F[0,40] B", {"B": rectangle(4, 4, 5, 5)})
+    synthesise(task, Settings(pitch=0.2), on_progress=lambda done, left, said: told.append((done, left)))
+    shares = [done for done, _ in told]
+    assert len(set(shares)) > 20
+    assert shares == sorted(shares)
+    assert shares[0] > 0.0
+    assert told[-1] == (1.0, 0.0)
+
+
 def test_a_robot_that_cannot_stand_still_is_planned_for():
     """It turns where it would wait; a row for every motion."""
     task = flat("G[0,20] F[0,40] West and F[10,60] East", CUSTOM)

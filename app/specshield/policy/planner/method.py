@@ -38,7 +38,7 @@ def _check(task: Task, options: Settings) -> None:
 def _make(task: Task, options: Settings, run: Run) -> Made:
     from specshield.policy.planner import policy
 
-    return policy.synthesise(task, options, run.spec)
+    return policy.synthesise(task, options, run.spec, run.on_progress)
 
 
 def _load(weights: bytes | Path, card: Card, task: Task) -> Proposer:

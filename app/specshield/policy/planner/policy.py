@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -63,6 +63,7 @@ BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measu
 # Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
 FIRST, ON = 300_000, 20_000
 STARTS = 50  # poses that a new policy is tried from
+FIELDS_SHARE = 0.3  # of the time that making a policy takes, about
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +172,16 @@ class PlannerPolicy:
         first, found = plan_all(world, t, history[-1], held, known, effort, most, motions)
         return Proposal(motions, int(first)), bool(found)
 
-    def feasible_start(self, lattice: Lattice, signals: Mapping[str, Floats] | None = None) -> float:
+    def feasible_start(
+        self,
+        lattice: Lattice,
+        signals: Mapping[str, Floats] | None = None,
+        on_progress: Callable[[float], None] = lambda done: None,
+    ) -> float:
         """The share of poses drawn from the lattice (the same each time) that some plan begins at.
 
-        signals {name: [1]}: held from x_0 on; else each has its initial value.
+        signals {name: [1]}: held from x_0 on; else each has its initial value. on_progress: told the share
+        of the poses that were tried.
         """
         free, random = np.argwhere(lattice.valid == 1), np.random.default_rng(0)
         if not len(free):
@@ -183,7 +190,11 @@ class PlannerPolicy:
             pose_of(self._body, lattice.pitch, lattice.headings, *map(float, free[i]))
             for i in random.integers(len(free), size=STARTS)
         )
-        return sum(self._plan(np.array([pose]), signals or {}, 0.0, ON)[1] for pose in poses) / STARTS
+        begun = 0
+        for tried, pose in enumerate(poses, 1):
+            begun += self._plan(np.array([pose]), signals or {}, 0.0, ON)[1]
+            on_progress(tried / STARTS)
+        return begun / STARTS
 
     def weights(self) -> bytes:
         """The safetensors file."""
@@ -191,10 +202,17 @@ class PlannerPolicy:
 
 
 def synthesise(
-    task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
+    task: Task,
+    settings: Settings | None = None,
+    spec: Mapping[str, Any] | None = None,
+    on_progress: Callable[[float, float, str], None] = lambda done, seconds_left, said: None,
 ) -> PlannerPolicy:
-    """Computes the fields. Raises PolicyError for a map too large."""
+    """Computes the fields. Raises PolicyError for a map too large. on_progress: as `Run` has it."""
     began = time.perf_counter()
+
+    def tell(done: float) -> None:
+        on_progress(done, (time.perf_counter() - began) * (1.0 - done) / done, "")
+
     settings = settings or Settings()
     pitch = _pitch(task, settings)
     packed, literals = literals_of(task, task.formula)
@@ -213,12 +231,17 @@ def synthesise(
                     allowed &= holds[g] | near[k] if ended else holds[g]
                 codes[k, keeps] = steps_to(lattice, near[k], allowed)[used]
             chosen[k, column] = list(codes).index((k, keeps)) if (k, keeps) in codes else chosen[k, 0]
+            tell(FIELDS_SHARE * (column * len(literals) + k + 1) / (2 * len(literals)))
     cell = number_cells(used)
     code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
     fields = Fields(cell, code, pitch)
     # Trying it also leaves its kernels compiled where a server finds them.
     policy = PlannerPolicy(task, {}, settings, fields, chosen)
-    metrics: dict[str, float] = {"feasible_start": round(policy.feasible_start(lattice), 4)}
+    metrics: dict[str, float] = {}
+    share = policy.feasible_start(
+        lattice, on_progress=lambda done: tell(FIELDS_SHARE + (1.0 - FIELDS_SHARE) * done)
+    )
+    metrics["feasible_start"] = round(share, 4)
     if task.signals:
         worst = worst_signals(task)
         at_worst = {} if worst is None else dict(zip(task.signals, worst.T, strict=True))
