@@ -4,10 +4,11 @@
 
 The episodes are shared out among small worlds of benchmarks/worlds.py from whose start the rule can be kept.
 The model nearly always stands still, where that breaks the rule: alone it keeps it in the share shown. Some
-worlds leave no time for slips and noise; how often the rule is kept where 1 is asked bounds what can be had.
-The verdict is that of benchmarks/judge.py. The world is exact; or every twentieth motion is not executed, as
-the session was told; or motions end off by 0.5 cm and half a degree, as the session was told. The interval is
-of 99 %, by Clopper and Pearson.
+worlds leave no time for slips and noise: how often the rule is kept in a world where 1 is asked says what can
+be had there. The last three columns are of the worlds in which that is at least what was asked. The verdict
+is that of benchmarks/judge.py. The world is exact; or every twentieth motion is not executed, as the session
+was told; or motions end off by 0.5 cm and half a degree, as the session was told. The interval is of 99 %, by
+Clopper and Pearson.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from specshield.shield.episode import Carry, Config, Shield, decide, make_shield
 from specshield.shield.uncertainty import Uncertainty
 
 Floats = NDArray[np.float64]
-ASKED = (0.5, 0.8, 0.9, 0.95, 1.0)
+ASKED = (1.0, 0.95, 0.9, 0.8, 0.5)  # 1 first: it says what can be had
 STANDS = 4.0  # [nats] by which the model prefers to stand still; beside noise of one nat
 WORLDS = 20
 
@@ -60,17 +61,33 @@ def main() -> None:
     options = parser.parse_args()
     worlds = list(drawn(options.seed))
     each = math.ceil(options.episodes / len(worlds))
-    print("| motions | asked | kept | 99 % interval | alone |\n|---|--:|--:|---|--:|")
+    print(
+        "| motions | asked | kept | 99 % interval | alone | worlds that can | kept there | 99 % interval |\n"
+        "|---|--:|--:|---|--:|--:|--:|---|"
+    )
     for how in HOWS:
         alone = sum(kept(world, None, how, 0.0, run) for world, _ in worlds for run in range(each))
+        most: Floats | None = None
         for asked in ASKED:
-            found = sum(
-                kept(world, shield, how, asked, run) for world, shield in worlds for run in range(each)
+            found = np.array(
+                [sum(kept(world, shield, how, asked, run) for run in range(each)) for world, shield in worlds]
             )
-            n = each * len(worlds)
-            low, high = binomtest(found, n).proportion_ci(0.99, method="exact")
-            interval = f"{low:.3f} to {high:.3f}"
-            print(f"| {how.name} | {asked} | {found / n:.3f} | {interval} | {alone / n:.3f} |", flush=True)
+            most = found if most is None else most
+            can = most >= asked * each
+            print(
+                f"| {how.name} | {asked} | {share(found, each)} | {alone / each / len(worlds):.3f} "
+                f"| {can.sum()} | {share(found[can], each)} |",
+                flush=True,
+            )
+
+
+def share(found: NDArray[np.int_], each: int) -> str:
+    """The share of what was kept, `found` [worlds] of `each`, and its interval."""
+    if not len(found):
+        return "- | -"
+    n = each * len(found)
+    low, high = binomtest(int(found.sum()), n).proportion_ci(0.99, method="exact")
+    return f"{found.sum() / n:.3f} | {low:.3f} to {high:.3f}"
 
 
 def drawn(seed: int) -> Iterator[tuple[World, Shield]]:
