@@ -50,10 +50,10 @@ def plan(houses: Sequence[str] = ()) -> Iterator[Campaign]:
         yield Campaign("noise", Experiment(case, noise="gaussian"), 100, NOISY)
     yield Campaign("bodies", Experiment("case2b"), 100, FEW)
     for house in [*(f"drawn_{seed}" for seed in range(DRAWN)), *houses]:
-        yield Campaign("houses", Experiment("house", house), 40, FEW)
+        yield Campaign("houses", Experiment("house", house), 30, FEW)
     for model in sorted(set(MODELS) - set(MAIN_MODELS)):
         for case in CASES:
-            yield Campaign("models", Experiment(case, model=model, seed=UNTRIED), 100, FEW)
+            yield Campaign("models", Experiment(case, model=model, seed=UNTRIED), 60, FEW)
     for noise in WRONG:
         for case in CASES:
             yield Campaign("noise", Experiment(case, noise=noise), 40, ("paper", "ours", "ours@default"))

@@ -57,9 +57,10 @@ def better(found: Found) -> Iterator[str]:
     """A section: what other methods do better than `ours`, of those that keep the rule as well."""
     yield "## What does better than ours"
     yield (
-        "Methods that keep the rule as often, as far as McNemar's test tells (p >= 0.05), or more often, where "
-        "the 95 % interval of the difference in steps or KL, run by run, lies below 0, or more of them keep "
-        "the rule or do the main task (p < 0.05). Of so many comparisons, some are so by chance."
+        "Methods that keep the rule as often, as far as McNemar's test tells (p >= 0.05), or more often; of "
+        "those, where the 95 % interval of the difference in steps or KL, run by run, lies below 0, or where "
+        "more runs keep the rule or do the main task (p < 0.05). Of so many comparisons, a few are so by "
+        "chance."
     )
     yield "\n".join(line for results in found.values() for line in _better(results)) or "- None was found."
 
