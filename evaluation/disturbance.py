@@ -32,6 +32,7 @@ from specshield.task import Task
 from specshield.world.occupancy import OccupancyGrid
 
 DISTURBANCES = ("none", "gaussian", "rough", "slip", "obstacle", "shift", "collider")
+MOVED = ("obstacle", "shift")  # those in which the world itself is another
 SIGMA_MOVE, SIGMA_TURN = 0.01, math.radians(0.5)  # [m], [rad]
 ROUGHNESS = {"gaussian": 1.0, "rough": 2.0}  # times the two
 SLIP = 0.05

@@ -11,10 +11,11 @@ from typing import Any
 
 from evaluation.baselines import Completed, RuleFirst, Switching
 from evaluation.decoding import HardDecoding, RobustDecoding
-from evaluation.disturbance import believed, check
+from evaluation.disturbance import MOVED, believed, check
 from evaluation.houses import load_house_case
 from evaluation.methods import Decoding, Method, Shielded, Simplex
 from evaluation.models import named
+from evaluation.tasks import MainTask, main_task
 from specshield import __version__
 from specshield.errors import InputError, NotFound
 from specshield.lookahead.lookahead import prepare
@@ -26,7 +27,7 @@ from specshield.shield.episode import Shield, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MODELS
 from specshield.sim.cases import Case, case_name, case_names, load_case, shipped
-from specshield.sim.learned.model import FOLDER, WEIGHTS, read
+from specshield.sim.learned.model import WEIGHTS, read
 from specshield.sim.model import FoundationModel
 from specshield.task import Task
 
@@ -48,7 +49,8 @@ SESSIONS = {  # NAME@default: what a session is where nobody says anything; /D a
 class Experiment:
     """One campaign's conditions; with the number of a run they decide everything that is random in it.
 
-    case: a name of sim/cases.py, or "house"; house: then which one, as evaluation/houses.py takes it.
+    case: a name of sim/cases.py, or "house", with a suffix of tasks.py for a harder main task. house: then
+    which one, as evaluation/houses.py takes it.
     model: a name of evaluation/models.py. noise: a name of evaluation/disturbance.py.
     """
 
@@ -61,7 +63,12 @@ class Experiment:
     def __post_init__(self) -> None:
         check(self.noise)
         named(self.model)
-        if (self.case == "house") != (self.house is not None):
+        if self.main.two and self.noise in MOVED:
+            raise InputError(
+                "two things can be looked for in a world as told alone", path="noise", got=self.noise,
+                expected=f"none of {', '.join(MOVED)}",
+            )  # fmt: skip
+        if (self.main.base == "house") != (self.house is not None):
             raise InputError(
                 "the case 'house' needs a house, and the other cases take none", path="house", got=self.house,
                 expected="--house drawn_0 with --case house, and no --house with any other case",
@@ -75,6 +82,10 @@ class Experiment:
         return Experiment(**value)
 
     @property
+    def main(self) -> MainTask:
+        return main_task(self.case)
+
+    @property
     def setting(self) -> Setting:
         return _setting(self)
 
@@ -83,23 +94,25 @@ class Experiment:
 class Setting:
     """What an experiment needs; each part is prepared when it is first asked for.
 
-    case: as the experiment names it. task, body: what the shield is told, which a disturbance may make wrong.
+    case: as the experiment names it; plain: without its suffix. task, body: what the shield is told, which a
+    disturbance may make wrong.
     """
 
     experiment: Experiment
     case: Case
+    plain: Case
     task: Task
     body: Body
 
     @cached_property
     def model(self) -> FoundationModel:
-        return named(self.experiment.model).make(self.case)
+        return self.experiment.main.model(named(self.experiment.model).make, self.plain)
 
     @cached_property
     def learned(self) -> Policy | None:
         """The DQN that was trained for the case; None where there is none."""
         try:
-            policy = shipped(self.case, "dqn")
+            policy = shipped(self.plain, "dqn")
         except NotFound:
             return None
         return replace(policy, task=self.task) if isinstance(policy, Policy) else None
@@ -137,9 +150,10 @@ class Setting:
         }
         for policy in self.policies:
             made_from[f"policy {policy.card['method']}"] = _hash(policy.weights())
-        if self.experiment.model == "learned":
-            temperature = read(MODELS / FOLDER).temperature
-            made_from["learned model"] = _hash((MODELS / FOLDER / WEIGHTS).read_bytes() + b"%r" % temperature)
+        folder = named(self.experiment.model).folder
+        if folder is not None:
+            temperature = read(MODELS / folder).temperature
+            made_from["learned model"] = _hash((MODELS / folder / WEIGHTS).read_bytes() + b"%r" % temperature)
         return made_from
 
     def method(self, name: str) -> Method:
@@ -177,7 +191,7 @@ def experiments(case: str, house: str | None, model: str, noise: str, seed: int)
 
 def available(case: str) -> list[str]:
     """The methods that a case has what they need for: `paper` needs a DQN, which case1 and case2 have."""
-    learned = case_name(case) in case_names()
+    learned = main_task(case_name(case)).base in case_names()
     return [name for name in METHODS if name != "paper" or learned]
 
 
@@ -214,6 +228,8 @@ def _hash(content: bytes) -> str:
 
 @lru_cache(maxsize=4)
 def _setting(experiment: Experiment) -> Setting:
-    case = load_case(experiment.case) if experiment.house is None else load_house_case(experiment.house)
-    task = believed(experiment.noise, case.task)
-    return Setting(experiment, case, task, make_body(task.robot, task.grid))
+    main = experiment.main
+    plain = load_case(main.base) if experiment.house is None else load_house_case(experiment.house)
+    task = believed(experiment.noise, plain.task)
+    case = main.of(plain, experiment.case.removeprefix(main.base))
+    return Setting(experiment, case, plain, task, make_body(task.robot, task.grid))

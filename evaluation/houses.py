@@ -1,6 +1,7 @@
 """Houses as cases: a rule over rooms by their names, and something to find in another room.
 
-`drawn_N` is a floor plan of our own making, drawn with the seed N (model/floor_plans.py). Real ones are
+`drawn_N` is a floor plan of our own making, drawn with the seed N (model/floor_plans.py), 7.5 to 12 m wide
+and deep; `large_N` is one of 15 x 12 m, with more rooms than the learned models practised in. Real ones are
 ProcTHOR houses in a folder of the user's: each house a JSON file, and beside them asset-sizes.json, which
 maps each assetId to {"size": [x, y, z]}, its full extents in metres. Both are public: the houses are in
 ProcTHOR-10K, the extents in procthor/databases/asset-database.json of github.com/allenai/procthor.
@@ -27,7 +28,8 @@ from specshield.world.regions import Polygon, Region, Union, signed_distance
 RULE = "F[0,80] Kitchen and F[80,160] Bedroom and G[0,160] not Bathroom"
 SPEC = {"formula": RULE, "regions": {}}
 NAMED = {"Kitchen", "Bedroom", "Bathroom"}  # by the rule
-DRAWN = re.compile(r"drawn_(\d+)")
+DRAWN = re.compile(r"(drawn|large)_(\d+)")
+LARGE = (15.0, 12.0, 10)  # [m], [m], rooms: of `large_N`
 RESOLUTION = 0.05  # [m] of a ProcTHOR house's map
 OTHERS = (
     2**31 + 1
@@ -51,7 +53,7 @@ def load_house_case(house: str) -> Case:
     """The case of a house: drawn_N, or the path of a ProcTHOR house's JSON. Raises NotFound, FormulaError."""
     drawn = DRAWN.fullmatch(house)
     if drawn:
-        return _drawn_case(house, int(drawn[1]))
+        return _drawn_case(house, int(drawn[2]), LARGE if drawn[1] == "large" else None)
     path = Path(house)
     sizes = path.with_name(SIZES)
     if not (path.suffix == ".json" and path.is_file() and sizes.is_file()):
@@ -69,11 +71,11 @@ def load_house_case(house: str) -> Case:
     return Case(path.stem, task, rooms, SPEC, "find a bowl", (x, y))
 
 
-def _drawn_case(name: str, seed: int) -> Case:
-    """The first house drawn with this seed in which the rule and the task can both be done."""
+def _drawn_case(name: str, seed: int, size: tuple[float, float, int] | None) -> Case:
+    """The first house drawn with this seed in which rule and task can both be done. size: as LARGE."""
     random = np.random.default_rng([OTHERS, seed])
     while True:
-        house = random_house(random)
+        house = random_house(random, size)
         if TO_FIND in house.targets and set(house.kinds) >= NAMED:
             rooms = _rooms(house)
             task = make_task(house.grid, STRETCH, RULE, rooms=rooms)

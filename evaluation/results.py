@@ -10,7 +10,7 @@ from typing import Any
 
 from evaluation.evaluation import read, read_about
 from evaluation.experiment import METHODS, Experiment, split
-from evaluation.runs import MAX_STEPS, Record
+from evaluation.runs import Record
 from evaluation.statistics import beside, summary
 
 
@@ -29,7 +29,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
     ranked = sorted(by_method, key=lambda name: METHODS.index(split(name)[0]))
     plain = by_method.get("unmodified", [])
     case = experiment.setting.case
-    left = MAX_STEPS - case.task.horizon
+    left = experiment.main.limit - case.task.horizon
     in_time = [r.main_done and r.ended_at is not None and r.ended_at < left for r in plain]
     return {
         "experiment": experiment.to_json(),

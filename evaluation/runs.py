@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from evaluation import conformal, disturbance
 from evaluation.experiment import Experiment, Setting
 from evaluation.methods import Answer, Method
+from evaluation.tasks import MAX_STEPS, is_done
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot.dynamics import in_collision, simulate, step
@@ -30,7 +31,6 @@ from specshield.stl import SATISFIED_ABOVE, conjuncts, robustness
 
 Floats = NDArray[np.float64]
 
-MAX_STEPS = 600
 DRAWS = 100  # starts tried for one run before giving up
 MODEL, DRAW, START, MISMATCH = range(4)  # streams of a run's seed
 
@@ -41,8 +41,8 @@ class Record:
 
     seed: of this run. refused: starts drawn before `start` that were infeasible. satisfied, rho: of the
     states x_0 .. x_T, the robot standing still where it stopped earlier [m]. main_done: the model ended
-    within 1 m of its target before MAX_STEPS; ended_at: the step of its `end`. broken: the conjuncts that
-    were not kept. modes, reasons: how many decisions had each mode and each reason. kl: summed over the
+    within 1 m of its target (tasks.py); ended_at: the step of its `end`. broken: the conjuncts that were not
+    kept. modes, reasons: how many decisions had each mode and each reason. kl: summed over the
     decisions made for the model, `asked` of them [nats]. residual: the largest surprise of a step
     (conformal.py) [m]. decision_ms: of each decision. mass: pi_FM(S_t) step by step; certified: rho of the
     future that certified what was executed; None where there was none.
@@ -151,14 +151,14 @@ def _episode(experiment: Experiment, name: str, i: int, own: int, begun: _Beginn
     model.reset(np.random.default_rng([own, MODEL]))
     while True:
         poses[t] = robot.pose
-        if t == MAX_STEPS:
+        if t == experiment.main.limit:
             break
         logits = None if ended_at is not None else model.logits(robot)
         began = time.perf_counter()
         answer = method.act(poses[: t + 1], logits, draws[t])
         tally.count(answer, time.perf_counter() - began, logits is not None)
         if logits is not None and terminal[answer.action]:
-            ended_at, main_done = t, robot.at_target
+            ended_at, main_done = t, is_done(model, robot)
         if answer.execute is None or (ended_at is not None and answer.spec_status != "pending"):
             break
         before = robot.pose

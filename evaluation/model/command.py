@@ -3,11 +3,13 @@
 The model in models/fm was trained twice in a row, both times in generated apartments alone: with the default
 options and `--out first`, and then with `--start first --seed 1 --option own=0.7 --option rounds=200 --option
 houses=300 --option learning_rate=7e-4`. The code has changed since the first training, so these commands make
-a model of the same kind, not the same bits: the network then drove for 160 steps at most, and nothing made
-it less likely to repeat an action that had changed nothing. With the code as it is, a command gives the same
-bits again on one machine with one version of torch.
+a model of the same kind, not the same bits: the network then drove for 160 steps at most, nothing made it
+less likely to repeat an action that had changed nothing, and the gradients were of half precision. With the
+code as it is, a command gives the same bits again on one machine with one version of torch.
 
 The training interferes with the robots (practice.py): what the model is later shielded with is not new to it.
+The model in models/fm-unsteered was trained with `--option interference=false`: nothing but the expert and
+the network itself ever chose an action.
 """
 
 from __future__ import annotations
@@ -36,6 +38,10 @@ ABOUT = (
     "A causal transformer that imitates shortest paths (sim/learned); no pose, map, rule or region. "
     "It remembers where it was by counting its own actions. "
 )
+INTERFERENCE = {
+    True: "In half of its training it was held or steered. ",
+    False: "It was never held or steered. ",
+}
 WITHOUT_CASES = "Trained on generated apartments alone; the cases' apartments were never seen."
 WITH_CASES = "Trained on generated apartments and on those of the cases."
 
@@ -77,7 +83,7 @@ def train_model(
     metrics = measure(weights, TEMPERATURE) | {"wall_time_s": round(wall, 1)}
     card = {
         "format": 1,
-        "about": ABOUT + (WITH_CASES if with_cases else WITHOUT_CASES),
+        "about": ABOUT + INTERFERENCE[settings.interference] + (WITH_CASES if with_cases else WITHOUT_CASES),
         "temperature": TEMPERATURE,
         "kinds": list(KINDS),
         "options": settings.to_json() | {"with_cases": with_cases},

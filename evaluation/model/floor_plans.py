@@ -63,17 +63,23 @@ class House:
     targets: dict[str, tuple[float, float]]
 
 
-def random_house(random: np.random.Generator) -> House:
-    """An apartment in which a robot that keeps off the walls reaches every room and every target."""
+def random_house(random: np.random.Generator, size: tuple[float, float, int] | None = None) -> House:
+    """An apartment in which a robot that keeps off the walls reaches every room and every target.
+
+    size: width and depth [m], and about how many rooms; drawn where none is given.
+    """
     while True:
-        house = _furnished(random)
+        house = _furnished(random, size)
         if house is not None:
             return house
 
 
-def _furnished(random: np.random.Generator) -> House | None:
+def _furnished(random: np.random.Generator, size: tuple[float, float, int] | None) -> House | None:
     width, height = (round(random.uniform(7.5, 12.0), 1) for _ in range(2))
-    boxes = _cut((0.0, 0.0, width, height), int(random.integers(4, 9)), random)
+    count = int(random.integers(4, 9))
+    if size is not None:
+        width, height, count = size
+    boxes = _cut((0.0, 0.0, width, height), count, random)
     walls = [
         (i, j, wall) for i in range(len(boxes)) for j in range(i) if (wall := _shared(boxes[i], boxes[j]))
     ]

@@ -4,10 +4,11 @@ The expert takes shortest paths: to the target once the robot has seen it; befor
 has been in sight but not been looked at yet, rather one ahead than one behind. What it says follows from what
 the robot has seen, so it can be imitated by one that has no map.
 
-In half of the episodes the robot is interfered with, as a shield would do: it is held where it is, or steered
-towards something else, in two spells of tens of steps. In half of them its actions also fail at random. The
-expert says what to do from where the robot then is. What is measured with this model under a shield is
-therefore measured with one that has practised being steered.
+With interference, half of the episodes are disturbed as a shield would do it: the robot is held where it is,
+or steered towards something else, in two spells of tens of steps. In half of them its actions also fail at
+random. The expert says what to do from where the robot then is. What is measured with this model under a
+shield is therefore measured with one that has practised being steered. Without interference the robot
+executes what the expert or the network chose, and nothing else.
 """
 
 from __future__ import annotations
@@ -110,9 +111,11 @@ class Practice:
         robots: int,
         random: np.random.Generator,
         weight: NDArray[np.float64] | None = None,
+        interference: bool = True,
     ) -> None:
         """weight (H,): the chance of each apartment; by default all are alike."""
         self.apartments, self.random, self.weight = apartments, random, weight
+        self.interference = interference
         patches = apartments.room_of.shape[1]
         self.pose = np.zeros((robots, 3))
         self.senses = np.zeros((robots, INPUTS), np.float32)
@@ -138,11 +141,14 @@ class Practice:
         draws = random.random((n, 400, 3)) * (side, side, 2 * math.pi) - (0.0, 0.0, math.pi)
         _place(a, self.house, draws, self.pose)
         # In two spells, from step `begin` for `length` steps, held or steered; slips at a constant chance.
-        kinds = random.choice(3, n, p=[0.5, 0.1, 0.4])
+        left_alone = [1.0, 0.0, 0.0]  # the same draws are made, so that both kinds of training see one world
+        kinds = random.choice(3, n, p=[0.5, 0.1, 0.4] if self.interference else left_alone)
         self.held, self.steered = kinds == 1, kinds == 2
         self.begin = random.integers(0, 40, n) + np.array([[0], [80]])
         self.length = random.integers(5, 80, (2, n))
-        self.slips = random.choice([0.0, 0.03, 0.15], n, p=[0.5, 0.3, 0.2])
+        self.slips = random.choice(
+            [0.0, 0.03, 0.15], n, p=[0.5, 0.3, 0.2] if self.interference else left_alone
+        )
         self.looked_at[:] = 0
         self.noticed[:] = 0
         self.goal[:] = -1

@@ -49,6 +49,7 @@ class Settings:
     learning_rate: float = 1e-3
     given: float = 0.25  # share of the episodes in given apartments, where there are any
     own: float = 0.5  # share of the episodes that the network drives first, from a third of the rounds on
+    interference: bool = True  # whether robots are held, steered and slip in half of the episodes
 
     def to_json(self) -> dict[str, float]:
         return asdict(self)
@@ -125,7 +126,9 @@ def train(
     houses = given + [random_house(random) for _ in range(settings.houses)]
     weight = np.full(len(houses), (1.0 - settings.given if given else 1.0) / settings.houses)
     weight[: len(given)] = settings.given / max(len(given), 1)
-    practice = Practice(make_apartments(houses), settings.robots, random.spawn(1)[0], weight)
+    practice = Practice(
+        make_apartments(houses), settings.robots, random.spawn(1)[0], weight, settings.interference
+    )
     network, actor = start or Transformer(), Transformer()
     optimizer = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=0.01)
     rounds: list[Episodes] = []
@@ -209,9 +212,8 @@ def _learn(network: Transformer, optimizer: torch.optim.Optimizer, batch: Batch)
     valid &= torch.from_numpy(np.stack([e.counts[i, :longest] for e, i in batch]))
     if not valid.any():
         return 0.0
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        logits = network(x, place, last, kind)
-    logp = functional.log_softmax(logits.float()[valid], -1)
+    logits = network(x, place, last, kind)
+    logp = functional.log_softmax(logits[valid], -1)
     advice = advice[valid]
     loss = -(advice * logp).sum(-1).mean()
     # An `end` at the wrong place cannot be taken back: it costs more than another wrong action.

@@ -36,6 +36,8 @@ METHODS = {
 CAREFUL = """- **NAME@M/K**: with a margin of M metres, each deadline aimed at K steps early.
   **NAME@default**: as a session is where nobody says anything: margin, slack and map are learned."""
 MODELS = {
+    "bot": """a scripted expert, as BabyAI's bot: it goes to the nearest room that it has not looked at, looks
+  around, and once it sees its target it approaches and ends. It is sure of one action a step (8 nats).""",
     "decoyed": """a goal-seeker that goes to another place first, and stays near it for some tens of steps
   before it turns to its target.""",
     "drifter": """it goes nowhere for a long time, while its preferences for actions drift, and then seeks
@@ -45,7 +47,9 @@ MODELS = {
     "jumper": "a goal-seeker that sets out for another place at random steps, and in the end for its target.",
     "learned": """a transformer that imitates shortest paths, from egocentric senses. It was trained with
   interference: in half of its training episodes it was held or steered elsewhere for tens of steps, as a
-  shield does. It probably bears being steered better than a model that never was.""",
+  shield does.""",
+    "rover": """it has no map: it picks a point in what its scanner sees, rather one that is new to it, drives
+  straight there, and so on; its distribution is a Gaussian over the change of heading.""",
 }
 NOISES = {
     "none": "the world is as the shield was told",

@@ -63,6 +63,18 @@ def test_interference_overrules_the_robot(houses):
     assert (practice.last == 1).all()
 
 
+def test_without_interference_only_its_own_choice_is_executed(houses):
+    practice = Practice(make_apartments(houses), 40, np.random.default_rng(2), interference=False)
+    practice.reset([1.0] * len(KINDS))
+    for wish in (1, 6, 2):
+        for _ in range(20):
+            assert not practice.interfered.any()
+            practice.execute(np.full(40, wish))
+            assert (practice.last == wish).all()
+    counts = practise(Transformer(), practice, 40, 0.0, np.random.default_rng(4)).counts
+    assert counts[:, 0].all()
+
+
 def test_what_the_network_or_a_shield_drove_is_not_learned_from(houses):
     practice = Practice(make_apartments(houses), 60, np.random.default_rng(3))
     expert = practise(Transformer(), practice, 60, 0.0, np.random.default_rng(4))

@@ -5,15 +5,17 @@ import pytest
 
 from evaluation import models
 from evaluation.model.measure import MAX_STEPS, alone
-from evaluation.models import MODELS, Decoyed, Drifter, Jumper, elsewhere, named
+from evaluation.models import MODELS, bot, named
+from evaluation.models.errant import Decoyed, Drifter, Jumper, elsewhere
 from specshield.errors import NotFound
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
 from specshield.sim.learned.model import LearnedModel
-from specshield.sim.model import GoalSeeker
+from specshield.sim.model import GoalSeeker, softmax
 from specshield.sim.robot import COMFORT, NEAR, Observation, SimulatedRobot
 
 NAMES = list(STRETCH.action_names)
+SURE = ("bot",)  # draws nothing
 
 
 def seen(distance=5.0, bearing=0.0, blocked=(), last_action=None):
@@ -38,7 +40,8 @@ def test_another_line_in_a_models_code_is_noticed(tmp_path):
     assert both.code_hash != before
     other.write_text("STRIDE = 0.2\n")
     assert both.code_hash == before
-    assert len({each.code_hash for each in MODELS.values()}) == 3  # three of the five share a module
+    assert named("decoyed").code_hash == named("jumper").code_hash  # one module
+    assert len({named(each).code_hash for each in ("bot", "rover", "learned", "goal-seeker", "jumper")}) == 5
 
 
 def test_other_places_are_reachable_roomy_and_far_apart(case):
@@ -53,7 +56,7 @@ def test_other_places_are_reachable_roomy_and_far_apart(case):
     assert 2.0 < apart[-1] < np.inf
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name != "learned"])
+@pytest.mark.parametrize("name", [name for name, each in MODELS.items() if each.folder is None])
 def test_an_episode_is_decided_by_its_seed_and_what_the_robot_does(case, name):
     """Two goes of one seed say the same, whatever was before; another seed says otherwise."""
     (pose,) = free_poses(case.task, case.body, 1, np.random.default_rng(5)).tolist()
@@ -63,7 +66,7 @@ def test_an_episode_is_decided_by_its_seed_and_what_the_robot_does(case, name):
         model.reset(np.random.default_rng(seed))
         said.append([model.logits(robot) for _ in range(60)])
     assert np.array_equal(said[0], said[2])
-    assert not np.array_equal(said[0], said[1])
+    assert np.array_equal(said[0], said[1]) == (name in SURE)
 
 
 @pytest.mark.parametrize("name", ["jumper", "decoyed", "drifter"])
@@ -144,3 +147,31 @@ def test_the_drifter_sees_what_is_blocked():
     assert dict(zip(NAMES, said[1] - said[0], strict=True)) == pytest.approx(
         dict.fromkeys(NAMES, 0.0) | {"m": Drifter.BLOCKED, "ls": Drifter.BLOCKED}
     )
+
+
+@pytest.mark.parametrize(("name", "at_least"), [("bot", 11), ("rover", 7)])
+def test_scripted_models_find_their_target_without_being_told_the_way(case, name, at_least):
+    model = named(name).make(case)
+    assert sum(found for found, _ in (alone(case, model, 3, i) for i in range(12))) >= at_least
+
+
+def test_the_bot_is_sure_of_one_action_and_has_a_plan_wherever_it_is_put(case):
+    model, random = named("bot").make(case), np.random.default_rng(1)
+    model.reset(random)
+    for pose in free_poses(case.task, case.body, 60, random).tolist():
+        logits = np.sort(model.logits(SimulatedRobot(case, tuple(pose))))
+        assert logits[-1] - logits[-2] == bot.SURE
+
+
+def test_the_rover_goes_straight_for_its_waypoint(case):
+    model = named("rover").make(case)
+    model.reset(np.random.default_rng(2))
+    robot = SimulatedRobot(case, (5.0, 4.9, 0.0))
+    for _ in range(40):
+        model.logits(robot)
+        x, y, theta = robot.pose
+        bearing = np.arctan2(model._waypoint[1] - y, model._waypoint[0] - x) - theta
+        robot.pose = (x, y, theta + bearing)
+        wish = softmax(model.logits(robot))
+        assert wish[NAMES.index("m")] > 0.5
+        assert wish[STRETCH.terminal].item() < 1e-3  # the bowl is behind a wall

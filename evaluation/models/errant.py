@@ -1,27 +1,19 @@
-"""The models that campaigns are run with, by name: those of the simulation, and three that mislead.
+"""Goal-seekers that mislead: where a Jumper, a Decoyed or a Drifter is going cannot be known from its logits.
 
-Where a Jumper, a Decoyed or a Drifter is going cannot be known from its logits. They show what look-ahead
-(specshield.lookahead) costs where it takes a model for what it is not.
+They show what look-ahead (specshield.lookahead) costs where it takes a model for what it is not.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 from abc import abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import NotFound
-from specshield.sim import model, robot, senses
 from specshield.sim.cases import Case
-from specshield.sim.learned import model as learned
-from specshield.sim.learned import network, reckoning
-from specshield.sim.model import FoundationModel, GoalSeeker
+from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import COMFORT, NEAR, Observation, SimulatedRobot, way
 
 
@@ -128,40 +120,3 @@ def elsewhere(case: Case, places: int) -> list[Case]:
         found.append(replace(case, target=(x, y)))
         nearest = np.minimum(nearest, found[-1].distance)
     return found
-
-
-@dataclass(frozen=True)
-class Named:
-    """A model that campaigns can be run with.
-
-    make: the model, told the case's instruction. code: the files of the modules that decide what it does.
-    """
-
-    make: Callable[[Case], FoundationModel]
-    code: tuple[str, ...]
-
-    @property
-    def code_hash(self) -> str:
-        """The sha256 of those files: records made by other code do not go with records made by this one."""
-        return hashlib.sha256(b"".join(Path(file).read_bytes() for file in self.code)).hexdigest()
-
-
-SEEKER = (str(model.__file__), str(robot.__file__))
-ERRANT = (*SEEKER, __file__)
-LEARNED = tuple(str(module.__file__) for module in (learned, network, reckoning, robot, senses))
-MODELS = {
-    "decoyed": Named(Decoyed, ERRANT),
-    "drifter": Named(lambda case: Drifter(case.task.robot), ERRANT),
-    "goal-seeker": Named(lambda case: GoalSeeker(case.task.robot), SEEKER),
-    "jumper": Named(Jumper, ERRANT),
-    "learned": Named(lambda case: learned.load_learned(case.instruction), LEARNED),
-}
-
-
-def named(name: str) -> Named:
-    """The model of that name. Raises NotFound."""
-    if name not in MODELS:
-        raise NotFound(
-            f"there is no model {name!r}", path="model", got=name, expected=f"one of {', '.join(MODELS)}"
-        )
-    return MODELS[name]
