@@ -8,8 +8,8 @@ less likely to repeat an action that had changed nothing, and the gradients were
 code as it is, a command gives the same bits again on one machine with one version of torch.
 
 The training interferes with the robots (practice.py): what the model is later shielded with is not new to it.
-The model in models/fm-unsteered was trained with `--option interference=false`: nothing but the expert and
-the network itself ever chose an action.
+The model in models/fm-unsteered was trained once, with `--option interference=false`: nothing but the expert
+and the network itself ever chose an action.
 """
 
 from __future__ import annotations

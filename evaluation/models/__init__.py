@@ -53,6 +53,7 @@ MODELS = {
     "jumper": Named(errant.Jumper, ERRANT),
     "learned": _learned(learned.FOLDER),
     "rover": Named(lambda case: rover.Rover(case.task.robot), (*SENSING, str(rover.__file__))),
+    "unsteered": _learned(UNSTEERED),
 }
 
 

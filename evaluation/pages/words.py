@@ -47,9 +47,11 @@ MODELS = {
     "jumper": "a goal-seeker that sets out for another place at random steps, and in the end for its target.",
     "learned": """a transformer that imitates shortest paths, from egocentric senses. It was trained with
   interference: in half of its training episodes it was held or steered elsewhere for tens of steps, as a
-  shield does.""",
+  shield does. `unsteered` is the same network without that.""",
     "rover": """it has no map: it picks a point in what its scanner sees, rather one that is new to it, drives
   straight there, and so on; its distribution is a Gaussian over the change of heading.""",
+    "unsteered": """the network of `learned`, trained in apartments of the same kind without interference:
+  nothing but the expert and the network itself ever chose an action.""",
 }
 NOISES = {
     "none": "the world is as the shield was told",

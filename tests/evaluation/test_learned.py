@@ -9,6 +9,7 @@ from safetensors.numpy import save
 
 from evaluation.model.measure import alone
 from evaluation.model.transformer import Transformer, export
+from evaluation.models import named
 from specshield.errors import NotFound, PolicyError
 from specshield.policy.tensors import read_tensors
 from specshield.robot import STRETCH
@@ -130,8 +131,9 @@ def test_the_last_action_and_the_past_matter(case):
     assert np.abs(model.logits(robot) - fresh).max() > 0.1
 
 
-def test_alone_it_finds_its_target(case):
-    model = load_learned(case.instruction)
+@pytest.mark.parametrize("name", ["learned", "unsteered"])
+def test_alone_it_finds_its_target(case, name):
+    model = named(name).make(case)
     results = [alone(case, model, 1, i) for i in range(10)]
     assert sum(found for found, _ in results) >= 8
     assert alone(case, model, 1, 0) == results[0]
