@@ -117,7 +117,8 @@ def _mass(case: Case, by_method: ByMethod) -> Any:
         if np.isfinite(values).any():
             _band(axis, values, name, look)
     axis.set(xlabel="step", ylabel="feasible mass", ylim=(-0.02, 1.02), title="The model's mass on S_t")
-    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    if axis.lines:
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 

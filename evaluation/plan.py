@@ -26,7 +26,9 @@ NOISY = (
 )  # fmt: skip
 WRONG = ("slip", "obstacle", "shift", "collider")
 UNTRIED = 1  # seed of the models that nothing was chosen on
-DRAWN = 6  # apartments, of the seeds 0 to DRAWN - 1
+DRAWN = 6  # apartments, drawn with the seeds 0 to DRAWN - 1
+HARDER = ("case1-two", "case2-two", "case1-200", "case2-200")
+LARGE = ("large_0", "large_1")
 LEAST = 10  # runs of a campaign that is cut short
 
 
@@ -44,16 +46,20 @@ def plan(houses: Sequence[str] = ()) -> Iterator[Campaign]:
     """Every campaign, in the order in which they are run. houses: the paths of ProcTHOR houses."""
     for model in MAIN_MODELS:
         for case in CASES:
-            if model in MODELS:
-                yield Campaign("cases", Experiment(case, model=model), 200, (*METHODS, SLACK))
+            yield Campaign("cases", Experiment(case, model=model), 200, (*METHODS, SLACK))
     for case in CASES:
         yield Campaign("noise", Experiment(case, noise="gaussian"), 100, NOISY)
     yield Campaign("bodies", Experiment("case2b"), 100, FEW)
-    for house in [*(f"drawn_{seed}" for seed in range(DRAWN)), *houses]:
-        yield Campaign("houses", Experiment("house", house), 30, FEW)
     for model in sorted(set(MODELS) - set(MAIN_MODELS)):
         for case in CASES:
             yield Campaign("models", Experiment(case, model=model, seed=UNTRIED), 60, FEW)
+    for model in MAIN_MODELS:
+        for task in HARDER:
+            yield Campaign("tasks", Experiment(task, model=model), 40, FEW)
+        for house in LARGE:
+            yield Campaign("houses", Experiment("house", house, model=model), 30, FEW)
+    for house in [*(f"drawn_{seed}" for seed in range(DRAWN)), *houses]:
+        yield Campaign("houses", Experiment("house", house), 30, FEW)
     for noise in WRONG:
         for case in CASES:
             yield Campaign("noise", Experiment(case, noise=noise), 40, ("paper", "ours", "ours@default"))
