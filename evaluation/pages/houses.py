@@ -23,9 +23,9 @@ def houses(found: Found) -> Iterator[str]:
     """A row a house and method; how many starts were refused in each house."""
     formulas = dict.fromkeys(results["formula"] for results in found.values())
     yield (
-        "Apartments drawn_N and large_N were drawn at random with the seed N, the large ones 15 m x 12 m. The "
-        "others are ProcTHOR houses, which are not in this repository (`evaluation/houses.py` says how to get "
-        f"them). The rule is {', '.join(f'`{formula}`' for formula in formulas)}. A room holds where the "
+        "Apartments drawn_N and large_N were drawn at random with the seed N, the large ones 15 x 12 m. The "
+        "others are ProcTHOR houses, which are not in this repository (`evaluation/houses.py` says how to "
+        f"get them). The rule is {', '.join(f'`{formula}`' for formula in formulas)}. A room holds where the "
         "robot's origin is in it. A start is refused where no future that keeps the rule was found; another "
         "is then drawn."
     )
