@@ -17,7 +17,8 @@ def evaluate(
         str,
         typer.Option(
             help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps; NAME@default: as a "
-            "session is by default; NAME@episode/D, NAME@default/D: threshold D over the episode."
+            "session is by default; NAME@episode/D, NAME@default/D: threshold D over the episode; "
+            "NAME@step/D: at each step; NAME@robustness/D: of D metres, with J = rho."
         ),
     ] = "",
     noise: Annotated[
@@ -119,6 +120,61 @@ def results(
     kinds = only.split(",") if only else []
     failed = carry_out(out, page, houses_in(houses), kinds, share, processes or os.cpu_count() or 1)
     raise typer.Exit(1 if failed else 0)
+
+
+def rewards(
+    case: Annotated[str, typer.Option(help="Cases, as 1,2.")] = "1,2",
+    reward: Annotated[str, typer.Option(help="Some of paper, progress.")] = "paper,progress",
+    seeds: Annotated[str, typer.Option(help="Seeds of the trainings, as 0,1,2.")] = "0,1,2",
+    updates: Annotated[int, typer.Option(help="Of each training; 16000 is the default of `train`.")] = 16_000,
+    runs: Annotated[int, typer.Option(help="Runs by the paper's rule with each network.", min=1)] = 50,
+    out: Annotated[
+        Path, typer.Option(help="Folder of the networks; what it holds is not made again.")
+    ] = Path("out/rewards"),
+    page: Annotated[Path, typer.Option(help="The page to write.")] = Path("docs/rewards.md"),
+) -> None:
+    """Train the learned policy with the paper's reward and with ours, and compare what comes of them."""
+    from evaluation.rewards import all_of, compare
+
+    compare(all_of(case, reward, seeds, updates), runs, out, page)
+
+
+def curves(
+    case: Annotated[str, typer.Option(help="Cases, as 1,2.")] = "1,2",
+    model: Annotated[str, typer.Option(help="Models, as learned,goal-seeker.")] = "learned,goal-seeker",
+    thresholds: Annotated[
+        str, typer.Option(help="Of each step and of the episode, above 0 and at most 1.")
+    ] = "0.25,0.5,0.75,0.9,1",
+    metres: Annotated[str, typer.Option(help="Thresholds with J = rho [m].")] = "-1,-0.5,-0.2,0,0.1,0.2",
+    runs: Annotated[int, typer.Option(help="Runs of each point.", min=1)] = 60,
+    seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
+    out: Annotated[Path, typer.Option(help="Folder of the runs; what it holds is not made again.")] = Path(
+        "out/curves"
+    ),
+    page: Annotated[Path, typer.Option(help="The page to write, with its figure beside it.")] = Path(
+        "docs/curves.md"
+    ),
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+) -> None:
+    """Measure what thresholds below 1 and a real-valued J keep, and what they cost."""
+    from evaluation.curves import draw_all
+    from evaluation.experiment import Experiment
+    from specshield.sim.cases import case_name
+
+    asked = [
+        Experiment(case_name(one), model=name, seed=seed)
+        for one in case.split(",")
+        for name in model.split(",")
+    ]
+    draw_all(
+        asked,
+        [float(value) for value in thresholds.split(",")],
+        [float(value) for value in metres.split(",")],
+        runs,
+        out,
+        page,
+        processes or os.cpu_count() or 1,
+    )
 
 
 def report(

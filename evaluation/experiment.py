@@ -22,7 +22,7 @@ from specshield.lookahead.lookahead import prepare
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.robot.dynamics import Body, make_body
-from specshield.shield.decision import Config
+from specshield.shield.decision import Config, ThresholdOver
 from specshield.shield.episode import Shield, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MODELS
@@ -39,10 +39,15 @@ CERTIFYING = ("simplex", "switching", "rule-first", "paper", "ours", "lookahead"
 CAREFUL = CERTIFYING  # NAME@M/K: a margin of M metres, K steps of slack
 
 
-SESSIONS = {  # NAME@default: what a session is where nobody says anything; /D after either: a threshold
+SESSIONS = {  # NAME@default: what a session is where nobody says anything
     "default": Config(uncertainty=Uncertainty(), learn_map=True),
     "episode": Config(),
+    "step": Config(),
+    "robustness": Config(evaluation="robustness"),  # J = rho
 }
+THRESHOLDS: dict[str, ThresholdOver] = {  # NAME@default/D and so on: over what the threshold D holds
+    "default": "episode", "episode": "episode", "step": "step", "robustness": "step"
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -158,7 +163,8 @@ class Setting:
 
     def method(self, name: str) -> Method:
         """A method by its name; NAME@M/K is one with a margin of M metres and K steps of slack, NAME@default
-        one as a session is where nobody says anything: it learns its robot and its map.
+        one as a session is where nobody says anything: it learns its robot and its map. A threshold D is
+        NAME@step/D at each step, NAME@episode/D over the episode, NAME@robustness/D in metres with J = rho.
 
         Raises NotFound for a name that there is not, InputError for a margin that cannot be.
         """
@@ -209,7 +215,7 @@ def split(method: str) -> tuple[str, Config]:
         if metres in SESSIONS and kind in CAREFUL:
             session = SESSIONS[metres]
             if steps:
-                session = replace(session, threshold=float(steps), threshold_over="episode")
+                session = replace(session, threshold=float(steps), threshold_over=THRESHOLDS[metres])
             return kind, session
         margin, slack = float(metres), int(steps or 0)
     except ValueError:
@@ -217,7 +223,8 @@ def split(method: str) -> tuple[str, Config]:
     if kind not in CAREFUL or not math.isfinite(margin):
         raise InputError(
             "not a method with a margin", path="methods", got=method,
-            expected=f"NAME@METRES, NAME@METRES/STEPS or NAME@default, the name one of {', '.join(CAREFUL)}",
+            expected=f"NAME@METRES, NAME@METRES/STEPS, NAME@default or NAME@step/THRESHOLD, the name one of "
+            f"{', '.join(CAREFUL)}",
         )  # fmt: skip
     return kind, Config(margin=margin, slack=slack)
 

@@ -85,9 +85,21 @@ def _method(experiment: Experiment, name: str) -> Method:
 
 def run(experiment: Experiment, i: int, methods: Sequence[str]) -> list[Record]:
     """Run i by each method, in their order. Raises InfeasibleStart where no start can be found."""
-    own = int(np.random.SeedSequence([experiment.seed, i]).generate_state(1)[0])
-    begun = _begin(experiment.setting, own)
-    return [_episode(experiment, name, i, own, begun) for name in methods]
+    setting = experiment.setting
+    shields = [setting.ours] if setting.learned is None else [setting.paper, setting.ours]
+    return run_by(setting, i, {name: _method(experiment, name) for name in methods}, shields)
+
+
+def run_by(
+    setting: Setting, i: int, methods: Mapping[str, Method], shields: Sequence[Shield]
+) -> list[Record]:
+    """Run i by each of these methods, from a start that none of the shields refuses.
+
+    Raises InfeasibleStart where no start can be found.
+    """
+    own = int(np.random.SeedSequence([setting.experiment.seed, i]).generate_state(1)[0])
+    begun = _begin(setting, own, shields)
+    return [_episode(setting, method, name, i, own, begun) for name, method in methods.items()]
 
 
 @dataclass(frozen=True)
@@ -99,12 +111,11 @@ class _Beginning:
     refused: int
 
 
-def _begin(setting: Setting, own: int) -> _Beginning:
-    """The first start, of those drawn uniformly over free space, that no shield refuses.
+def _begin(setting: Setting, own: int, shields: Sequence[Shield]) -> _Beginning:
+    """The first start, of those drawn uniformly over free space, that none of the shields refuses.
 
     Where the world is not as the shield was told, the start has to be free in the real world too.
     """
-    shields = [setting.ours] if setting.learned is None else [setting.paper, setting.ours]
     starts = free_poses(setting.case.task, setting.case.body, DRAWS, np.random.default_rng([own, START]))
     for refused, (x, y, theta) in enumerate(starts.tolist()):
         pose = (x, y, theta)
@@ -137,9 +148,8 @@ def _certified_way(shield: Shield, pose: Pose) -> Floats:
     return np.concatenate([[pose], poses])
 
 
-def _episode(experiment: Experiment, name: str, i: int, own: int, begun: _Beginning) -> Record:
-    setting, case = experiment.setting, begun.case
-    method, model = _method(experiment, name), setting.model
+def _episode(setting: Setting, method: Method, name: str, i: int, own: int, begun: _Beginning) -> Record:
+    experiment, case, model = setting.experiment, begun.case, setting.model
     robot = SimulatedRobot(case, begun.pose)
     draws = np.random.default_rng([own, DRAW]).random(MAX_STEPS + 1)
     shaken = np.random.default_rng([own, MISMATCH, 1])

@@ -32,18 +32,31 @@ def test_the_decay_rate_of_table_1():
     assert decay_rate(1.0, 0.5, 2.0, 3.0) == 0.0  # min rho above gamma_inf: inside the funnel from the start
 
 
-def test_funnels_by_hand():
+def test_funnels_of_the_paper_by_hand():
     _, _, funnels = prepared(literal=True)
     assert funnels.gamma_0.tolist() == [4.0, 2.5, 4.0]
     assert funnels.gamma_inf.tolist() == [0.25, 1.0, 0.2]
-    assert funnels.clock.tolist() == [10, 0, 6]  # each its own window's start: a, a, a + c2
-    # t*: halfway through [10, 20], one step into G, halfway through [6, 10]
-    np.testing.assert_allclose(funnels.rate, [math.log(15) / 5, math.log(1.5), math.log(3.8 / 0.2) / 2])
-    assert gamma(funnels, 0, 0) == gamma(funnels, 0, 10) == 4.0  # still to come: gamma_0
+    assert funnels.clock.tolist() == [0, 0, 0]
+    # t*: the middle of [10, 20]; 1 instead of 0 for G[0,44]; the middle of [4 + 2, 8 + 2]
+    np.testing.assert_allclose(funnels.rate, [math.log(15) / 15, math.log(1.5), math.log(3.8 / 0.2) / 8])
+    assert gamma(funnels, 0, 0) == 4.0
     assert gamma(funnels, 0, 15) == pytest.approx(0.5)  # rho_max at t*: the reward's sign is rho's
-    assert gamma(funnels, 0, 20) == pytest.approx(3.75 / 15**2 + 0.25)
+    assert gamma(funnels, 0, 30) == pytest.approx(3.75 / 15**2 + 0.25)
     assert gamma(funnels, 1, 1) == pytest.approx(2.0)
     assert gamma(funnels, 2, 8) == pytest.approx(0.4)
+
+
+def test_the_t_star_of_an_always_that_begins_later_is_its_beginning():
+    scene = make_scene(flat("G[6,20] West"))
+    funnels = make_funnels(scene, np.array([-3.5]), np.array([0.5]), True)
+    assert funnels.rate[0] == pytest.approx(math.log(15) / 6)
+
+
+def test_our_clocks_start_with_the_windows():
+    _, _, funnels = prepared(literal=False)
+    assert funnels.clock.tolist() == [10, 0, 6]  # a, a, a + c2
+    assert gamma(funnels, 0, 0) == gamma(funnels, 0, 10) == funnels.gamma_0[0]  # still to come: gamma_0
+    assert gamma(funnels, 0, 15) == pytest.approx(funnels.rho_max[0])  # t*: half the window later
 
 
 @pytest.mark.parametrize("literal", [True, False])
@@ -59,7 +72,7 @@ def test_every_funnel_narrows_from_gamma_0_to_gamma_inf(literal):
         assert course[-1] >= funnels.gamma_inf[k]
 
 
-def test_the_literal_reward_is_the_least_of_the_pending_ones():
+def test_the_papers_reward_is_the_least_of_those_whose_window_is_open():
     task, scene, funnels = prepared(literal=True)
     pose = (*task.grid.to_map([1.0, 1.5]), 0.0)
 
@@ -68,15 +81,23 @@ def test_the_literal_reward_is_the_least_of_the_pending_ones():
         state.predicates[:] = [0.2, 0.9, -2.0]
         return reward(scene, funnels, t, state)
 
-    # rho + gamma(t) - rho_max at t = 15: 0.2 + 0.5 - 0.5;  0.9 + 1 + 1.5 / 1.5^15 - 2;  -2 + gamma - 0.4
-    third = 3.8 * math.exp(-9 * math.log(19) / 2) + 0.2
-    assert literal(15, PENDING, PENDING, PENDING) == pytest.approx(-2.4 + third)
-    assert literal(15, PENDING, PENDING, SETTLED) == pytest.approx(0.9 + 1.0 + 1.5 / 1.5**15 - 2.0)
-    assert literal(15, PENDING, SETTLED, BROKEN) == pytest.approx(0.2)
-    assert literal(0, PENDING, SETTLED, SETTLED) == pytest.approx(
-        0.2 + 4.0 - 0.5
-    )  # before its window: gamma_0
-    assert literal(15, SETTLED, SETTLED, SETTLED) == 0.0
+    # rho + gamma(t) - rho_max of F[10,20], G[0,44] and F[4,8] G[2,6], which is decided at 14
+    def first(t):
+        return 0.2 + 3.75 / 15 ** (t / 15) + 0.25 - 0.5
+
+    def second(t):
+        return 0.9 + 1.5 / 1.5**t + 1.0 - 2.0
+
+    def third(t):
+        return -2.0 + 3.8 / 19 ** (t / 8) + 0.2 - 0.4
+
+    pending = [PENDING] * 3
+    assert literal(3, *pending) == pytest.approx(second(3))
+    assert literal(8, *pending) == pytest.approx(min(second(8), third(8)))
+    assert literal(14, *pending) == pytest.approx(third(14))
+    assert literal(20, *pending) == literal(20, SETTLED, BROKEN, SETTLED) == pytest.approx(second(20))
+    assert literal(12, *pending) == pytest.approx(min(first(12), second(12), third(12)))
+    assert literal(45, *pending) == 0.0
 
 
 def test_the_default_reward_rises_with_progress_and_falls_with_danger():

@@ -3,10 +3,17 @@
     gamma(t) = (gamma_0 - gamma_inf) exp(-l t) + gamma_inf                      (eq. 4)
     r(x_t)   = rho(x_t, predicate) + gamma(t) - rho_max                         (eq. 5)
 
-There are two rewards for a conjunction of obligations. `paper` takes the minimum of r over the obligations
-that are not yet settled, literally. `progress`, the default, counts the goals that are settled, adds the
-current goal's funnel along free space, and takes the minimum with the robustness of each `always`, capped.
-Uncapped, the farthest distance from a forbidden region would rule that minimum.
+There are two rewards for a conjunction of obligations.
+
+`paper` is eq. 5 with Table I to the letter: t is the episode's own step, robustness the formula's own. What
+the paper leaves open is chosen so. gamma_inf is REST of its upper limit. t* of F is the middle of its window,
+that of F G the middle of Table I's interval. Where t* would be 0, as for G[0,b], it is 1, the first step that
+there is. Of several obligations the least r counts, over those whose window holds t; 0 where none does. An
+episode ends at the horizon, or where an obligation is broken.
+
+`progress`, the default, is ours: it counts the goals that are settled, adds the current goal's funnel along
+free space, whose clock starts with the goal's window, and takes the minimum with the robustness of each
+`always`, capped. Uncapped, the farthest distance from a forbidden region would rule that minimum.
 """
 
 from __future__ import annotations
@@ -20,7 +27,7 @@ from specshield.arrays import Floats, Ints
 from specshield.compiled import leaf
 from specshield.policy.dqn.observation import State
 from specshield.policy.dqn.scene import Scene, current_goal, distance_to
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED
+from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 
 # Chosen by hand; nothing was measured.
 CAP = 0.15  # [m] robustness of an `always` beyond which more is no better, and rho_max inside a goal
@@ -30,7 +37,10 @@ MOST_OF_A_GOAL = 0.95  # what being close to a goal counts at most; 1 is for a g
 
 
 class Funnels(NamedTuple):
-    """One funnel for each obligation: eq. 4's parameters and the step at which its clock starts, each [K]."""
+    """One funnel for each obligation: eq. 4's parameters and the step at which its clock starts, each [K].
+
+    literal: of the reward `paper`, in which every clock starts at 0.
+    """
 
     gamma_0: Floats
     gamma_inf: Floats
@@ -44,7 +54,7 @@ def decay_rate(gamma_0: float, gamma_inf: float, rho_max: float, t_star: float) 
     """Table I's l: the funnel's boundary reaches zero robustness at t_star steps.
 
     t_star counts as at least 1, since G[0,b] would divide by zero. l is at least 0: the logarithm is negative
-    where min rho > gamma_inf, which means that the whole space is inside the funnel already.
+    where the predicate holds everywhere, and there the funnel would widen without end.
     """
     return max(math.log((gamma_0 - gamma_inf) / (rho_max - gamma_inf)) / max(t_star, 1.0), 0.0)
 
@@ -52,8 +62,8 @@ def decay_rate(gamma_0: float, gamma_inf: float, rho_max: float, t_star: float) 
 def make_funnels(scene: Scene, lowest: Floats, highest: Floats, literal: bool) -> Funnels:
     """The funnels of a task's obligations. lowest, highest (K,): each predicate's robustness over free space.
 
-    A clock starts with its obligation's window; t* is Table I's, half the window. literal: for the reward
-    `paper`.
+    literal: for the reward `paper`. t* is Table I's: the window's start for G, the middle of the window in
+    which the predicate has to begin to hold for the others.
     """
     rules, n = scene.rules, len(scene.rules.kind)
     gamma_0, gamma_inf, rate, rho_max = (np.zeros(n) for _ in range(4))
@@ -67,16 +77,17 @@ def make_funnels(scene: Scene, lowest: Floats, highest: Floats, literal: bool) -
         gamma_0[k], rho_max[k] = span, top
         gamma_inf[k] = REST * min(span, top)
         hold = rules.kind[k] == EVENTUALLY_ALWAYS
-        clock[k] = rules.a[k] + (rules.c2[k] if hold else 0)
-        width = (rules.c1[k] if hold else rules.b[k]) - rules.a[k]
-        t_star = 1.0 if rules.kind[k] == ALWAYS else 0.5 * float(width)
+        opens = rules.a[k] + (rules.c2[k] if hold else 0)
+        width = 0 if rules.kind[k] == ALWAYS else (rules.c1[k] if hold else rules.b[k]) - rules.a[k]
+        clock[k] = 0 if literal else opens
+        t_star = float(opens - clock[k]) + 0.5 * float(width)
         rate[k] = decay_rate(gamma_0[k], gamma_inf[k], rho_max[k], t_star)
     return Funnels(gamma_0, gamma_inf, rate, clock, rho_max, literal)
 
 
 @leaf
 def gamma(funnels: Funnels, k: int, t: int) -> float:
-    """Eq. 4 at step t; gamma_0 before the window."""
+    """Eq. 4 at step t; gamma_0 before the clock starts."""
     elapsed = max(t - funnels.clock[k], 0)
     decayed = (funnels.gamma_0[k] - funnels.gamma_inf[k]) * math.exp(-funnels.rate[k] * elapsed)
     return float(decayed + funnels.gamma_inf[k])
@@ -86,7 +97,7 @@ def gamma(funnels: Funnels, k: int, t: int) -> float:
 def reward(scene: Scene, funnels: Funnels, t: int, state: State) -> float:
     """The reward of having come to x_t, with its progress and predicates in `state`."""
     if funnels.literal:
-        return _paper_reward(funnels, t, state)
+        return _paper_reward(scene.rules, funnels, t, state)
     rules, status = scene.rules, state.status
     goals, settled, safe = 0, 0, 1.0
     for k in range(rules.kind.shape[0]):
@@ -107,10 +118,10 @@ def reward(scene: Scene, funnels: Funnels, t: int, state: State) -> float:
 
 
 @leaf
-def _paper_reward(funnels: Funnels, t: int, state: State) -> float:
-    """The minimum of eq. 5 over the obligations that are not yet settled, 0 where none is left."""
+def _paper_reward(rules: Rules, funnels: Funnels, t: int, state: State) -> float:
+    """The minimum of eq. 5 over the obligations whose window holds t, 0 where none does."""
     least = np.inf
-    for k in range(state.status.shape[0]):
-        if state.status[k] == PENDING:
+    for k in range(rules.kind.shape[0]):
+        if rules.a[k] <= t <= rules.last[k]:
             least = min(least, state.predicates[k] + gamma(funnels, k, t) - funnels.rho_max[k])
     return least if least < np.inf else 0.0
