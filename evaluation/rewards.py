@@ -49,8 +49,8 @@ What the paper leaves open, and how it was chosen, is said in `app/specshield/po
 
 Shares have 95 % Clopper-Pearson intervals. Training times are of two cores with other work on them."""
 OUTCOME = """\
-Of {began} runs that began where a session opens with the network, {kept} kept the rule, whatever its reward:
-Algorithm 1 goes on as it can begin. A reward decides from how many places it can."""
+Of {began} of these runs that began where a session opens with the network, {kept} kept the rule, as Proposition
+1 says, whatever the reward. What a reward decides is from how many places a session opens."""
 
 
 @dataclass(frozen=True)
@@ -170,8 +170,9 @@ def _told(found: Sequence[Found]) -> Iterator[str]:
         of = [each for each in found if (each.training.case, each.training.reward) == (case, reward)]
         alone, can = (_range([each.metrics[name] for each in of]) for name in ("satisfied", "feasible_start"))
         kept = _range([sum(run.satisfied for run in each.runs) / len(each.runs) for each in of])
+        seeds = ", ".join(str(each.training.seed) for each in of)
         yield (
-            f"- {case}, `{reward}`, {len(of)} trainings: alone it keeps the rule from {alone} of the starts, "
+            f"- {case}, `{reward}`, seeds {seeds}: alone it keeps the rule from {alone} of the starts, "
             f"a session can open at {can}, and the paper's decision rule keeps {kept} of its runs."
         )
 
