@@ -49,8 +49,8 @@ What the paper leaves open, and how it was chosen, is said in `app/specshield/po
 
 Shares have 95 % Clopper-Pearson intervals. Training times are of two cores with other work on them."""
 OUTCOME = """\
-Of {began} of these runs that began where a session opens with the network, {kept} kept the rule, as Proposition
-1 says, whatever the reward. What a reward decides is from how many places a session opens."""
+Of {began} of these runs that began where a session opens with the network, {kept} kept the rule, as
+Proposition 1 says, whatever the reward. What a reward decides is from how many places a session opens."""
 
 
 @dataclass(frozen=True)
