@@ -73,13 +73,18 @@ reliability: .venv-bench/.done
 	-$(RELIABILITY) fuzz
 	$(RELIABILITY) report
 
-# docs/results.md and docs/results/; 90 minutes on two free cores at most. What is in RESULTS already is not done
-# again. A first look at all of it: make results ARGS='--share 0.1' RESULTS=/tmp/try PAGES=/tmp/try-pages
+# docs/results.md with the pages that it links to; 90 minutes on two free cores, by the processor time that a run
+# takes. What is in RESULTS already is not done again. A first look at the campaigns, a tenth of their runs:
+# make results ARGS='--share 0.1' RESULTS=/tmp/try PAGES=/tmp/try-pages
 RESULTS ?= out/results
 PAGES ?= docs
 HOUSES ?= ../shared/data/houses
 results: .venv/.dev
+	@echo "begun: $$(date)"
 	$(BIN)/python -m evaluation results --out $(RESULTS) --page $(PAGES)/results.md --houses $(HOUSES) $(ARGS)
+	$(BIN)/python -m evaluation curves --runs 40 --out $(RESULTS)-curves --page $(PAGES)/curves.md
+	$(BIN)/python -m evaluation rewards --updates 6000 --runs 20 --out $(RESULTS)-rewards --page $(PAGES)/rewards.md
+	@echo "done: $$(date)"
 
 openapi: .venv/.server
 	$(BIN)/specshield openapi > openapi.json

@@ -52,14 +52,14 @@ def plan(houses: Sequence[str] = ()) -> Iterator[Campaign]:
     yield Campaign("bodies", Experiment("case2b"), 100, FEW)
     for model in sorted(set(MODELS) - set(MAIN_MODELS)):
         for case in CASES:
-            yield Campaign("models", Experiment(case, model=model, seed=UNTRIED), 60, FEW)
+            yield Campaign("models", Experiment(case, model=model, seed=UNTRIED), 50, FEW)
     for model in MAIN_MODELS:
         for task in HARDER:
             yield Campaign("tasks", Experiment(task, model=model), 40, FEW)
         for house in LARGE:
-            yield Campaign("houses", Experiment("house", house, model=model), 30, FEW)
+            yield Campaign("houses", Experiment("house", house, model=model), 20, FEW)
     for house in [*(f"drawn_{seed}" for seed in range(DRAWN)), *houses]:
-        yield Campaign("houses", Experiment("house", house), 30, FEW)
+        yield Campaign("houses", Experiment("house", house), 20, FEW)
     for noise in WRONG:
         for case in CASES:
             yield Campaign("noise", Experiment(case, noise=noise), 40, ("paper", "ours", "ours@default"))
