@@ -1,6 +1,7 @@
 """Simple methods, made of the shield's own parts, that might do as well as it does.
 
 rule-first   the rule before the task: the certified continuation until the rule is decided, then the model
+visits-first the certified continuation until what is to be visited was, then the shield
 hcd+, rcd+   next-step decoding, and a plan for the time after the model's `end`
 switching    the model until its own draw is not feasible, then the plan until an obligation is met
 """
@@ -35,6 +36,23 @@ class RuleFirst(Shielded):
         if led.spec_status == "pending":
             return replace(led, kl=shaping.divergence(led.distribution, shaping.log_softmax(logits)))
         return replace(self._alone.act(history, logits, draw), spec_status=led.spec_status)
+
+
+class VisitsFirst(Shielded):
+    """The certified continuation until every conjunct but those of the form G is met, and then the shield.
+
+    A rule to keep out of a place until late does not hold the model back once the visits are made.
+    """
+
+    def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
+        task = self._shield.task
+        visits = sum(not isinstance(part, Always) for part in conjuncts(task.formula))
+        if logits is None or met(task, history) >= visits:
+            return super().act(history, logits, draw)
+        led = super().act(history, None, draw)
+        if led.spec_status != "pending":  # a visit was missed: what is left is kept as the shield keeps it
+            return super().act(history, logits, draw)
+        return replace(led, kl=shaping.divergence(led.distribution, shaping.log_softmax(logits)))
 
 
 class Completed:
@@ -105,7 +123,7 @@ class Switching(Shielded):
 
 
 def met(task: Task, history: Floats) -> int:
-    """How many conjuncts of the rule hold already, whatever follows."""
+    """How many conjuncts of the rule hold already, whatever follows; a G does not before its window ends."""
     prefix = task.samples(history)
     return sum(
         bool(robustness_bounds(part, {name: prefix[name] for name in part.names})[0] > SATISFIED_ABOVE)

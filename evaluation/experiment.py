@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
-from evaluation.baselines import Completed, RuleFirst, Switching
+from evaluation.baselines import Completed, RuleFirst, Switching, VisitsFirst
 from evaluation.decoding import HardDecoding, RobustDecoding
 from evaluation.disturbance import MOVED, believed, check
 from evaluation.houses import load_house_case
@@ -32,10 +32,10 @@ from specshield.sim.model import FoundationModel
 from specshield.task import Task
 
 METHODS = (
-    "unmodified", "hcd", "hcd+", "rcd", "rcd+", "simplex", "switching", "rule-first", "paper", "ours",
-    "lookahead",
+    "unmodified", "hcd", "hcd+", "rcd", "rcd+", "simplex", "switching", "rule-first", "visits-first", "paper",
+    "ours", "lookahead",
 )  # fmt: skip
-CERTIFYING = ("simplex", "switching", "rule-first", "paper", "ours", "lookahead")
+CERTIFYING = ("simplex", "switching", "rule-first", "visits-first", "paper", "ours", "lookahead")
 CAREFUL = CERTIFYING  # NAME@M/K: a margin of M metres, K steps of slack
 
 
@@ -178,6 +178,7 @@ class Setting:
             "simplex": lambda: Simplex(make_shield(self.policies, careful)),
             "switching": lambda: Switching(make_shield(self.policies, careful)),
             "rule-first": lambda: RuleFirst(make_shield(self.policies, careful)),
+            "visits-first": lambda: VisitsFirst(make_shield(self.policies, careful)),
             "paper": lambda: Shielded(replace(self.paper, config=careful), carries=False),
             "ours": lambda: Shielded(make_shield(self.policies, careful)),
             "lookahead": lambda: Shielded(

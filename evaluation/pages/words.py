@@ -26,6 +26,7 @@ METHODS = {
   the plan drives until it has met the next obligation. A draw that breaks a G at once is only replaced.""",
     "rule-first": """the certified continuation until the rule is decided, then the model alone; its KL is
   that of the plan's actions from what the model wanted meanwhile.""",
+    "visits-first": "the certified continuation until every F of the rule is met, then ours.",
     "paper": """the paper's decision rule with **our** DQN as pi_phi, rolled out after every action. The DQNs
   learned from the reward `progress`, not from the paper's funnels: it is not the paper's policy.""",
     "ours": """reachability and the DQN together; the certified continuation of each decision is handed to the

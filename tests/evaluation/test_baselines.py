@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from evaluation.baselines import Completed, RuleFirst, Switching, breaks_now, met
+from evaluation.baselines import Completed, RuleFirst, Switching, VisitsFirst, breaks_now, met
 from evaluation.decoding import HardDecoding
 from evaluation.methods import Decoding
 from specshield.shield.episode import make_shield
@@ -17,7 +17,18 @@ CELLS = Cells(
     lambda s: s["A"][..., :5].any(-1) & ~s["B"].any(-1),
     {"A": (2, 0), "B": (3, 0)},
 )
-SHIELD = make_shield([Exhaustive(CELLS)])
+
+
+class Forwards:
+    """Of the futures that keep the rule, always the one that drives on soonest."""
+
+    def choice(self, good):
+        return good[0]
+
+
+PROPOSER = Exhaustive(CELLS)
+PROPOSER.random = Forwards()
+SHIELD = make_shield([PROPOSER])
 STAY, LEAVE = np.array([-3.0, -3.0, -3.0, 3.0, -3.0]), np.array([0.0, 0.0, 0.0, 0.0, 9.0])
 
 
@@ -48,6 +59,25 @@ def test_rule_first_follows_the_plan_whatever_the_model_wants_and_then_lets_it_g
     assert [a.kl for a in answers[:5]] == pytest.approx([9.0 + math.log1p(4.0 * math.exp(-9.0))] * 5)
     assert (answers[5].action, answers[5].kl) == (END, pytest.approx(0.0))
     np.testing.assert_allclose(answers[5].distribution, np.exp(log_softmax(LEAVE)))
+
+
+def test_visits_first_hands_over_to_the_shield_once_the_visits_are_made():
+    """A is met at t = 2; from there on the model is free but for B, until the rule is decided at t = 5."""
+    onwards = np.array([9.0, 0.0, 0.0, 0.0, 0.0])
+    history, answers = episode(VisitsFirst(SHIELD), lambda t: onwards, [0.5] * 8)
+    assert [a.mode for a in answers[:6]] == [
+        "completion",
+        "completion",
+        "shaped",
+        "shaped",
+        "shaped",
+        "prior",
+    ]
+    assert answers[0].kl == pytest.approx(math.log1p(4.0 * math.exp(-9.0)))
+    assert answers[2].distribution[FORWARD] == 0.0  # B is ahead
+    assert kept(history)
+    _, ended = episode(VisitsFirst(SHIELD), lambda t: LEAVE, [0.99] * 8)
+    assert [a.action == END for a in ended[:3]] == [False, False, True]
 
 
 @pytest.mark.parametrize("completes", [False, True])
@@ -96,10 +126,11 @@ def test_switching_takes_one_step_for_a_guard_and_the_drive_for_a_deadline():
 
 def test_switching_and_rule_first_keep_the_rule_with_any_model():
     random = np.random.default_rng(0)
-    for make in (Switching, RuleFirst, lambda shield: Completed(Decoding(CELLS.task), shield)):
+    keeping = (Switching, RuleFirst, VisitsFirst)
+    for make in (*keeping, lambda shield: Completed(Decoding(CELLS.task), shield)):
         outcomes = []
         for _ in range(40):
             table = 2.0 * random.normal(size=(9, 5))
             history, _ = episode(make(SHIELD), lambda t, table=table: table[t], random.random(9))
             outcomes.append(kept(history))
-        assert all(outcomes) is (make in (Switching, RuleFirst))
+        assert all(outcomes) is (make in keeping)
