@@ -19,7 +19,7 @@ from specshield.sim.progress import duration
 
 CASES = ("case1", "case2")
 SLACK = "ours@0/25"  # the slack that did best with a client's model; chosen by hand
-FEW = ("unmodified", "visits-first", "ours", SLACK, "lookahead")
+FEW = ("unmodified", "rule-first", "ours", SLACK, "lookahead")
 NOISY = (
     "unmodified", "rule-first", "paper", "ours", "rule-first@conformal/8", "paper@conformal/8",
     "ours@conformal/8", "paper@default", "ours@default",
