@@ -26,6 +26,8 @@ from specshield.robot.dynamics import around, motion_count, step_from
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.
 NEAR = 3.0  # [steps] from where the field leads: nearer than this, poses are told apart by the finer grain
 GRAIN, FINE = 0.1, 0.02  # [m] poses that differ by less, and by less than a degree, count once
+GRAINS = (GRAIN, 0.03)  # [m] tried in turn: a gap may lead nowhere but from poses that the first passes over
+RICH = 100_000  # poses: with fewer left, the first grain is the only one
 ASTRAY = 6.0  # [steps] by which the fields may err
 OPTIMISM = 1.05  # the fields say a little less than there is to go
 DEEPER = 1e-3  # [steps] by which a pose farther on its way goes before one that is as good
@@ -76,11 +78,14 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
                 same = world.field[k, 0] == world.field[k, 1]
                 if n > before or (column == 1 and (same or not guarding)):
                     continue
-                most = left // 2 if column == 1 else left
-                after, made = _reach(
-                    world, way, k, world.field[k, column], n, stop, nodes.need[0], tree, most
-                )
-                n, left = max(n, after), left - made
+                for grain in GRAINS:
+                    if n > before or (grain < GRAIN and left < RICH):
+                        continue
+                    most = left // 2 if column == 1 else left
+                    after, made = _reach(
+                        world, way, k, world.field[k, column], n, stop, nodes.need[0], tree, most, grain
+                    )
+                    n, left = max(n, after), left - made
             if n > before:
                 break
         if n == before:
@@ -92,10 +97,11 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
 
 @leaf
 def _reach(
-    world: World, way: Way, k: int, f: int, n: int, stop: int, need: Ints, tree: Tree, most: int
-) -> tuple[int, int]:
+    world: World, way: Way, k: int, f: int, n: int, stop: int, need: Ints, tree: Tree, most: int, grain: float
+) -> tuple[int, int]:  # fmt: skip
     """Goes on from motions[:n] to where literal k holds, by motions[:stop] and by field f, and keeps what has
-    to hold on the way. How many motions there are then, -1 where it is not found; how many poses were made.
+    to hold on the way. grain [m]: poses that differ by less count once, but not near the literal. How many
+    motions there are then, -1 where it is not found; how many poses were made.
     """
     body = world.body
     tree.table[:] = -1
@@ -120,7 +126,7 @@ def _reach(
                 continue
             tree.pose[count, 0], tree.pose[count, 1], tree.pose[count, 2] = x, y, theta
             tree.made[count], tree.parent[count], tree.motion[count] = made, here, m
-            if not _is_new(tree, count, FINE if ahead < NEAR else GRAIN):
+            if not _is_new(tree, count, FINE if ahead < NEAR else grain):
                 continue
             read_pose(world.literals, x, y, theta, way.values, way.stack, way.rho)
             if not keeps(world, k, way.t + n + made, need, way.rho):
