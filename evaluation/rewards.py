@@ -62,9 +62,12 @@ class Training:
     seed: int
     updates: int
 
+    def folder(self, out: Path) -> Path:
+        return out / f"{self.case}-{self.reward}-{self.seed}-{self.updates}"
+
     def policy(self, out: Path) -> Policy:
         """The network in `out`; trained if it is not there, from where a training was cut off."""
-        folder = out / f"{self.case}-{self.reward}-{self.seed}-{self.updates}"
+        folder = self.folder(out)
         if not (folder / "card.json").exists():
             options = [f"reward={self.reward}"]
             training.train(self.case, "dqn", self.seed, self.updates, options, folder, True)
@@ -77,7 +80,7 @@ class Training:
 
     def records(self, out: Path, runs: int) -> list[Record]:
         """Runs 0 to `runs` - 1 by the paper's decision rule with the network; what `out` holds is kept."""
-        file = out / f"{self.case}-{self.reward}-{self.seed}-{self.updates}" / "runs.jsonl"
+        file = self.folder(out) / "runs.jsonl"
         lines = file.read_text().splitlines() if file.exists() else []
         done = [Record.from_json(json.loads(line)) for line in lines]
         setting, method = Experiment(self.case).setting, Shielded(self.shield(out), carries=False)
@@ -105,13 +108,24 @@ def _keeping(case: str) -> Shield:
 
 
 def compare(trainings: Sequence[Training], runs: int, out: Path, page: Path) -> None:
-    """Trains what `out` has not got yet, one after another, and writes the page after each."""
-    found = list[Found]()
+    """Trains what `out` has not got yet, one after another; writes the page of all that it has after each."""
     for each in trainings:
-        made = each.records(out, runs)
-        opened = [_opens(each.shield(out), record.start) for record in made]
-        found.append(Found(each, each.policy(out).card["metrics"], made, opened))
+        each.policy(out)
+        found = [_found(made, runs, out) for made in _made(out)]
         page.write_text(text(found, runs, out))
+
+
+def _made(out: Path) -> list[Training]:
+    """The trainings that are finished in `out`: by case, reward, updates and seed."""
+    names = [card.parent.name.split("-") for card in out.glob("*/card.json")]
+    made = [Training(case, reward, int(seed), int(updates)) for case, reward, seed, updates in names]
+    return sorted(made, key=lambda each: (each.case, each.reward, each.updates, each.seed))
+
+
+def _found(made: Training, runs: int, out: Path) -> Found:
+    records, shield = made.records(out, runs), made.shield(out)
+    opened = [_opens(shield, record.start) for record in records]
+    return Found(made, made.policy(out).card["metrics"], records, opened)
 
 
 def _opens(shield: Shield, pose: Pose) -> bool:
@@ -137,7 +151,7 @@ def text(found: Sequence[Found], runs: int, out: Path) -> str:
         markdown(heads, rows),
         "\n".join([*_told(found), *_shipped()]),
         OUTCOME.format(began=len(opened), kept=sum(opened)),
-        f"```sh\n{_command([each.training for each in found], runs, out)}\n```",
+        "```sh\n{}\n```".format("\n".join(_commands([each.training for each in found], runs, out))),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -165,15 +179,17 @@ def _percent(count: int, of: int) -> str:
 
 
 def _told(found: Sequence[Found]) -> Iterator[str]:
-    """A sentence for each case and reward: the range over the seeds."""
-    for case, reward in dict.fromkeys((each.training.case, each.training.reward) for each in found):
-        of = [each for each in found if (each.training.case, each.training.reward) == (case, reward)]
+    """A sentence for each case, reward and number of updates: the range over the seeds."""
+    alike = [(each.training.case, each.training.reward, each.training.updates) for each in found]
+    for case, reward, updates in dict.fromkeys(alike):
+        of = [each for each, is_of in zip(found, alike, strict=True) if is_of == (case, reward, updates)]
         alone, can = (_range([each.metrics[name] for each in of]) for name in ("satisfied", "feasible_start"))
         kept = _range([sum(run.satisfied for run in each.runs) / len(each.runs) for each in of])
         seeds = ", ".join(str(each.training.seed) for each in of)
         yield (
-            f"- {case}, `{reward}`, seeds {seeds}: alone it keeps the rule from {alone} of the starts, "
-            f"a session can open at {can}, and the paper's decision rule keeps {kept} of its runs."
+            f"- {case}, `{reward}`, {updates:,} updates, seeds {seeds}: alone it keeps the rule from "
+            f"{alone} of the starts, a session can open at {can}, and the paper's decision rule keeps {kept} "
+            "of its runs."
         )
 
 
@@ -194,14 +210,15 @@ def _range(shares: Sequence[float]) -> str:
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
-def _command(trainings: Sequence[Training], runs: int, out: Path) -> str:
-    def named(name: str) -> str:
-        return ",".join(dict.fromkeys(str(getattr(each, name)) for each in trainings))
-
-    return (
-        f"python -m evaluation rewards --case {named('case')} --reward {named('reward')} --seeds "
-        f"{named('seed')} --updates {named('updates')} --runs {runs} --out out/{out.name}"
-    )
+def _commands(trainings: Sequence[Training], runs: int, out: Path) -> Iterator[str]:
+    for case, updates in dict.fromkeys((each.case, each.updates) for each in trainings):
+        of = [each for each in trainings if (each.case, each.updates) == (case, updates)]
+        rewards = ",".join(dict.fromkeys(each.reward for each in of))
+        seeds = ",".join(str(seed) for seed in sorted({each.seed for each in of}))
+        yield (
+            f"python -m evaluation rewards --case {case} --reward {rewards} --seeds {seeds} "
+            f"--updates {updates} --runs {runs} --out out/{out.name}"
+        )
 
 
 def all_of(cases: str, rewards: str, seeds: str, updates: int) -> list[Training]:
