@@ -177,6 +177,37 @@ def curves(
     )
 
 
+def habits(
+    runs: Annotated[int, typer.Option(help="Runs, each by every method.", min=1)] = 60,
+    seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
+    out: Annotated[Path, typer.Option(help="Folder of the runs; what it holds is not made again.")] = Path(
+        "out/habits"
+    ),
+    page: Annotated[Path, typer.Option(help="The page to write.")] = Path("docs/habits.md"),
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+) -> None:
+    """Measure what shields break of a model's habit and of its memory."""
+    from evaluation.habits import measure
+
+    measure(runs, seed, out, page, processes or os.cpu_count() or 1)
+
+
+def rivals(
+    runs: Annotated[int, typer.Option(help="Runs of each model and case.", min=1)] = 60,
+    seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 3,
+    model: Annotated[str, typer.Option(help="Models, as bot,learned; all of six families.")] = "",
+    out: Annotated[Path, typer.Option(help="Folder of the runs; what it holds is not made again.")] = Path(
+        "out/rivals"
+    ),
+    page: Annotated[Path, typer.Option(help="The page to write.")] = Path("docs/rivals.md"),
+    processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
+) -> None:
+    """Measure look-ahead beside plain slacks, and say whether it wins."""
+    from evaluation.rivals import FAMILIES, measure
+
+    measure(runs, seed, model.split(",") if model else FAMILIES, out, page, processes or os.cpu_count() or 1)
+
+
 def report(
     results: Annotated[Path, typer.Argument(help="Folder that evaluate has kept results in.")],
     out: Annotated[Path, typer.Option(help="The page to write; figures go into a folder beside it.")] = Path(

@@ -15,6 +15,7 @@ from evaluation.disturbance import MOVED, believed, check
 from evaluation.houses import load_house_case
 from evaluation.methods import Decoding, Method, Shielded, Simplex
 from evaluation.models import named
+from evaluation.slacks import Adaptive, proportional
 from evaluation.tasks import MainTask, main_task
 from specshield import __version__
 from specshield.errors import InputError, NotFound
@@ -33,9 +34,9 @@ from specshield.task import Task
 
 METHODS = (
     "unmodified", "hcd", "hcd+", "rcd", "rcd+", "simplex", "switching", "rule-first", "visits-first", "paper",
-    "ours", "lookahead",
+    "ours", "proportional", "adaptive", "lookahead",
 )  # fmt: skip
-CERTIFYING = ("simplex", "switching", "rule-first", "visits-first", "paper", "ours", "lookahead")
+CERTIFYING = METHODS[METHODS.index("simplex") :]
 CAREFUL = CERTIFYING  # NAME@M/K: a margin of M metres, K steps of slack
 
 
@@ -181,6 +182,8 @@ class Setting:
             "visits-first": lambda: VisitsFirst(make_shield(self.policies, careful)),
             "paper": lambda: Shielded(replace(self.paper, config=careful), carries=False),
             "ours": lambda: Shielded(make_shield(self.policies, careful)),
+            "proportional": lambda: Shielded(make_shield(self.policies, proportional(self.task, careful))),
+            "adaptive": lambda: Adaptive(make_shield(self.policies, careful)),
             "lookahead": lambda: Shielded(
                 make_shield(self.policies, careful, prepare(self.task, self.policies))
             ),

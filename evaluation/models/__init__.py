@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from evaluation.models import bot, errant, rover
+from evaluation.models import bot, courteous, errant, follower, rover
 from specshield.errors import NotFound
 from specshield.shipped import MODELS as FOLDERS
 from specshield.sim import model, robot, senses
@@ -55,12 +55,17 @@ MODELS = {
     "rover": Named(lambda case: rover.Rover(case.task.robot), (*SENSING, str(rover.__file__))),
     "unsteered": _learned(UNSTEERED),
 }
+TELLING = {  # what they show is measured by habits.py, in tables of its own
+    "courteous": Named(courteous.Courteous, (*SEEKER, str(bot.__file__), str(courteous.__file__))),
+    "follower": Named(follower.Follower, (*SEEKER, *SENSING, str(rover.__file__), str(follower.__file__))),
+}
 
 
 def named(name: str) -> Named:
     """The model of that name. Raises NotFound."""
-    if name not in MODELS:
+    there = MODELS | TELLING
+    if name not in there:
         raise NotFound(
-            f"there is no model {name!r}", path="model", got=name, expected=f"one of {', '.join(MODELS)}"
+            f"there is no model {name!r}", path="model", got=name, expected=f"one of {', '.join(there)}"
         )
-    return MODELS[name]
+    return there[name]

@@ -31,6 +31,10 @@ METHODS = {
   learned from the reward `progress`, not from the paper's funnels: it is not the paper's policy.""",
     "ours": """reachability and the DQN together; the certified continuation of each decision is handed to the
   next; hard projection.""",
+    "proportional": """ours with slack in proportion to the window: NAME@M/K is K per cent of the rule's
+  shortest window.""",
+    "adaptive": """ours with slack that follows the model: NAME@M/K is K steps times the mean of what
+  probability the model has lately given to infeasible actions.""",
     "lookahead": """ours, with the feasible actions weighted by what the rule will still cost the model from
   there, as far as a surrogate fitted to its logits can tell.""",
 }

@@ -1,0 +1,127 @@
+"""Look-ahead beside the simplest rivals: plain slacks, on models of several families, in both cases.
+
+The rule by which look-ahead stays was set before the runs: KL at most KL_SHARE times that of the best plain
+slack, and steps no more, in sum over all models and cases; and at most ADDED above projection in the share
+SINGLE of the runs in which projection hardly intervenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evaluation.evaluation import evaluate
+from evaluation.experiment import Experiment
+from evaluation.results import markdown, share
+from evaluation.runs import Record
+from evaluation.statistics import clopper_pearson, compared
+
+CASES = ("case1", "case2")
+FAMILIES = ("bot", "goal-seeker", "jumper", "learned", "rover", "unsteered")
+SLACKS = ("ours", "ours@0/25", "proportional@0/25", "adaptive@0/25")  # ours: a slack of 0, projection alone
+METHODS = ("unmodified", *SLACKS, "lookahead")
+KL_SHARE, SINGLE = 0.8, 0.95
+HARDLY, ADDED = 1.0, 1.0  # [nats]
+ABOUT = """# Look-ahead beside plain slacks
+
+Written by `{command}`: {models} models in two cases, {runs} runs of each
+by every method, which share starts, model seeds and draws. KL: summed along a run, in nats, mean over runs.
+Steps: until the model has done its main task, {limit} where it does not; mean over runs. NAME@0/K: K steps of
+slack, or K per cent of the window, or at most K steps. In the sums the models and cases weigh alike."""
+
+
+def measure(runs: int, seed: int, models: Sequence[str], out: Path, page: Path, processes: int) -> None:
+    """Runs what `out` does not hold yet, prints what came of it and writes the page."""
+    found: dict[tuple[str, str], list[Record]] = {}
+    for model in models:
+        for case in CASES:
+            experiment = Experiment(case, model=model, seed=seed)
+            folder = out / model / case / experiment.noise
+            found[model, case] = evaluate(experiment, runs, METHODS, folder, processes)
+    command = f"python -m evaluation rivals --runs {runs} --seed {seed} --model {','.join(models)}"
+    limit = experiment.main.limit
+    about = ABOUT.format(command=command, models=len(models), runs=runs, limit=limit)
+    text = "\n\n".join([about, *tables(found, limit), *verdict(found, limit)])
+    print(text)
+    page.write_text(text + "\n")
+
+
+Found = Mapping[tuple[str, str], Sequence[Record]]
+
+
+def tables(found: Found, limit: int) -> list[str]:
+    """One of KL and one of steps, with a row a model and case, and their sums."""
+    made = []
+    for name in ("KL", "steps"):
+        rows = [
+            [f"{model}, {case}", *(f"{means[method]:.1f}" for method in METHODS)]
+            for (model, case), records in found.items()
+            for means in [_means(records, name, limit)]
+        ]
+        sums = _sums(found, name, limit)
+        rows.append(["**sum**", *(f"**{sums[method]:.1f}**" for method in METHODS)])
+        made.append(f"## {name}\n\n{markdown(('model, case', *METHODS), rows)}")
+    done = [
+        [f"{model}, {case}", *(str(sum(r.main_done for r in records if r.method == m)) for m in METHODS)]
+        for (model, case), records in found.items()
+    ]
+    of = len(next(iter(found.values()))) // len(METHODS)
+    return [*made, f"## Main task done, of {of}\n\n{markdown(('model, case', *METHODS), done)}"]
+
+
+def verdict(found: Found, limit: int) -> list[str]:
+    """The rule's three parts, each with its figure, and how much each method costs beside projection."""
+    kl, steps = _sums(found, "KL", limit), _sums(found, "steps", limit)
+    best_kl, best_steps = min(SLACKS, key=kl.__getitem__), min(SLACKS, key=steps.__getitem__)
+    ratio = kl["lookahead"] / kl[best_kl]
+    alone = [pair for each in found.values() for pair in _pairs(each, "lookahead") if pair[1] < HARDLY]
+    within = sum(mine <= other + ADDED for mine, other in alone)
+    said = _share(within, len(alone))
+    paired = [pair for each in found.values() for pair in _pairs(each, "lookahead", best_kl)]
+    beside = compared(paired)
+    parts = [
+        f"- KL in sum: look-ahead's is {ratio:.2f} ({beside['low']:.2f} to {beside['high']:.2f}) of that of "
+        f"the best plain slack, `{best_kl}`; at most {KL_SHARE:g} is asked: {_met(ratio <= KL_SHARE)}.",
+        f"- Steps in sum: look-ahead's are {steps['lookahead'] / steps[best_steps]:.2f} of those of the best "
+        f"plain slack, `{best_steps}`; at most 1 is asked: {_met(steps['lookahead'] <= steps[best_steps])}.",
+        f"- Single runs in which projection's KL is below {HARDLY:g}: look-ahead's is at most {ADDED:g} nat "
+        f"more in {said}; {100 * SINGLE:g} % is asked: {_met(within >= SINGLE * len(alone) > 0)}.",
+    ]
+    return ["## The rule by which look-ahead stays", "\n".join(parts)]
+
+
+def _met(so: bool) -> str:
+    return "**met**" if so else "**not met**"
+
+
+def _share(count: int, of: int) -> str:
+    if of == 0:
+        return "no run (there are none)"
+    low, high = clopper_pearson(count, of)
+    return share({"count": count, "of": of, "low": low, "high": high})
+
+
+def _means(records: Sequence[Record], name: str, limit: int) -> dict[str, float]:
+    return {
+        method: float(np.mean([_cost(r, name, limit) for r in records if r.method == method]))
+        for method in METHODS
+    }
+
+
+def _sums(found: Found, name: str, limit: int) -> dict[str, float]:
+    means = [_means(records, name, limit) for records in found.values()]
+    return {method: sum(each[method] for each in means) for method in METHODS}
+
+
+def _cost(record: Record, name: str, limit: int) -> float:
+    if name == "KL":
+        return record.kl
+    return record.ended_at if record.main_done and record.ended_at is not None else limit
+
+
+def _pairs(records: Sequence[Record], method: str, beside: str = "ours") -> list[tuple[float, float]]:
+    """KL of the same runs by two methods."""
+    other = {record.run: record.kl for record in records if record.method == beside}
+    return [(record.kl, other[record.run]) for record in records if record.method == method]
