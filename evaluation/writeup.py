@@ -17,7 +17,7 @@ from evaluation.pages.houses import bodies, houses
 from evaluation.pages.noise import noise
 from evaluation.pages.summary import linked, summary
 from evaluation.pages.tables import Results, commands
-from evaluation.pages.words import INTRODUCTION, MAIN_MODELS, WHY_NEXT_STEP, legend
+from evaluation.pages.words import INTRODUCTION, MAIN_MODELS, legend
 from evaluation.results import write
 from specshield.errors import NotFound
 from specshield.sim.cases import Case
@@ -33,6 +33,7 @@ TITLES = {  # of the pages in a folder beside the summary
 OTHERS = {  # pages beside the summary that commands of their own write
     "rewards": "The paper's reward to the letter, and seeds",
     "curves": "Thresholds below 1",
+    "habits": "Does closeness to the model matter?",
     "lookahead": "Look-ahead",
     "related": "The neighbours",
 }
@@ -82,7 +83,7 @@ def write_up(folder: Path, page: Path) -> None:
     others = {title: beside / f"{name}.md" for name, title in TITLES.items()}
     others |= {title: page.with_name(f"{name}.md") for name, title in OTHERS.items()}
     told = summary(parts["cases"], linked(page, others), parts["noise"])
-    _write(page, [*told, legend(_methods(parts["cases"].values())), WHY_NEXT_STEP])
+    _write(page, [*told, legend(_methods(parts["cases"].values()))])
 
 
 def pages_of(results: Results) -> set[str]:

@@ -8,8 +8,8 @@ from typing import Any
 
 from evaluation.experiment import CERTIFYING, split
 from evaluation.pages.tables import Found, Results, about, beside_ours, better, summary_table, title
-from evaluation.pages.words import MODELS
-from evaluation.results import table
+from evaluation.pages.words import MODELS, NOT_THE_SAME, PAPER, WHY_NEXT_STEP
+from evaluation.results import markdown, share, table
 
 
 def overview(found: Found) -> Iterator[str]:
@@ -40,6 +40,10 @@ def one_by_one(found: Found, drawn: Mapping[Path, Sequence[Path]], page: Path) -
         yield "\n".join([*_missed(results), *beside_ours(results), *_left(results)])
         for path in drawn.get(kept, ()):
             yield f"![{path.stem} of {title(results)}]({path.relative_to(page.parent)})"
+    yield WHY_NEXT_STEP
+    yield "## The paper's Table II"
+    yield NOT_THE_SAME
+    yield _beside_paper(found)
 
 
 def models(found: Found) -> str:
@@ -80,3 +84,19 @@ def _left(results: Results) -> Iterator[str]:
             f"- A rule may keep the model from its task until the horizon. In the {left['steps']} steps "
             f"that are then left, unmodified does its task in {left['done']} of {left['of']} runs."
         )
+
+
+def _beside_paper(found: Found) -> str:
+    """The paper's Table II, apart from our own tables."""
+    rows = []
+    for results in found.values():
+        for one in results["methods"]:
+            theirs = PAPER.get(results["case"], {}).get(one["method"])
+            if theirs is not None:
+                said = (f"{theirs[0]:g} %", f"{theirs[1]:g} %")
+                here = (share(one["satisfied"]), share(one["main_done"]))
+                rows.append((title(results), one["method"], *said, *here))
+    heads = (
+        "case, model", "method", "the paper: rule", "the paper: main task", "here: rule", "here: main task",
+    )  # fmt: skip
+    return markdown(heads, rows)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from evaluation.experiment import split
 from evaluation.pages.tables import Found, better, summary_table, title
-from evaluation.pages.words import CAVEATS, HOW, NOT_THE_SAME, PAPER
-from evaluation.results import markdown, share
+from evaluation.pages.words import CAVEATS, HOW
+from evaluation.results import share
 
 
 def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterator[str]:
@@ -18,9 +18,6 @@ def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterato
     yield summary_table(found.values())
     yield "\n".join([CAVEATS, *_noise(noisy)])
     yield from better(found)
-    yield "## Beside the paper's Table II"
-    yield NOT_THE_SAME
-    yield _beside(found)
     yield "## More"
     yield "\n".join(f"- [{name}]({path})" for name, path in elsewhere.items())
     yield "`make results` makes all of it again; each page ends with its own commands."
@@ -40,21 +37,6 @@ def _noise(noisy: Found) -> Iterator[str]:
         ]
         if parts:
             yield f"  - {title(results)}, gaussian noise, rule kept: {'; '.join(parts)}."
-
-
-def _beside(found: Found) -> str:
-    rows = []
-    for results in found.values():
-        for one in results["methods"]:
-            theirs = PAPER.get(results["case"], {}).get(one["method"])
-            if theirs is not None:
-                said = (f"{theirs[0]:g} %", f"{theirs[1]:g} %")
-                here = (share(one["satisfied"]), share(one["main_done"]))
-                rows.append((title(results), one["method"], *said, *here))
-    heads = (
-        "case, model", "method", "the paper: rule", "the paper: main task", "here: rule", "here: main task",
-    )  # fmt: skip
-    return markdown(heads, rows)
 
 
 def linked(page: Path, others: Mapping[str, Path]) -> dict[str, str]:

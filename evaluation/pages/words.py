@@ -83,7 +83,7 @@ CAVEATS = """\
 What these figures are less than they may sound:
 
 - **learned** was trained with interference: in half of its training episodes it was held or steered
-  elsewhere, as a shield does. **unsteered** is the same network on the same data, without interference.
+  elsewhere, as a shield does. **unsteered** is the same network, trained for itself without interference.
 - **paper** is the paper's decision rule with our DQN, which learned from another reward than the paper's.
 - Maps were drawn and regions placed so that a robot that only seeks its target breaks the rule.
 - A region holds where the robot's **origin** is in it, as in the paper: the body may reach into Forbidden.
