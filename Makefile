@@ -82,7 +82,7 @@ HOUSES ?= ../shared/data/houses
 results: .venv/.dev
 	@echo "begun: $$(date)"
 	$(BIN)/python -m evaluation results --out $(RESULTS) --page $(PAGES)/results.md --houses $(HOUSES) $(ARGS)
-	$(BIN)/python -m evaluation curves --runs 40 --out $(RESULTS)-curves --page $(PAGES)/curves.md
+	$(BIN)/python -m evaluation curves --runs 30 --out $(RESULTS)-curves --page $(PAGES)/curves.md
 	$(BIN)/python -m evaluation rewards --updates 6000 --runs 20 --out $(RESULTS)-rewards --page $(PAGES)/rewards.md
 	@echo "done: $$(date)"
 

@@ -37,6 +37,7 @@ METHODS = (
     "ours", "proportional", "adaptive", "lookahead",
 )  # fmt: skip
 CERTIFYING = METHODS[METHODS.index("simplex") :]
+SLACKS = ("proportional", "adaptive")  # what K says of their slack is not steps (slacks.py)
 CAREFUL = CERTIFYING  # NAME@M/K: a margin of M metres, K steps of slack
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evaluation import campaigns
-from evaluation.experiment import METHODS, Experiment
+from evaluation.experiment import METHODS, SLACKS, Experiment
 from evaluation.models import MODELS
 from evaluation.pages.words import MAIN_MODELS
 from evaluation.writeup import write_up
@@ -19,7 +19,10 @@ from specshield.sim.progress import duration
 
 CASES = ("case1", "case2")
 SLACK = "ours@0/25"  # the slack that did best with a client's model; chosen by hand
+PROPORTIONAL, ADAPTIVE = "proportional@0/40", "adaptive@0/25"  # of about as many steps; chosen by hand
+MAIN = (*(name for name in METHODS if name not in SLACKS), SLACK, ADAPTIVE)
 FEW = ("unmodified", "rule-first", "ours", SLACK, "lookahead")
+RIVALS = (*FEW, PROPORTIONAL, ADAPTIVE)
 NOISY = (
     "unmodified", "rule-first", "paper", "ours", "rule-first@conformal/8", "paper@conformal/8",
     "ours@conformal/8", "paper@default", "ours@default",
@@ -46,16 +49,16 @@ def plan(houses: Sequence[str] = ()) -> Iterator[Campaign]:
     """Every campaign, in the order in which they are run. houses: the paths of ProcTHOR houses."""
     for model in MAIN_MODELS:
         for case in CASES:
-            yield Campaign("cases", Experiment(case, model=model), 200, (*METHODS, SLACK))
+            yield Campaign("cases", Experiment(case, model=model), 200, MAIN)
     for case in CASES:
-        yield Campaign("noise", Experiment(case, noise="gaussian"), 100, NOISY)
-    yield Campaign("bodies", Experiment("case2b"), 100, FEW)
+        yield Campaign("noise", Experiment(case, noise="gaussian"), 80, NOISY)
+    yield Campaign("bodies", Experiment("case2b"), 60, FEW)
     for model in sorted(set(MODELS) - set(MAIN_MODELS)):
         for case in CASES:
-            yield Campaign("models", Experiment(case, model=model, seed=UNTRIED), 50, FEW)
+            yield Campaign("models", Experiment(case, model=model, seed=UNTRIED), 40, RIVALS)
     for model in MAIN_MODELS:
         for task in HARDER:
-            yield Campaign("tasks", Experiment(task, model=model), 40, FEW)
+            yield Campaign("tasks", Experiment(task, model=model), 25, FEW)
         for house in LARGE:
             yield Campaign("houses", Experiment("house", house, model=model), 20, FEW)
     for house in [*(f"drawn_{seed}" for seed in range(DRAWN)), *houses]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.evaluation import read, read_about
-from evaluation.experiment import METHODS, Experiment, split
+from evaluation.experiment import METHODS, SLACKS, Experiment, split
 from evaluation.runs import Record
 from evaluation.statistics import beside, summary
 
@@ -50,7 +50,7 @@ def results(experiment: Experiment, records: Sequence[Record]) -> dict[str, Any]
 
 def _ours(name: str, there: Container[str]) -> str | None:
     """What of `there` a method is compared with."""
-    alike = re.sub("^[^@]+", "ours", name)
+    alike = "ours" if split(name)[0] in SLACKS else re.sub("^[^@]+", "ours", name)
     return next((other for other in (alike, "ours") if other in there and other != name), None)
 
 

@@ -160,6 +160,6 @@ def test_a_method_is_told_beside_ours_with_few_pairs_too():
 
 def test_a_margin_is_compared_with_the_same_margin():
     there = ("ours", "ours@0.04/8", "ours@default", "paper", "lookahead")
-    asked = ("paper@0.04/8", "paper", "paper@0.1", "ours@0.04/8", "ours")
-    others = ["ours@0.04/8", "ours", "ours", "ours", None]
+    asked = ("paper@0.04/8", "paper", "paper@0.1", "ours@0.04/8", "adaptive@0.04/8", "ours")
+    others = ["ours@0.04/8", "ours", "ours", "ours", "ours", None]
     assert [results._ours(name, there) for name in asked] == others
