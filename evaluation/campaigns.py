@@ -9,7 +9,7 @@ from pathlib import Path
 
 from evaluation import evaluation, results
 from evaluation.calibration import calibrated
-from evaluation.experiment import CERTIFYING, Experiment, split
+from evaluation.experiment import Experiment, certifies, split
 from specshield.sim.progress import StatusLine, duration
 
 WIDTH = 30  # characters of a progress bar
@@ -53,7 +53,7 @@ def evaluate(
             print(f"{results.table(figures)}\n")
             print(f"{duration(time.monotonic() - began)}{'' if folder is None else f'; {folder}'}")
         broken |= experiment.noise == "none" and any(
-            not record.satisfied and split(record.method)[0] in CERTIFYING for record in records
+            not record.satisfied and certifies(record.method) for record in records
         )
     return 1 if broken else 0
 

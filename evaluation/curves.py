@@ -102,13 +102,18 @@ def text(rows: Sequence[Row], runs: int, seed: int, figure: Path, command: str) 
 
 def _told(rows: Sequence[Row]) -> Iterator[str]:
     """A sentence for each kind of threshold."""
+    whole = {(row["case"], row["model"]): row["kl"] for row in rows if row["method"] == "ours"}
     for kind in COLUMNS[0]:
         asked = [row for row in rows if row["kind"] == kind and row["threshold"] < 1.0]
+        if not asked:
+            continue
         below = sum(row["satisfied"]["high"] < row["threshold"] for row in asked)
         above = sum(row["satisfied"]["low"] > row["threshold"] for row in asked)
+        costs = [row["kl"] / whole[row["case"], row["model"]] for row in asked if whole]
         yield (
             f"- **{kind}**: of {len(asked)} rows with a threshold below 1, the interval of the share kept "
             f"lies below\n  the threshold in {below} and above it in {above}."
+            + (f" Their KL is {min(costs):.2f} to {max(costs):.2f} of that at 1." if costs else "")
         )
     values = [row for row in rows if row["kind"] == "robustness" and row["threshold"] >= 0.0]
     if values:

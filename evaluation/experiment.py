@@ -206,6 +206,12 @@ def available(case: str) -> list[str]:
     return [name for name in METHODS if name != "paper" or learned]
 
 
+def certifies(method: str) -> bool:
+    """Whether a method gives mass to certified actions alone: a threshold below 1, or in metres, does not."""
+    kind, session = split(method)
+    return kind in CERTIFYING and session.evaluation == "feasibility" and session.threshold == 1.0
+
+
 def split(method: str) -> tuple[str, Config]:
     """The kind of a method, and its session's settings. Raises NotFound or InputError."""
     kind, at, asked = method.partition("@")

@@ -3,7 +3,7 @@
 import pytest
 
 from evaluation.curves import draw_all, methods_of
-from evaluation.experiment import Experiment, split
+from evaluation.experiment import Experiment, certifies, split
 from specshield.errors import InputError
 
 
@@ -16,6 +16,8 @@ def test_a_threshold_is_of_each_step_or_of_the_episode_or_in_metres():
     assert split("ours@default")[1].threshold_over == "step"
     with pytest.raises(InputError, match="threshold"):
         split("ours@step/0")
+    names = ["ours", "ours@step/1", "ours@step/0.9", "ours@episode/0.9", "ours@robustness/1", "unmodified"]
+    assert [name for name in names if certifies(name)] == ["ours", "ours@step/1"]
 
 
 def test_threshold_1_is_the_same_runs_for_step_and_episode():
