@@ -187,7 +187,7 @@ def _told(found: Sequence[Found]) -> Iterator[str]:
         kept = _range([sum(run.satisfied for run in each.runs) / len(each.runs) for each in of])
         seeds = ", ".join(str(each.training.seed) for each in of)
         yield (
-            f"- {case}, `{reward}`, {updates:,} updates, seeds {seeds}: alone it keeps the rule from "
+            f"- {case}, `{reward}`, {updates:,} updates, seed {seeds}: alone it keeps the rule from "
             f"{alone} of the starts, a session can open at {can}, and the paper's decision rule keeps {kept} "
             "of its runs."
         )
