@@ -83,6 +83,7 @@ results: .venv/.dev
 	@echo "begun: $$(date)"
 	$(BIN)/python -m evaluation results --out $(RESULTS) --page $(PAGES)/results.md --houses $(HOUSES) $(ARGS)
 	$(BIN)/python -m evaluation curves --runs 30 --out $(RESULTS)-curves --page $(PAGES)/curves.md
+	$(BIN)/python -m evaluation habits --runs 30 --out $(RESULTS)-habits --page $(PAGES)/habits.md
 	$(BIN)/python -m evaluation rewards --updates 6000 --runs 20 --out $(RESULTS)-rewards --page $(PAGES)/rewards.md
 	@echo "done: $$(date)"
 

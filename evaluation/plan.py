@@ -59,10 +59,11 @@ def plan(houses: Sequence[str] = ()) -> Iterator[Campaign]:
     for model in MAIN_MODELS:
         for task in HARDER:
             yield Campaign("tasks", Experiment(task, model=model), 25, FEW)
-        for house in LARGE:
-            yield Campaign("houses", Experiment("house", house, model=model), 20, FEW)
-    for house in [*(f"drawn_{seed}" for seed in range(DRAWN)), *houses]:
+    for house in [*houses, *(f"drawn_{seed}" for seed in range(DRAWN))]:
         yield Campaign("houses", Experiment("house", house), 20, FEW)
+    for house in LARGE:
+        for model in MAIN_MODELS:
+            yield Campaign("houses", Experiment("house", house, model=model), 20, FEW)
     for noise in WRONG:
         for case in CASES:
             yield Campaign("noise", Experiment(case, noise=noise), 40, ("paper", "ours", "ours@default"))
