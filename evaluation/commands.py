@@ -195,7 +195,8 @@ def habits(
 def rivals(
     runs: Annotated[int, typer.Option(help="Runs of each model and case.", min=1)] = 60,
     seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 3,
-    model: Annotated[str, typer.Option(help="Models, as bot,learned; all of six families.")] = "",
+    model: Annotated[str, typer.Option(help="Models, as bot,learned; else six, of several families.")] = "",
+    case: Annotated[str, typer.Option(help="Cases, or drawn houses, as case1,drawn_1.")] = "case1,case2",
     out: Annotated[Path, typer.Option(help="Folder of the runs; what it holds is not made again.")] = Path(
         "out/rivals"
     ),
@@ -205,7 +206,8 @@ def rivals(
     """Measure look-ahead beside plain slacks, and say whether it wins."""
     from evaluation.rivals import FAMILIES, measure
 
-    measure(runs, seed, model.split(",") if model else FAMILIES, out, page, processes or os.cpu_count() or 1)
+    models = model.split(",") if model else FAMILIES
+    measure(runs, seed, models, case.split(","), out, page, processes or os.cpu_count() or 1)
 
 
 def report(

@@ -14,11 +14,11 @@ import numpy as np
 
 from evaluation.evaluation import evaluate
 from evaluation.experiment import Experiment
+from evaluation.houses import DRAWN
 from evaluation.results import markdown, share
 from evaluation.runs import Record
 from evaluation.statistics import clopper_pearson, compared
 
-CASES = ("case1", "case2")
 FAMILIES = ("bot", "goal-seeker", "jumper", "learned", "rover", "unsteered")
 SLACKS = ("ours", "ours@0/25", "proportional@0/25", "adaptive@0/25")  # ours: a slack of 0, projection alone
 METHODS = ("unmodified", *SLACKS, "lookahead")
@@ -26,23 +26,31 @@ KL_SHARE, SINGLE = 0.8, 0.95
 HARDLY, ADDED = 1.0, 1.0  # [nats]
 ABOUT = """# Look-ahead beside plain slacks
 
-Written by `{command}`: {models} models in two cases, {runs} runs of each
+Written by `{command}`: models: {models}, cases: {cases}, {runs} runs of each
 by every method, which share starts, model seeds and draws. KL: summed along a run, in nats, mean over runs.
 Steps: until the model has done its main task, {limit} where it does not; mean over runs. NAME@0/K: K steps of
 slack, or K per cent of the window, or at most K steps. In the sums the models and cases weigh alike."""
 
 
-def measure(runs: int, seed: int, models: Sequence[str], out: Path, page: Path, processes: int) -> None:
-    """Runs what `out` does not hold yet, prints what came of it and writes the page."""
+def measure(
+    runs: int, seed: int, models: Sequence[str], cases: Sequence[str], out: Path, page: Path, processes: int
+) -> None:
+    """Runs what `out` does not hold yet, prints what came of it and writes the page.
+
+    cases: names of cases, or of houses that are drawn.
+    """
     found: dict[tuple[str, str], list[Record]] = {}
     for model in models:
-        for case in CASES:
-            experiment = Experiment(case, model=model, seed=seed)
+        for case in cases:
+            house = case if DRAWN.fullmatch(case) else None
+            experiment = Experiment("house" if house else case, house, model, seed=seed)
             folder = out / model / case / experiment.noise
             found[model, case] = evaluate(experiment, runs, METHODS, folder, processes)
-    command = f"python -m evaluation rivals --runs {runs} --seed {seed} --model {','.join(models)}"
+    command = f"python -m evaluation rivals --runs {runs} --seed {seed} --case {','.join(cases)}"
+    if tuple(models) != FAMILIES:
+        command += f" --model {','.join(models)}"
     limit = experiment.main.limit
-    about = ABOUT.format(command=command, models=len(models), runs=runs, limit=limit)
+    about = ABOUT.format(command=command, models=len(models), cases=len(cases), runs=runs, limit=limit)
     text = "\n\n".join([about, *tables(found, limit), *verdict(found, limit)])
     print(text)
     page.write_text(text + "\n")
