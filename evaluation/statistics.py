@@ -16,6 +16,7 @@ from specshield.sim.episodes import Episode
 MODES = ("shaped", "switched", "completion", "prior", "fallback", "violated")  # of decisions
 CONFIDENCE = 0.95
 RESAMPLED = 2000  # samples of a bootstrap; chosen by hand
+NOTHING = 1e-6  # [nats] or [steps]; a KL of less is what rounding leaves of 0
 PERCENTILES = (("p50", 50.0), ("p99", 99.0), ("max", 100.0))
 _TAILS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 
@@ -149,7 +150,8 @@ def compared(pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
 
     pairs: how many; mine, other: the means. difference, share: mine - other and mine / other, each with low
     and high, the interval of a bootstrap that draws whole pairs (Efron and Tibshirani, 1993). None: there
-    are no pairs; of the share also: the other's mean is not above 0, in the runs or in a bootstrap's sample.
+    are no pairs; of the share also: the other's mean is not above NOTHING, in the runs or in a bootstrap's
+    sample.
     """
     if not pairs:
         nothing = ("mine", "other", "difference", "difference_low", "difference_high", "share", "low", "high")
@@ -158,7 +160,7 @@ def compared(pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
     mine, other = both.mean(axis=0)
     means = _resampled(both)
     apart = np.quantile(means[:, 0] - means[:, 1], _TAILS)
-    bounded = bool((means[:, 1] > 0.0).all())
+    bounded = bool((means[:, 1] > NOTHING).all())
     low, high = np.quantile(means[:, 0] / means[:, 1], _TAILS) if bounded else (None, None)
     return {
         "pairs": len(both),
@@ -167,7 +169,7 @@ def compared(pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
         "difference": _rounded(mine - other),
         "difference_low": _rounded(apart[0]),
         "difference_high": _rounded(apart[1]),
-        "share": _rounded(mine / other) if other > 0.0 else None,
+        "share": _rounded(mine / other) if other > NOTHING else None,
         "low": None if low is None else _rounded(low),
         "high": None if high is None else _rounded(high),
     }

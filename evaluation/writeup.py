@@ -35,6 +35,7 @@ OTHERS = {  # pages beside the summary that commands of their own write
     "curves": "Thresholds below 1",
     "habits": "Does closeness to the model matter?",
     "lookahead": "Look-ahead",
+    "rivals": "Look-ahead beside plain slacks",
     "related": "The neighbours",
 }
 

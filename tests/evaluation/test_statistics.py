@@ -121,6 +121,8 @@ def test_what_is_unwelcome_is_said_too():
     )
     faster = compared([(2.0, -4.0), (0.0, -4.0)])
     assert (faster["share"], faster["low"], faster["difference"]) == (None, None, 5.0)
+    dust = compared([(3.0, 1e-13), (1.0, 2e-13)])
+    assert (dust["share"], dust["difference"]) == (None, 2.0)
     uncertain = compared([(1.0, -1.0), (1.0, 3.0)])
     assert (uncertain["share"], uncertain["low"], uncertain["high"]) == (1.0, None, None)
     assert mean_of([]) == {"mean": None, "low": None, "high": None}
