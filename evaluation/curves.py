@@ -136,6 +136,8 @@ def draw(rows: Sequence[Row], file: Path) -> None:
         for column, (case, kinds) in enumerate(columns):
             for kind, model in product(kinds, models):
                 of = [row for row in rows if (row["case"], row["model"], row["kind"]) == (case, model, kind)]
+                if not of:  # the experiment is still to come
+                    continue
                 look = {"color": COLORS[kind], "ls": LINES[models.index(model) % len(LINES)]}
                 _lines(list(axes[:, column]), of, look, f"{kind}, {model}")
             axes[0, column].set_title(case)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from evaluation.curves import draw_all, methods_of
+from evaluation.curves import draw, draw_all, methods_of
 from evaluation.experiment import Experiment, certifies, split
 from specshield.errors import InputError
 
@@ -41,3 +41,16 @@ def test_the_page_has_a_row_a_point_and_what_is_kept_is_not_run_again(tmp_path):
     assert (tmp_path / "curves" / "curves.png").stat().st_size > 10_000
     (runs,) = (tmp_path / "out").glob("*/*/*/runs.jsonl")
     assert len(runs.read_text().splitlines()) == 2 * 5
+
+
+def test_what_is_still_to_come_is_left_out_of_the_figure(tmp_path):
+    pytest.importorskip("matplotlib")
+    kept = {"count": 1, "of": 2, "low": 0.1, "high": 0.9}
+    rows = [
+        {"case": case, "model": model, "kind": kind, "threshold": 0.5, "satisfied": kept, "main_done": kept,
+         "kl": 3.0, "kl_interval": [2.0, 4.0]}
+        for case, model in (("case1", "learned"), ("case1", "bot"), ("case2", "learned"))
+        for kind in ("step", "episode", "robustness")
+    ]  # fmt: skip
+    draw(rows, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
