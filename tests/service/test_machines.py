@@ -27,6 +27,8 @@ def test_a_server_that_is_told_to_stop_says_so_first_and_finishes_what_it_was_as
         serving(tmp_path, *options, SPECSHIELD_DRAIN="3") as server,
         httpx.Client(base_url=server.url) as client,
     ):
+        # The process that this connection leads to, which need not be the one that was ready first.
+        wait_for(lambda: client.get("/readyz").status_code == 200, 60.0)
         assert client.post("/v1/maps", json=grid_json()).status_code == 201
         policy = send_policy(client)
         session = client.post("/v1/sessions", json={"policy_id": policy["id"], "initial_pose": START}).json()
