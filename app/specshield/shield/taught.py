@@ -75,7 +75,7 @@ class Taught:
 def teach(
     shield: Shield, carry: Carry | None, poses: Floats, occupied: ArrayLike | None, free: ArrayLike | None
 ) -> tuple[Taught, tuple[str, ...]]:
-    """What is known at step t = len(poses) - 1, and what there is to say of the points [n, 2] that were sent.
+    """What the session knows at step t = len(poses) - 1, and warnings about the points [n, 2] that were sent.
 
     carry: what the last decision handed on: what was known then, and where each motion would lead. Raises
     SampleError for points that are none.
@@ -98,7 +98,7 @@ def teach(
         if motion >= 0:
             driven = poses[np.hypot(*(poses[:, :2] - poses[-1, :2]).T) <= NEARBY]
             for by, cells in cells_met(body, poses[-1], motion, driven):
-                # What lies along the front was touched; what may lie behind is a guess that tells no more.
+                # A cell along the front was touched, which replaces a guess. A guess replaces nothing.
                 kept = known.cell if by == BEHIND else known.cell[known.by != BEHIND]
                 known = learn(grid, known, t, np.setdiff1d(cells, kept), True, by)
     beyond = 0

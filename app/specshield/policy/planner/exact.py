@@ -26,8 +26,8 @@ from specshield.robot.dynamics import around, motion_count, step_from
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.
 NEAR = 3.0  # [steps] from where the field leads: nearer than this, poses are told apart by the finer grain
 GRAIN, FINE = 0.1, 0.02  # [m] poses that differ by less, and by less than a degree, count once
-GRAINS = (GRAIN, 0.03)  # [m] tried in turn: a gap may lead nowhere but from poses that the first passes over
-RICH = 100_000  # poses: with fewer left, the first grain is the only one
+GRAINS = (GRAIN, 0.03)  # [m] tried in turn: the coarse one can miss the few poses that lead through a gap
+RICH = 100_000  # poses: with fewer left to try, only the first grain is tried. Chosen by hand
 ASTRAY = 6.0  # [steps] by which the fields may err
 OPTIMISM = 1.05  # the fields say a little less than there is to go
 DEEPER = 1e-3  # [steps] by which a pose farther on its way goes before one that is as good
