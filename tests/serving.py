@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -30,12 +32,23 @@ class RunningServer:
         self.process.wait()
 
 
-def free_port(port: int = 0) -> int:
-    """This port, or any that is free."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind(("127.0.0.1", port))
-        return int(probe.getsockname()[1])
+# Below the ports that Linux gives to outgoing connections (32768 and up), in an order of this process's own.
+_PORTS = itertools.cycle(random.SystemRandom().sample(range(20_000, 32_000), 12_000))
+
+
+def free_port() -> int:
+    """A port that is free now, and that this process does not hand out again.
+
+    The kernel's own choice (port 0) may be the same twice before the first is in use, and may be taken by
+    an outgoing connection of another test meanwhile.
+    """
+    for port in _PORTS:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            with contextlib.suppress(OSError):
+                probe.bind(("127.0.0.1", port))
+                return port
+    raise AssertionError("the ports never end")
 
 
 @contextmanager
@@ -43,7 +56,7 @@ def serving(
     data_dir: Path, *options: str, ready: bool = True, port: int = 0, **environment: str
 ) -> Iterator[RunningServer]:
     """`specshield serve`. port: 0 is a free one. environment: settings, as in SPECSHIELD_SESSION_TTL="1"."""
-    port = free_port(port)
+    port = port or free_port()
     kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
     data_dir.mkdir(parents=True, exist_ok=True)
     log = data_dir / "server.log"

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -20,19 +19,13 @@ import httpx
 import redis
 
 from specshield.sim.service import follow_parent
+from tests.serving import free_port
 
 TICKS = os.sysconf("SC_CLK_TCK")
 PAGE = os.sysconf("SC_PAGE_SIZE")
 START = 1800.0  # [s] most that a start may take; kernels that are missing are compiled
 LOOK = 0.02  # [s] between two looks at something that is waited for
 STOP = 60.0  # [s] most that an orderly stop may take
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def wait_for(condition: Callable[[], object], seconds: float, what: str) -> None:

@@ -13,7 +13,8 @@ import redis
 
 from benchmarks.reliability.faults.crowd import Crowd
 from benchmarks.reliability.faults.kills import Scene
-from benchmarks.reliability.plant import Program, RedisServer, Service, free_port, wait_for
+from benchmarks.reliability.plant import Program, RedisServer, Service, wait_for
+from tests.serving import free_port
 
 NODES, SLOTS = 3, 16384
 MOVED = 400  # slots that move to another node, each time
