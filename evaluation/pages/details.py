@@ -29,6 +29,7 @@ def one_by_one(found: Found, drawn: Mapping[Path, Sequence[Path]], page: Path) -
     drawn: the pictures of an experiment, by its folder; page: the page that they are shown on.
     """
     yield models(found)
+    yield from better(found)
     yield (
         "In the pictures of ways, blue runs kept the rule and orange ones did not; what came after the "
         "rule's horizon is grey."

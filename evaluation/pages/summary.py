@@ -1,42 +1,42 @@
-"""docs/results.md: one table, what the figures are less than they may sound, and where the rest is."""
+"""docs/results.md, in three screens: one table, what it is less than it may sound, where the rest is."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from evaluation.experiment import split
-from evaluation.pages.tables import Found, better, summary_table, title
-from evaluation.pages.words import CAVEATS, HOW
-from evaluation.results import share
+from evaluation.pages.tables import Found, Results, better_in_short, summary_table, title
+from evaluation.pages.words import CAVEATS, HOW, SHORT
+from evaluation.results import markdown, share
+
+FRONT = ("unmodified", "rcd+", "simplex", "rule-first", "paper", "ours", "ours@0/25", "lookahead")
+NOISY = ("ours", "paper", "rule-first", "ours@default", "paper@default")
 
 
 def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterator[str]:
     """found: the main experiments. elsewhere: other pages, {title: path}. noisy: those of the noise page."""
     yield "# Results"
     yield HOW
-    yield summary_table(found.values())
-    yield "\n".join([CAVEATS, *_noise(noisy)])
-    yield from better(found)
+    yield summary_table(found.values(), FRONT)
+    yield SHORT
+    yield CAVEATS
+    yield _noise([each for each in noisy.values() if each["experiment"]["noise"] == "gaussian"])
+    yield from better_in_short(found)
     yield "## More"
     yield "\n".join(f"- [{name}]({path})" for name, path in elsewhere.items())
     yield "`make results` makes all of it again; each page ends with its own commands."
 
 
-def _noise(noisy: Found) -> Iterator[str]:
-    """The rule under gaussian noise by `ours` and by others, each pair with the same margin."""
-    for results in noisy.values():
-        if results["experiment"]["noise"] != "gaussian":
-            continue
+def _noise(noisy: Sequence[Results]) -> str:
+    """How many runs keep the rule under gaussian noise, a row a case."""
+    if not noisy:
+        return ""
+    heads = ("gaussian noise, rule kept", *NOISY)
+    rows = []
+    for results in noisy:
         kept = {one["method"]: share(one["satisfied"]) for one in results["methods"]}
-        parts = [
-            f"{(ours := found['other'])} {kept[ours]}, {method} {kept[method]}, "
-            f"p = {found['satisfied']['p']:.2g}"
-            for method, found in results["beside_ours"].items()
-            if split(method)[0] in ("paper", "rule-first")
-        ]
-        if parts:
-            yield f"  - {title(results)}, gaussian noise, rule kept: {'; '.join(parts)}."
+        rows.append((title(results), *(kept.get(method, "not run") for method in NOISY)))
+    return markdown(heads, rows)
 
 
 def linked(page: Path, others: Mapping[str, Path]) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,15 @@ def title(results: Results) -> str:
     return f"{results['case']}, {results['experiment']['model']}"
 
 
-def summary_table(found: Iterable[Results]) -> str:
-    """A row for each experiment and method, under HEADS."""
-    return markdown(HEADS, [(title(results), *row(one)) for results in found for one in results["methods"]])
+def summary_table(found: Iterable[Results], methods: Sequence[str] | None = None) -> str:
+    """A row for each experiment and method, under HEADS. methods: those to show, None for all."""
+    rows = [
+        (title(results), *row(one))
+        for results in found
+        for one in results["methods"]
+        if methods is None or one["method"] in methods
+    ]
+    return markdown(HEADS, rows)
 
 
 def row(one: Mapping[str, Any]) -> tuple[str, ...]:
@@ -63,28 +69,51 @@ def better(found: Found) -> Iterator[str]:
         "where more runs keep the rule or do the main task (p < 0.05). Of so many comparisons, a few are so "
         "by chance."
     )
-    yield "\n".join(line for results in found.values() for line in _better(results)) or "- None was found."
+    lines = []
+    for results in found.values():
+        world = results["experiment"]["noise"]
+        where = title(results) if world == "none" else f"{title(results)}, {world}"
+        for method, said in _better(results):
+            other = results["beside_ours"][method]["other"]
+            figures = "; ".join(f"{name} {figure}" for name, figure in said.items())
+            lines.append(f"- **{method}**, beside {other} ({where}): {figures}.")
+    yield "\n".join(lines) or "- None was found."
 
 
-def _better(results: Results) -> Iterator[str]:
+def better_in_short(found: Found) -> Iterator[str]:
+    """The same section without the figures: what each method does better, and where."""
+    where: dict[tuple[str, str], list[str]] = {}
+    for results in found.values():
+        for method, said in _better(results):
+            for name in said:
+                where.setdefault((method, name), []).append(title(results))
+    yield "## What does better than ours"
+    yield (
+        "Methods that keep the rule as often and whose 95 % interval of the difference in KL or steps lies "
+        "below 0, or that do more main tasks (p < 0.05). The figures are on the page of the cases."
+    )
+    lines = [f"- **{method}**: {name} ({'; '.join(there)})." for (method, name), there in where.items()]
+    yield "\n".join(lines) or "- None was found."
+
+
+def _better(results: Results) -> Iterator[tuple[str, dict[str, str]]]:
+    """Each method that does better than `ours` in something, and in what, with the figure."""
     for method, found in results["beside_ours"].items():
         kept = found["satisfied"]
         if split(method)[0] not in CERTIFYING or (kept["p"] < UNLIKELY and kept["only"] < kept["only_other"]):
             continue
-        said = [
-            f"{name} {difference(found[key])}"
+        said = {
+            name: difference(found[key])
             for key, name in COSTS.items()
             if found[key]["pairs"] >= ENOUGH and found[key]["difference_high"] < 0.0
-        ]
-        said += [
-            f"{name} {test(found[key])}"
+        }
+        said |= {
+            name: test(found[key])
             for key, name in OUTCOMES.items()
             if found[key]["p"] < UNLIKELY and found[key]["only"] > found[key]["only_other"]
-        ]
+        }
         if said:
-            world = results["experiment"]["noise"]
-            where = title(results) if world == "none" else f"{title(results)}, {world}"
-            yield f"- **{method}**, beside {found['other']} ({where}): {'; '.join(said)}."
+            yield method, said
 
 
 def test(found: Mapping[str, Any]) -> str:

@@ -35,8 +35,8 @@ METHODS = {
   shortest window.""",
     "adaptive": """ours with slack that follows the model: NAME@M/K is K steps times the mean of what
   probability the model has lately given to infeasible actions.""",
-    "lookahead": """ours, with the feasible actions weighted by what the rule will still cost the model from
-  there, as far as a surrogate fitted to its logits can tell.""",
+    "lookahead": """ours, and once the rule has cost 1 nat, with the feasible actions weighted by what it will
+  still cost the model from there, as far as a surrogate fitted to its logits can tell.""",
 }
 CAREFUL = """- **NAME@M/K**: with a margin of M metres, each deadline aimed at K steps early.
   **NAME@default**: as a session is where nobody says anything: margin, slack and map are learned."""
@@ -88,7 +88,13 @@ What these figures are less than they may sound:
 - Maps were drawn and regions placed so that a robot that only seeks its target breaks the rule.
 - A region holds where the robot's **origin** is in it, as in the paper: the body may reach into Forbidden.
 - Here the robot moves as the shield was told. Under noise it is another matter, also for `ours` without a
-  margin and slack; `paper` is given each margin and slack that `ours` is given:"""
+  margin and slack, as the next table shows; **@default** is what a session does where nobody says more."""
+SHORT = """\
+**unmodified**: the model alone. **rcd+**: SafeDec's robust decoding, then the rest of the rule. **simplex**:
+the model's draw where it is feasible, else the plan's. **rule-first**: the plan until the rule is decided,
+then the model. **paper**: the paper's decision rule with our DQN. **ours**: exact feasibility and projection.
+**@0/25**: each deadline aimed at 25 steps early. **lookahead**: ours, and once the rule has cost 1 nat, with
+an eye to what it will cost yet. The page of the cases has all methods, and says exactly what each does."""
 NOT_THE_SAME = """\
 The paper's figures are of other models, maps and simulators than these; only the shapes of the rules are the
 same. The cost that the paper reports (99 to 82.5 % of main tasks in case 2) is reproduced only as far as the

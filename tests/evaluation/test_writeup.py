@@ -88,9 +88,10 @@ def test_what_the_summary_says_is_in_the_records(tmp_path):
     page = (tmp_path / "results.md").read_text()
     row = "| case1, learned | rule-first | 8 of 8 (63.1 to 100.0 %) | 8 of 8 (63.1 to 100.0 %) "
     assert f"{row}| 9.0 (9.0 to 9.0) | +15.0 (+15.0 to +15.0), n 8 |" in page
-    assert "- **rule-first**, beside ours (case1, learned): extra steps -10.0 (-10.0 to -10.0), n 8." in page
-    assert "  - case1, learned, gaussian noise, rule kept: " in page
-    assert "ours 5 of 8 (24.5 to 91.5 %), paper 8 of 8 (63.1 to 100.0 %), p = 0.25." in page
+    assert "- **rule-first**: extra steps (case1, learned)." in page
+    assert "| gaussian noise, rule kept | ours | paper | rule-first | ours@default | paper@default |" in page
+    kept = "5 of 8 (24.5 to 91.5 %) | 8 of 8 (63.1 to 100.0 %) | 8 of 8 (63.1 to 100.0 %)"
+    assert f"| case1, learned | {kept} | not run | not run |" in page
     assert (tmp_path / "results" / "learned" / "case1" / "ways.png").is_file()
     assert "](results/cases.md)" in page
     assert "](results/noise.md)" in page
@@ -99,6 +100,7 @@ def test_what_the_summary_says_is_in_the_records(tmp_path):
         in (tmp_path / "results" / "noise.md").read_text()
     )
     cases = (tmp_path / "results" / "cases.md").read_text()
+    assert "- **rule-first**, beside ours (case1, learned): extra steps -10.0 (-10.0 to -10.0), n 8." in cases
     assert "| case1, learned | unmodified | 0 % | 93.5 % | 8 of 8" in cases
     assert "KL a run 9.0 and 4.0, difference +5.0 (+5.0 to +5.0), n 8, ratio 2.25 (2.25 to 2.25)" in cases
     assert "](learned/case1/ways.png)" in cases
