@@ -35,13 +35,14 @@ def observed():
     goals = goals_of((UNIT, 0), (-UNIT, 0))
     begun = beliefs.begin(2, MOTIONS)
     pose = np.array([0.5, 0.5, 0.0])
-    return begun, beliefs.update(begun, body, goals, pose, np.zeros(MOTIONS, bool), SAID, 0.1)
+    return begun, beliefs.update(begun, body, goals, pose, np.zeros(MOTIONS, bool), SAID, 0.1, 0.25)
 
 
 def test_before_anything_is_seen(observed):
     begun, _ = observed
     np.testing.assert_allclose(begun.style, STYLE)
     assert begun.excess == WARY
+    assert begun.forced == 0.0
     assert begun.trust == pytest.approx(1.0 / (1.0 + np.exp(WARY - DOUBT)))
     np.testing.assert_allclose(begun.probabilities(), [0.25, 0.25, 0.5])
 
@@ -88,5 +89,5 @@ def test_the_style_is_the_least_squares_fit_to_what_was_said(observed):
 
 def test_trust_falls_where_habits_predict_better():
     cost, normal = np.zeros(2), np.eye(4)
-    trusts = [Belief(cost, normal, normal[0], SAID, excess).trust for excess in (-20.0, DOUBT, 30.0)]
+    trusts = [Belief(cost, normal, normal[0], SAID, excess, 0.0).trust for excess in (-20.0, DOUBT, 30.0)]
     assert trusts == pytest.approx([1.0, 0.5, 0.0], abs=1e-9)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from specshield.lookahead.desirability import UNKEEPABLE, desirability, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import make_goals
 from specshield.lookahead.lattice import blocked_at, make_planes
-from specshield.lookahead.lookahead import prepare
+from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.lookahead.surrogate import WANDER, StandIn, end_chance, follow, price_left, step_price
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, step
@@ -202,17 +203,22 @@ def test_following_it_costs_what_the_best_path_does():
 
 SHARP_STYLE = (2.8, 2.8, -2.8, -1.0)
 TASK = flat("F[0,30] West and F[30,60] East and G[0,60] not Hole")
+ALL = np.ones(len(TASK.robot.actions), bool)
 
 
-def drive(speak, steps=25, start=(-0.4, 2.4, 0.2)):
-    """Beliefs and additions along the way of a model that is let go where it wants to."""
+def drive(speak, steps=25, start=(-0.4, 2.4, 0.2), forced=FORCED):
+    """Beliefs and additions along the way of a model that is let go where it wants to.
+
+    forced: what the rule is said to have cost before.
+    """
     ahead, body = prepare(TASK), make_body(TASK.robot, TASK.grid)
     motions = len(TASK.robot.motions)
-    belief, history, given = Belief.from_bytes(ahead.begin(), motions), [np.array(start)], []
+    belief = replace(Belief.from_bytes(ahead.begin(), motions), forced=forced)
+    history, given = [np.array(start)], []
     random = np.random.default_rng(0)
     for t in range(steps):
         log_prior = log_softmax(speak(t, history[-1], random))
-        belief, added = ahead.advance(belief, np.array(history), {}, log_prior)
+        belief, added = ahead.advance(belief, np.array(history), {}, log_prior, ALL)
         given.append((belief, added))
         weights = np.where(TASK.robot.terminal, 0.0, np.exp(log_prior))
         action = random.choice(len(weights), p=weights / weights.sum())
@@ -280,18 +286,34 @@ def test_it_is_pure_and_its_memory_travels_as_bytes():
     memory = belief.to_bytes()
     assert len(memory) < 8_000
     log_prior = log_softmax(seeks(0)(11, history[11], None))
-    again = ahead.step(memory, history[:12], {}, log_prior)
-    once, added_once = ahead.advance(belief, history[:12], {}, log_prior)
+    again = ahead.step(memory, history[:12], {}, log_prior, ALL)
+    once, added_once = ahead.advance(belief, history[:12], {}, log_prior, ALL)
     assert again[0] == once.to_bytes()
     np.testing.assert_array_equal(again[1], added_once)
     assert np.all(added[TASK.robot.terminal] == 0.0)
     assert np.all(added <= 0.0)
 
 
+def test_it_learns_but_prefers_nothing_until_the_rule_has_cost_enough():
+    ahead, history, given = drive(seeks(0), 12, forced=0.0)
+    assert not any(added.any() for _, added in given)  # everything was feasible, so nothing was forced
+    belief, log_prior = given[-1][0], log_softmax(seeks(0)(11, history[11], None))
+    assert belief.trust > 0.5
+    going_on = np.where(TASK.robot.terminal, 0.0, np.exp(log_prior))
+    likeliest = int(np.argmax(going_on))
+    for feasible in (~TASK.robot.terminal & (np.arange(len(going_on)) != likeliest), going_on == 0.0):
+        after, added = ahead.advance(belief, history[:12], {}, log_prior, feasible)
+        kept = going_on[feasible].sum() / going_on.sum()
+        forced = -going_on.sum() * math.log(kept) if kept > 0.0 else FORCED
+        assert after.forced == pytest.approx(forced)
+        assert added.any() == (after.forced >= FORCED)
+    assert added.any()  # without any feasible action the rule has cost enough
+
+
 def test_a_model_that_only_ends_teaches_nothing():
     ahead = prepare(TASK)
     log_prior = np.where(TASK.robot.terminal, 0.0, -np.inf)
-    memory, added = ahead.step(ahead.begin(), np.array([[-0.4, 2.4, 0.2]]), {}, log_prior)
+    memory, added = ahead.step(ahead.begin(), np.array([[-0.4, 2.4, 0.2]]), {}, log_prior, ALL)
     assert not added.any()
     assert memory == ahead.begin()
 

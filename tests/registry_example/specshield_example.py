@@ -111,7 +111,12 @@ class Eager:
         return b""
 
     def step(
-        self, memory: bytes, history: Floats, signals: Mapping[str, Floats], log_prior: Floats
+        self,
+        memory: bytes,
+        history: Floats,
+        signals: Mapping[str, Floats],
+        log_prior: Floats,
+        feasible: NDArray[np.bool_],
     ) -> tuple[bytes, Floats]:
         memory += b"."
         return memory, len(memory) * (np.arange(self.actions) == 0).astype(np.float64)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from specshield.lookahead import lookahead
-from specshield.lookahead.lookahead import prepare
+from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.service.sessions.state import pack_carry
 from specshield.shield.decision import Config
@@ -72,6 +72,31 @@ def test_the_guarantee_stays_and_the_path_costs_less(world):
     assert all(verdict == "satisfied" for _, verdict in with_it + without)
     assert max(differs) > 0.1
     assert sum(paid for paid, _ in with_it) < sum(paid for paid, _ in without)
+
+
+def test_a_run_that_the_rule_hardly_touches_is_as_with_projection(world):
+    case, shield = world
+    ahead = replace(shield, preference=prepare(shield.task, shield.proposers))
+    plain = {seed: distributions(case, shield, seed) for seed in range(3)}
+    for seed, (given, paid) in plain.items():
+        also, _ = distributions(case, ahead, seed)
+        forced = np.cumsum(paid)
+        untouched = int(np.searchsorted(forced, FORCED))  # decisions before the rule has cost that much
+        assert untouched > 0
+        np.testing.assert_array_equal(also[:untouched], given[:untouched])
+        assert not np.array_equal(also, given)
+
+
+def distributions(case, shield, seed):
+    """Every distribution of an episode, and the KL of each."""
+    given, paid = [], []
+
+    def keep(decision, logits):
+        given.append(decision.distribution)
+        paid.append(decision.kl or 0.0)
+
+    episode(case, shield, seed, keep)
+    return np.array(given), np.array(paid)
 
 
 def test_a_decision_made_again_is_the_same(world):

@@ -40,7 +40,8 @@ class Belief:
     """cost [G + 1]: what each goal and, last, wandering have been charged [nats]. normal [F, F], moment [F]:
     the normal equations of the least squares that fit the model's style. habit [M]: the running average of
     the probabilities of its motions. excess: the running sum of what the likely stand-ins were charged above
-    what the habit was [nats].
+    what the habit was [nats]. forced: what the rule has cost the model so far, had every answer been the
+    projection's [nats].
     """
 
     cost: Floats
@@ -48,6 +49,7 @@ class Belief:
     moment: Floats
     habit: Floats
     excess: float
+    forced: float
 
     @property
     def trust(self) -> float:
@@ -70,33 +72,40 @@ class Belief:
         return np.append(going * odds / odds.sum(), 1.0 - going)
 
     def to_bytes(self) -> bytes:
-        parts = (self.cost, self.normal.ravel(), self.moment, self.habit, [self.excess])
+        parts = (self.cost, self.normal.ravel(), self.moment, self.habit, [self.excess, self.forced])
         return np.concatenate(parts).astype("<f8").tobytes()
 
     @staticmethod
     def from_bytes(content: bytes, motions: int) -> Belief:
         """What `to_bytes` wrote, for a robot of so many motions."""
         values = np.frombuffer(content, "<f8").copy()
-        goals = len(values) - FEATURES * FEATURES - FEATURES - motions - 1
-        cost, normal, moment, habit, excess = np.split(
+        goals = len(values) - FEATURES * FEATURES - FEATURES - motions - 2
+        cost, normal, moment, habit, last = np.split(
             values, np.cumsum([goals, FEATURES * FEATURES, FEATURES, motions])
         )
-        return Belief(cost, normal.reshape(FEATURES, FEATURES), moment, habit, float(excess[0]))
+        return Belief(cost, normal.reshape(FEATURES, FEATURES), moment, habit, float(last[0]), float(last[1]))
 
 
 def begin(goals: int, motions: int) -> Belief:
     """Before the first observation."""
     habit = np.full(motions, 1.0 / motions)
-    return Belief(np.zeros(goals + 1), SURE * np.eye(FEATURES), SURE * STYLE, habit, WARY)
+    return Belief(np.zeros(goals + 1), SURE * np.eye(FEATURES), SURE * STYLE, habit, WARY, 0.0)
 
 
 def update(
-    belief: Belief, body: Body, goals: Goals, pose: Floats, blocked: Bools, said: Floats, end: float
+    belief: Belief,
+    body: Body,
+    goals: Goals,
+    pose: Floats,
+    blocked: Bools,
+    said: Floats,
+    end: float,
+    forced: float,
 ) -> Belief:
     """The belief after what the model said at x_t (3,).
 
     blocked [M]: the motions that an obstacle stops short. said [M]: the motions' probabilities, given that
-    the model does not end; end: the probability that it does.
+    the model does not end; end: the probability that it does. forced: the KL of projection's answer [nats].
     """
     said = np.maximum(said, LEAST_SAID) / np.maximum(said, LEAST_SAID).sum()
     log_said = np.log(said)
@@ -121,6 +130,7 @@ def update(
         KEEP * belief.moment + (1.0 - KEEP) * SURE * STYLE + (features.T * weight) @ wanted,
         (1.0 - HABITS) * belief.habit + HABITS * said,
         excess,
+        belief.forced + forced,
     )
 
 

@@ -1,8 +1,11 @@
 """Look-ahead: inside the feasible set S_t, weigh what the model wants by what it will cost the model later.
 
 Projection lets the model put a visit off, step after step, until it is forced. Look-ahead spreads that force
-over the path. It has stand-ins for the model: one for each of some places that the model may be going to, and
-one that wanders. Each has a table of D, what the rule will still cost it from every pose in KL and in steps
+over the path, from the step on at which the rule has cost the model FORCED. Until then it answers as
+projection does, so a rule that the model keeps almost by itself costs no more with look-ahead.
+
+It has stand-ins for the model: one for each of some places that the model may be going to, and one that
+wanders. Each has a table of D, what the rule will still cost it from every pose in KL and in steps
 (desirability.py), which is solved once for a task. A session learns which of the stand-ins the model is like
 (belief.py), and each action is weighed by exp(-D), with D the mean over them. Only the preference inside S_t
 changes: the rule is kept because of S_t alone.
@@ -10,6 +13,7 @@ changes: the rule is kept because of S_t alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +21,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import block_diag
 
-from specshield.arrays import Codes, Floats, Ints
+from specshield.arrays import Bools, Codes, Floats, Ints
 from specshield.errors import Unsupported
 from specshield.lookahead import belief as beliefs
 from specshield.lookahead.belief import STYLE, Belief
@@ -40,6 +44,7 @@ WORK = 200_000_000  # entries that are solved for a task, at most, where that le
 MOST, FEWEST = 64, 8  # places that have a table
 REACH = 0.3  # [m] further off than the nearest, at which a place stands for a goal 1 / e as much
 LEADERS = 16  # tables that a decision asks
+FORCED = 1.0  # [nats] of KL that the rule has cost a run: below it, projection is as good (evaluation rivals)
 NEGLIGIBLE = 0.02  # a probability, or trust, that is not worth the work
 WORST = 10.0  # [nats] above the worst action that has a D, for those that have none
 
@@ -65,21 +70,31 @@ class LookAhead:
         return beliefs.begin(len(self.goals.distance), len(self.task.robot.motions)).to_bytes()
 
     def step(
-        self, memory: bytes, history: Floats, signals: Mapping[str, Floats], log_prior: Floats
+        self,
+        memory: bytes,
+        history: Floats,
+        signals: Mapping[str, Floats],
+        log_prior: Floats,
+        feasible: Bools,
     ) -> tuple[bytes, Floats]:
         """As `Preference.step`. The memory is the belief.
 
         The log-weight of an action is -trust * D of the pose it leads to, D taken from its least value: at
-        most 0, and 0 for a terminal action and where nothing is known.
+        most 0, and 0 for a terminal action, where nothing is known, and until the rule has cost FORCED.
         """
         belief = Belief.from_bytes(memory, len(self.task.robot.motions))
-        belief, weights = self.advance(belief, history, signals, log_prior)
+        belief, weights = self.advance(belief, history, signals, log_prior, feasible)
         return belief.to_bytes(), weights
 
     def advance(
-        self, belief: Belief, history: Floats, signals: Mapping[str, Floats], log_prior: Floats
+        self,
+        belief: Belief,
+        history: Floats,
+        signals: Mapping[str, Floats],
+        log_prior: Floats,
+        feasible: Bools,
     ) -> tuple[Belief, Floats]:
-        """What is believed after the model's log_prior [A] at x_t, and the log-weights [A]."""
+        """What is believed after the model's log_prior [A] at x_t with S_t [A], and the log-weights [A]."""
         robot, pose = self.task.robot, history[-1]
         prior = np.exp(log_prior)
         going_on = prior[~robot.terminal]
@@ -88,8 +103,10 @@ class LookAhead:
         said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(robot.motions)) / going_on.sum()
         blocked = blocked_at(self.body, *pose)
         end = float(prior[robot.terminal].sum())
-        belief = beliefs.update(belief, self.body, self.goals, pose, blocked, said, end)
-        if belief.trust < NEGLIGIBLE:
+        possible = float(prior[feasible & ~robot.terminal].sum()) / float(going_on.sum())
+        forced = -float(going_on.sum()) * math.log(possible) if possible > 0.0 else FORCED
+        belief = beliefs.update(belief, self.body, self.goals, pose, blocked, said, end, max(forced, 0.0))
+        if belief.forced < FORCED or belief.trust < NEGLIGIBLE:
             return belief, np.zeros(len(prior))
         costs = self._costs(belief, history, signals)
         return belief, np.where(robot.terminal, 0.0, -belief.trust * costs[robot.motion_of])

@@ -58,5 +58,7 @@ def prepare(name: str, task: Task, proposers: Sequence[Proposer], pose: Sequence
     actions = len(task.robot.actions)
     signals = {signal: np.array([value]) for signal, value in task.signals.items()}
     even = np.full(actions, -math.log(actions))
-    preference.step(preference.begin(), np.array([pose], dtype=np.float64), signals, even)
+    preference.step(
+        preference.begin(), np.array([pose], dtype=np.float64), signals, even, np.zeros(actions, bool)
+    )
     return preference

@@ -157,7 +157,7 @@ def decide(
         judged = without(judged, shield, doubtful(told, taught, poses[-1]))
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
-            memory, weights = shield.preference.step(before, poses, signals, log_prior)
+            memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)
         if shield.config.threshold_over == "episode" and spec_status == "pending":
             chance = chances(shield, care, prefix, judged)
             left = left_of(shield, carry, chance)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol
 
-from specshield.arrays import Floats
+from specshield.arrays import Bools, Floats
 
 
 class Preference(Protocol):
@@ -22,10 +22,16 @@ class Preference(Protocol):
         ...
 
     def step(
-        self, memory: bytes, history: Floats, signals: Mapping[str, Floats], log_prior: Floats
+        self,
+        memory: bytes,
+        history: Floats,
+        signals: Mapping[str, Floats],
+        log_prior: Floats,
+        feasible: Bools,
     ) -> tuple[bytes, Floats]:
         """The memory after x_t, and the log-weights [A].
 
-        history [t + 1, 3] with t < T; signals {name: [t + 1]}; log_prior [A]: what the model says at x_t.
+        history [t + 1, 3] with t < T; signals {name: [t + 1]}; log_prior [A]: what the model says at x_t;
+        feasible [A]: S_t.
         """
         ...
