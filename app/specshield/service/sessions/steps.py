@@ -65,21 +65,26 @@ class Pace:
     """How long decisions with some policies take.
 
     They are made on the event loop, since handing one to a thread and back costs about as much as most of
-    them take. The first few, and the few that follow two close together that took longer than SHORT, are made
-    in a thread, where the processor's time is measured: the clock alone does not tell a long decision from a
-    busy machine.
-    After one that computed longer than SHORT the next WATCHED are made there; after several of LONG, all of
-    them in another process.
+    them take. The first few are made in a thread. On the event loop only the clock is asked, until two close
+    together were longer than SHORT. The clock alone does not tell a long decision from a busy machine, so the
+    processor's time of the few that follow is measured, where they are.
+    After one that computed longer than SHORT the next WATCHED are made in threads; after several of LONG, all
+    of them in another process.
     """
 
     def __init__(self) -> None:
-        self._unsure = SEVERAL  # how many are still to be measured
+        self._threaded = SEVERAL  # how many are still to be made in threads
+        self._doubted = 0  # how many are still to be measured on the event loop
         self._since_late = WATCHED  # decisions on the event loop since one that took longer than SHORT
         self._long = 0
 
     @property
     def short(self) -> bool:
-        return self._unsure == 0
+        return self._threaded == 0
+
+    @property
+    def doubted(self) -> bool:
+        return self._doubted > 0
 
     @property
     def long(self) -> bool:
@@ -89,10 +94,11 @@ class Pace:
         """computed: the seconds of a processor, None where they were not measured."""
         if computed is None:
             late = seconds > SHORT
-            self._unsure = SEVERAL if late and self._since_late < SEVERAL else 0
+            self._doubted = SEVERAL if late and self._since_late < SEVERAL else 0
             self._since_late = 0 if late else self._since_late + 1
             return
-        self._unsure = WATCHED if computed > SHORT else max(self._unsure - 1, 0)
+        self._doubted = max(self._doubted - 1, 0)
+        self._threaded = WATCHED if computed > SHORT else max(self._threaded - 1, 0)
         self._long += computed > LONG
 
 
@@ -187,15 +193,18 @@ class Steps:
             return Decided(*made[:3])
         learns = _learns(session, request)
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
-        if pace.short and not learns:  # asking for the thread's own time would cost a tenth of the step
-            begun, cpu = time.perf_counter(), None
-            made = decided(self._shields, session, request)
-            seconds = time.perf_counter() - begun
-        else:
+        cpu: float | None
+        if learns or not pace.short:
             loop = asyncio.get_running_loop()
             *made, seconds, cpu = await loop.run_in_executor(
                 self._threads, timed, self._shields, session, request
             )
+        elif pace.doubted:
+            *made, seconds, cpu = timed(self._shields, session, request)
+        else:  # asking for the thread's own time would cost a tenth of the step
+            begun, cpu = time.perf_counter(), None
+            made = list(decided(self._shields, session, request))
+            seconds = time.perf_counter() - begun
         timing["rollout"] = timing.get("rollout", 0.0) + seconds
         if not learns:  # what a map that changed costs says nothing of other sessions of the policy
             pace.add(seconds, cpu)
