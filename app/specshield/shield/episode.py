@@ -146,7 +146,7 @@ def decide(
         believed = taught
         for doubt in () if judged.feasible.any() else doubted(taught, t):
             shield, prefix, judged, withstands = judged_by_signals(
-                on_map(told, doubt.map), prefix, tail, spec_status, care
+                on_map(told, doubt.map, True), prefix, tail, spec_status, care
             )
             taught = doubt
             if judged.feasible.any():

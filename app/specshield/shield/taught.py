@@ -168,12 +168,12 @@ def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
     return differ
 
 
-def on_map(shield: Shield, known: LearnedMap) -> Shield:
-    """The shield on a session's own map."""
+def on_map(shield: Shield, known: LearnedMap, guess: bool = False) -> Shield:
+    """The shield on a session's own map. guess: whether it is one of several that a decision tries."""
     if not len(known):
         return shield
     body = body_on(shield, known)
-    proposers = tuple(p.on_body(body) if hasattr(p, "on_body") else p for p in shield.proposers)
+    proposers = tuple(p.on_body(body, guess) if hasattr(p, "on_body") else p for p in shield.proposers)
     return replace(shield, body=body, proposers=proposers)
 
 

@@ -47,7 +47,7 @@ class Policy:
     def scene(self) -> Scene:
         return make_scene(self.task)
 
-    def on_body(self, body: Body) -> Policy:
+    def on_body(self, body: Body, guess: bool = False) -> Policy:
         """The policy on another map: it sees the distances that it saw, its ways are those that there are."""
         other = replace(self)
         other.__dict__["scene"] = self.scene._replace(body=body)

@@ -94,7 +94,7 @@ class PlannerPolicy:
     def _world(self) -> World:
         return self._world_of(self.task.formula)
 
-    def on_body(self, body: Body) -> PlannerPolicy:
+    def on_body(self, body: Body, guess: bool = False) -> PlannerPolicy:
         """The policy on another map: its fields lead as they did, its ways are those that there are."""
         other = replace(self)
         other.__dict__.update(_body=body, _world=self._world._replace(body=body))

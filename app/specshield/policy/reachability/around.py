@@ -35,7 +35,8 @@ from specshield.robot.dynamics import around, displacement, motion_count, step, 
 from specshield.rule.progress import ALWAYS, PENDING, advance
 
 # Chosen by hand; python -m evaluation worlds says what comes of them.
-POSES = 16_384  # that one search may come to
+POSES = 8_192  # that one search may come to, in some 12 ms: a power of two
+FEWER = 2_048  # the same, where one decision tries several maps
 ONWARD = 0.1  # [steps] of slack that a step farther on its way is worth
 PLACE_GRAIN = 20.0  # [1/m] places that round to the same multiples of its inverse count once
 HEADING_GRAIN = 60.0 / (2.0 * math.pi)  # [1/rad]
@@ -60,13 +61,13 @@ class Tree(NamedTuple):
 
 @kernel
 def go_around(
-    guide: Guide, past: float, history: Floats, signals: Floats, poses: Floats, motions: Ints
+    guide: Guide, past: float, history: Floats, signals: Floats, poses: Floats, motions: Ints, most: int
 ) -> int:
     """Searches for a way from x_t to every goal, unless one is known. Returns its first motion, -1 where
     there is none; then motions (M, T - t) hold it, and after each other motion the way back to it.
 
-    poses (M, T - t, 3): the ways that are known; overwritten. The other arguments are those of
-    `continue_all`.
+    poses (M, T - t, 3): the ways that are known; overwritten. most: the poses that a search may come to. The
+    other arguments are those of `continue_all`.
     """
     t, k_count, steps = history.shape[0] - 1, guide.rules.kind.shape[0], motions.shape[1]
     status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
@@ -76,9 +77,9 @@ def go_around(
     if guide.wait < 0 or _is_known(guide, t, status, run, poses, scratch):
         return -1
     tree = Tree(
-        np.empty((POSES, 3)), np.empty((POSES, k_count), np.int8), np.empty((POSES, k_count), np.int64),
-        np.empty(POSES, np.int32), np.empty(POSES, np.int32), np.empty(POSES, np.int32), np.empty(POSES),
-        Heap(np.empty(POSES, np.int32), np.empty(POSES)),
+        np.empty((most, 3)), np.empty((most, k_count), np.int8), np.empty((most, k_count), np.int64),
+        np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most),
+        Heap(np.empty(most, np.int32), np.empty(most)),
     )  # fmt: skip
     seen = np.empty(4 * POSES, np.int32)
     way, led = np.empty(steps, np.int64), np.empty((steps, 3))

@@ -21,7 +21,7 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.reachability.around import go_around
+from specshield.policy.reachability.around import FEWER, POSES, go_around
 from specshield.policy.reachability.guide import Guide, share_with_slack
 from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
 from specshield.policy.reachability.method import Settings
@@ -60,6 +60,7 @@ class ReachabilityPolicy:
     tables: Tables
     narrow: Bools
     told: bool = True  # whether the tables were made for the map that the policy goes by
+    most: int = POSES  # that one search for a way around may come to
 
     @property
     def id(self) -> str:
@@ -73,9 +74,12 @@ class ReachabilityPolicy:
     def _rules(self) -> Rules:
         return make_rules(self.task)
 
-    def on_body(self, body: Body) -> ReachabilityPolicy:
-        """The policy on another map: its tables suggest what they did, its ways are those that there are."""
-        other = replace(self, told=False)
+    def on_body(self, body: Body, guess: bool = False) -> ReachabilityPolicy:
+        """The policy on another map: its tables suggest what they did, its ways are those that there are.
+
+        guess: whether the map is one of several that are tried in one decision.
+        """
+        other = replace(self, told=False, most=FEWER if guess else POSES)
         other.__dict__.update(_body=body, _rules=self._rules)
         return other
 
@@ -116,7 +120,7 @@ class ReachabilityPolicy:
             proposals.append(Proposal(motions, int(preferred)))
             if not self.told:
                 ways = np.empty_like(motions)
-                first = go_around(guide, past, history, rows, poses, ways)
+                first = go_around(guide, past, history, rows, poses, ways, self.most)
                 if first >= 0:
                     proposals.append(Proposal(ways, int(first)))
         return joined(*proposals)
