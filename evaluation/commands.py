@@ -203,7 +203,7 @@ def rivals(
     page: Annotated[Path, typer.Option(help="The page to write.")] = Path("docs/rivals.md"),
     processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
 ) -> None:
-    """Measure look-ahead beside plain slacks, and say whether it wins."""
+    """Measure look-ahead beside slacks of four kinds, and say whether it wins."""
     from evaluation.rivals import FAMILIES, measure
 
     models = model.split(",") if model else FAMILIES

@@ -117,12 +117,18 @@ def _told(rows: Sequence[Row]) -> Iterator[str]:
         )
     values = [row for row in rows if row["kind"] == "robustness" and row["threshold"] >= 0.0]
     if values:
-        shares = [row["satisfied"]["count"] / row["satisfied"]["of"] for row in values]
         yield (
-            f"- **robustness**: with a threshold of 0 m or more the rule is kept in {100 * min(shares):.1f} "
-            f"to {100 * max(shares):.1f} % of\n  a row's runs. A mean above 0 leaves mass on actions whose "
-            "rho is below 0."
+            "- **robustness**: " + "; ".join(_kept(values)) + ". A mean above 0 leaves mass on\n"
+            "  actions whose rho is below 0."
         )
+
+
+def _kept(rows: Sequence[Row]) -> Iterator[str]:
+    """At each threshold in metres, in how many runs of a row the rule is kept."""
+    for metres in sorted({row["threshold"] for row in rows}):
+        kept = [row["satisfied"] for row in rows if row["threshold"] == metres]
+        counts = sorted(each["count"] for each in kept)
+        yield f"at {metres:g} m the rule is kept in {counts[0]} to {counts[-1]} of {kept[0]['of']} runs a row"
 
 
 def draw(rows: Sequence[Row], file: Path) -> None:

@@ -22,11 +22,12 @@ METHODS = ("unmodified", "rule-first", "simplex", "ours", "adaptive@0/25", "look
 HEADS = ("method", "rule satisfied", "main task done", "KL a run [nats]", "extra steps")
 INTRODUCTION = """# Does staying close to the model matter?
 
-Written by `{command}`. Projection's only proven benefit over following the rule first and the model
-then is a smaller divergence from the model. Here are two models for which that could matter: one has a habit
-that people care for, and the other a memory that detours break. Neither knows the rule. All methods share
-starts, model seeds and draws. Shares of runs have 95 % Clopper-Pearson intervals, the others 95 % intervals
-of a bootstrap over runs. Extra steps are over the runs in which both did the main task."""
+Written by `{command}`. Beside following the rule first and the model then, projection has a smaller
+divergence from the model in every case, and fewer steps in case 2 alone. Here are two models for which that
+could matter: one has a habit that people care for, and the other a memory that detours break. Neither knows
+the rule. All methods share starts, model seeds and draws. Shares of runs have 95 % Clopper-Pearson
+intervals, the others 95 % intervals of a bootstrap over runs. Extra steps are over the runs in which both
+did the main task."""
 COURTEOUS = f"""## A habit: slow near people
 
 There is a person in the middle of each room. Within {courteous.NEAR_PEOPLE:g} m of one, the model waits after

@@ -26,18 +26,18 @@ from specshield.sim.cases import case_name, case_names, load_case
 from specshield.sim.robot import Pose
 
 REWARDS = {
-    "paper": "the paper's: eq. 5 with the funnels of its Table I, to the letter",
+    "paper": "the paper's: eq. 5 with the funnels of its Table I, to the letter but for what it leaves open",
     "progress": "ours, with which the shipped networks were trained",
 }
 INTRODUCTION = """\
 # Two rewards for the learned policy
 
 Written by `python -m evaluation rewards`. Only the reward differs; what the network sees and how it learns
-is the same, and by default but for the number of updates, which is in the table (by default 16,000):
+is the same. All other settings are the defaults; the number of updates is in the table (16,000 by default):
 
 {rewards}
 
-What the paper leaves open, and how it was chosen, is said in `app/specshield/policy/dqn/funnel.py`.
+`app/specshield/policy/dqn/funnel.py` says what the paper leaves open, and what was chosen.
 
 - **alone**: the network's greedy policy from {starts} starts uniform over free space.
 - **can start**: of the same starts, from how many some first action, and then the policy, keeps the rule. A
@@ -199,9 +199,10 @@ def _shipped() -> Iterator[str]:
         card = json.loads((MODELS / f"{name}-dqn" / "card.json").read_text())
         metrics, options = card["metrics"], card["options"]
         yield (
-            f"- The network shipped for {name} (`{options['reward']}`, {options['updates']:,} updates, seed "
-            f"{card['seed']}): alone from {100 * metrics['satisfied']:.1f} % of {metrics['starts']:,} "
-            f"starts, a session can open at {100 * metrics['feasible_start']:.1f} %."
+            f"- The network shipped for {name} (`{options['reward']}`, {options['updates']:,} updates, "
+            f"seed {card['seed']}): alone from {100 * metrics['satisfied']:.1f} % of {metrics['starts']:,} "
+            f"starts, a session can open at {100 * metrics['feasible_start']:.1f} %. It was trained by "
+            "earlier code: the same settings and seed do not lead to the same network today."
         )
 
 

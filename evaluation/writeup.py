@@ -17,7 +17,7 @@ from evaluation.pages.houses import bodies, houses
 from evaluation.pages.noise import noise
 from evaluation.pages.summary import linked, summary
 from evaluation.pages.tables import Results, commands
-from evaluation.pages.words import INTRODUCTION, MAIN_MODELS, legend
+from evaluation.pages.words import INTRODUCTION, MAIN_MODELS, TASKS, legend
 from evaluation.results import write
 from specshield.errors import NotFound
 from specshield.sim.cases import Case
@@ -35,7 +35,7 @@ OTHERS = {  # pages beside the summary that commands of their own write
     "curves": "Thresholds below 1",
     "habits": "Does closeness to the model matter?",
     "lookahead": "Look-ahead",
-    "rivals": "Look-ahead beside plain slacks",
+    "rivals": "Look-ahead beside slacks",
     "related": "The neighbours",
 }
 
@@ -58,7 +58,7 @@ def write_up(folder: Path, page: Path) -> None:
     parts = {name: {kept: r for kept, r in found.items() if name in pages_of(r)} for name in TITLES}
     texts = {
         "models": overview(parts["models"]),
-        "tasks": overview(parts["tasks"]),
+        "tasks": [TASKS, *overview(parts["tasks"])],
         "noise": noise(parts["noise"]),
         "houses": houses(parts["houses"]),
         "bodies": bodies(parts["bodies"]),

@@ -17,14 +17,18 @@ def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterato
     """found: the main experiments. elsewhere: other pages, {title: path}. noisy: those of the noise page."""
     yield "# Results"
     yield HOW
-    yield summary_table(found.values(), FRONT)
+    told = {one["case"]: (one["formula"], one["instruction"]) for one in found.values()}
+    yield "\n".join(
+        f'- **{case}**: `{rule}`; the model is told "{task}".' for case, (rule, task) in told.items()
+    )
     yield SHORT
+    yield summary_table(found.values(), FRONT)
     yield CAVEATS
     yield _noise([each for each in noisy.values() if each["experiment"]["noise"] == "gaussian"])
     yield from better_in_short(found)
     yield "## More"
     yield "\n".join(f"- [{name}]({path})" for name, path in elsewhere.items())
-    yield "`make results` makes all of it again; each page ends with its own commands."
+    yield "`make results` makes all of it again; each page of figures names its own command."
 
 
 def _noise(noisy: Sequence[Results]) -> str:

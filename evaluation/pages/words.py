@@ -14,12 +14,14 @@ PAPER = {  # Table II: rule satisfied and main task done, in per cent of 200 run
 }
 METHODS = {
     "unmodified": "the model's own draws; after its `end` the robot stands still.",
-    "hcd": """SafeDec's hard constrained decoding: an action is out where the states so far and the next one
-  leave some conjunct no chance. After the model's `end` the robot stands still.""",
+    "hcd": """our reading of SafeDec's hard constrained decoding for rules with windows: an action is out
+  where the states so far and the next one leave some conjunct no chance. After the model's `end` the robot
+  stands still.""",
     "hcd+": """hcd, and from the model's `end` on the certified continuation until the rule is decided; where
   none was found, the policy's best try.""",
-    "rcd": f"""SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)), alpha {ALPHA:g}
-  per metre, beta {BETA:g}, the best of 24 pairs on other seeds. After the `end` the robot stands still.""",
+    "rcd": f"""our reading of SafeDec's robust constrained decoding: logit + beta exp(alpha rho(next state)),
+  alpha {ALPHA:g} per metre, beta {BETA:g}, the best of 24 pairs on other seeds. After the `end` the robot
+  stands still.""",
     "rcd+": "rcd, with the same completion after the model's `end` as hcd+.",
     "simplex": "the model's own draw where it is feasible, else one step of the certified continuation.",
     "switching": """the model's own draws until one is not feasible, which is when the slack has run out; then
@@ -75,10 +77,12 @@ its target before 600 steps. Shares have 95 % Clopper-Pearson intervals; means, 
 McNemar's exact test. Extra steps are how much later the model ended than unmodified, over the n runs in which
 both did the main task. The p50 and p99 of a decision are over all decisions of all runs."""
 HOW = """\
-Written by `specshield report` from what `make results` runs. All methods share starts, model seeds, draws and
-disturbances, run by run. The main task is done when the model says `end` within 1 m of its target before 600
-steps. Shares have 95 % Clopper-Pearson intervals, means 95 % bootstrap intervals over runs. Extra steps: how
-much later the model ended than unmodified, over the n runs in which both did the main task."""
+Written by `specshield report` from what `make results` runs. All methods share starts, model seeds, draws
+and disturbances, run by run (seed 0). The main task is done when the model says `end` within 1 m of its
+target before 600 steps. KL: how far the answers were from what the model wanted, summed over a run; 0 is
+untouched. Extra steps: how much later the model ended than unmodified, over the n runs in which both did
+the main task. Shares have 95 % Clopper-Pearson intervals, means 95 % bootstrap intervals over runs. First
+the exact world:"""
 CAVEATS = """\
 What these figures are less than they may sound:
 
@@ -87,14 +91,20 @@ What these figures are less than they may sound:
 - **paper** is the paper's decision rule with our DQN, which learned from another reward than the paper's.
 - Maps were drawn and regions placed so that a robot that only seeks its target breaks the rule.
 - A region holds where the robot's **origin** is in it, as in the paper: the body may reach into Forbidden.
-- Here the robot moves as the shield was told. Under noise it is another matter, also for `ours` without a
-  margin and slack, as the next table shows; **@default** is what a session does where nobody says more."""
+- In the table above the robot moves as the shield was told. Where each motion ends off by sigma 1 cm along
+  x and y and by sigma 0.5 degrees (next table), `ours`, which has neither margin nor slack, loses the rule
+  in most runs. **@default** is what a session does where nobody says more."""
 SHORT = """\
-**unmodified**: the model alone. **rcd+**: SafeDec's robust decoding, then the rest of the rule. **simplex**:
-the model's draw where it is feasible, else the plan's. **rule-first**: the plan until the rule is decided,
-then the model. **paper**: the paper's decision rule with our DQN. **ours**: exact feasibility and projection.
-**@0/25**: each deadline aimed at 25 steps early. **lookahead**: ours, and once the rule has cost 1 nat, with
-an eye to what it will cost yet. The page of the cases has all methods, and says exactly what each does."""
+**unmodified**: the model alone. **rcd+**: our reading of SafeDec's robust decoding, then the rest of the
+rule. **simplex**: the model's draw where it is feasible, else the plan's. The plan is the certified way
+to the rule's last step. **rule-first**: the plan until the rule is decided, then the model. **paper**:
+the paper's decision rule with our DQN. **ours**: projection onto the actions after which a way was found
+to keep the whole rule. **@0/25**: each deadline aimed at 25 steps early. **lookahead**: ours, and once
+the rule has cost 1 nat, with an eye to what it will cost yet. The page of the cases has all methods, and
+says exactly what each does."""
+TASKS = """\
+case1-200, case2-200: the task has to be done within 200 steps, in place of 600. case1-two, case2-two: two
+things are to be found, one after the other."""
 NOT_THE_SAME = """\
 The paper's figures are of other models, maps and simulators than these; only the shapes of the rules are the
 same. The cost that the paper reports (99 to 82.5 % of main tasks in case 2) is reproduced only as far as the
@@ -104,11 +114,12 @@ Next-step methods notice a window at its last step only: when the place to visit
 step, no action is left that reaches it in time. HCD keeps a G. What RCD adds to the logits leads straight
 towards a place, also where a wall is between."""
 WHY_SLACK = """\
-Projection lets a model put a visit off to the last step from which it can still be certified, and noise can
-then take that step away: slack gives time back. A margin keeps a distance from what is forbidden, and asks
-for visits that reach further into a region than its edge. Without them, `ours` need not do better than
-`paper`. The slack of 8 steps was chosen by hand. The calibrated margin covers the surprise of one step; it
-promises nothing about the rule as a whole."""
+Projection lets a model put a visit off to the last step from which it can still be certified, and noise
+can then take that step away: slack gives time back. A margin keeps a distance from what is forbidden, and
+asks for visits that reach further into a region than its edge. Without them, `ours` keeps the rule less
+often than `paper` in some of these worlds, and more often in others. The slack of 8 steps was chosen by
+hand. The calibrated margin covers the surprise of one step; it promises nothing about the rule as a
+whole."""
 
 
 def legend(methods: Iterable[str]) -> str:
