@@ -311,15 +311,27 @@ def _follow(carry: Carry | None, poses: Floats) -> tuple[bytes | None, tuple[flo
     """The tail of the witness that the robot followed to x_t, and how far x_t is from where f leads."""
     if carry is None or carry.t != len(poses) - 2:
         return None, None
-    offset = carry.next_poses - poses[-1]
-    turn = np.abs(np.remainder(offset[:, 2] + math.pi, 2.0 * math.pi) - math.pi)
-    move = np.hypot(offset[:, 0], offset[:, 1])
-    gap = move + turn
-    near = np.flatnonzero(gap <= gap.min() + SAME_POSE)  # a blocked move leads where waiting does
-    certified = [m for m in near if carry.witnesses[m] is not None]
-    nearest = int(np.argmin(gap))
-    tail = carry.witnesses[certified[0]] if certified else None
-    return tail or None, (float(move[nearest]), float(turn[nearest]))
+    gap = np.empty(len(carry.next_poses))
+    off = _gaps(carry.next_poses, poses[-1], gap)
+    near = gap.min() + SAME_POSE  # a blocked move leads where waiting does
+    fits = zip(carry.witnesses, gap.tolist(), strict=True)
+    tail = next((witness for witness, far in fits if far <= near and witness is not None), None)
+    return tail or None, off
+
+
+@leaf
+def _gaps(foreseen: Floats, pose: Floats, gap: Floats) -> tuple[float, float]:
+    """Writes how far a pose (3,) is from each foreseen one [M, 3], metres and radians added up; [m], [rad] of
+    the nearest.
+    """
+    nearest, off = math.inf, (0.0, 0.0)
+    for m in range(len(foreseen)):
+        move = math.hypot(foreseen[m, 0] - pose[0], foreseen[m, 1] - pose[1])
+        turn = abs((foreseen[m, 2] - pose[2] + math.pi) % (2.0 * math.pi) - math.pi)
+        gap[m] = move + turn
+        if gap[m] < nearest:
+            nearest, off = gap[m], (move, turn)
+    return off
 
 
 def _draw(distribution: Floats, seed: int, t: int) -> int:

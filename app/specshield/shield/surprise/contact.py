@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
+from specshield.compiled import kernel
 from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
@@ -49,15 +50,15 @@ def contact_of(
     foreseen [M, 3]: where f leads from `before`. near: what noise explains.
     """
     drawn = followed.drawn
-    if drawn >= 0 and _near(foreseen[drawn : drawn + 1], after, near)[0]:
+    if drawn >= 0 and _is_near(foreseen[drawn : drawn + 1], after, near):
         return -1, replace(followed, halted=-1, met=0)
-    if _near(before[None], after, near)[0]:  # it stands where it stood
+    if _is_near(before[None], after, near):  # it stands where it stood
         if drawn < 0 or not followed.follows:
             return -1, followed
         if followed.halted == drawn or followed.met:  # what stopped it a moment ago does so again
             return drawn, replace(followed, halted=-1, met=followed.met + 1)
         return -1, replace(followed, halted=drawn)
-    if _near(foreseen, after, near).any():
+    if _is_near(foreseen, after, near):
         return -1, replace(followed, follows=False, halted=-1, met=0)
     short = _short(body, before, after, foreseen, near)
     if not short.any():
@@ -66,11 +67,14 @@ def contact_of(
     return motion, replace(followed, halted=-1, met=1)
 
 
-def _near(poses: Floats, pose: Floats, near: Near) -> Bools:
-    """Which of poses [n, 3] are the pose (3,), but for noise."""
-    turn = np.abs(np.remainder(poses[:, 2] - pose[2] + math.pi, 2.0 * math.pi) - math.pi)
-    found: Bools = (np.hypot(*(poses[:, :2] - pose[:2]).T) <= near[0]) & (turn <= near[1])
-    return found
+@kernel
+def _is_near(poses: Floats, pose: Floats, near: Near) -> bool:
+    """Whether one of poses [n, 3] is the pose (3,), but for noise."""
+    for i in range(len(poses)):
+        far = math.hypot(poses[i, 0] - pose[0], poses[i, 1] - pose[1])
+        if far <= near[0] and abs(wrap(poses[i, 2] - pose[2])) <= near[1]:
+            return True
+    return False
 
 
 def _short(body: Body, before: Floats, after: Floats, foreseen: Floats, near: Near) -> Bools:
