@@ -18,6 +18,7 @@ from specshield.errors import InfeasibleStart, PoseError
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot.dynamics import in_collision, simulate
+from specshield.service.warmup import PARTS, warm_up
 from specshield.shield.decision import Carry, Config
 from specshield.shield.episode import Shield, decide, make_shield, start
 from specshield.shield.uncertainty import Uncertainty
@@ -79,7 +80,9 @@ class Outcome:
 
 @lru_cache(maxsize=4)
 def prepared(case: str, collider: bool) -> tuple[Case, Shield]:
-    """A case, and the shield as it is told, with the paper's settings."""
+    """A case, and the shield as it is told, with the paper's settings; kernels are loaded, as in a server."""
+    for part in PARTS:
+        warm_up(part)
     found = load_case(case) if case in case_names() else load_house_case(case)
     task = believed("collider" if collider else "none", found.task)
     return found, make_shield([synthesise(task)])
