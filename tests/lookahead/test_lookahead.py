@@ -289,6 +289,8 @@ def test_it_is_pure_and_its_memory_travels_as_bytes():
     again = ahead.step(memory, history[:12], {}, log_prior, ALL)
     once, added_once = ahead.advance(belief, history[:12], {}, log_prior, ALL)
     assert again[0] == once.to_bytes()
+    older = ahead.step(memory[:-8], history[:12], {}, log_prior, ALL)  # written by another version
+    assert older[0] == ahead.step(ahead.begin(), history[:12], {}, log_prior, ALL)[0]
     np.testing.assert_array_equal(again[1], added_once)
     assert np.all(added[TASK.robot.terminal] == 0.0)
     assert np.all(added <= 0.0)

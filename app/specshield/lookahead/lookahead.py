@@ -82,6 +82,8 @@ class LookAhead:
         The log-weight of an action is -trust * D of the pose it leads to, D taken from its least value: at
         most 0, and 0 for a terminal action, where nothing is known, and until the rule has cost FORCED.
         """
+        if len(memory) != len(begun := self.begin()):  # it was written by another version
+            memory = begun
         belief = Belief.from_bytes(memory, len(self.task.robot.motions))
         belief, weights = self.advance(belief, history, signals, log_prior, feasible)
         return belief.to_bytes(), weights
