@@ -92,7 +92,8 @@ def teach(
         )
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses):
             motion, followed = -1, replace(followed, met=0)
-        for pose in _between(poses):
+        x, y, _ = 0.5 * (poses[-2] + poses[-1])  # half way: a motion goes straight on before it turns
+        for pose in (np.array([x, y, poses[-2, 2]]), poses[-1]):
             if overlap(body, *pose) > UNDER:
                 known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)
         if motion >= 0:
@@ -110,12 +111,6 @@ def teach(
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
     return Taught(own, followed, motion >= 0), said
-
-
-def _between(poses: Floats) -> Floats:
-    """The last pose, and the place half way to it: a motion goes straight on before it turns."""
-    x, y, _ = 0.5 * (poses[-2] + poses[-1])
-    return np.array([[x, y, poses[-2, 2]], poses[-1]])
 
 
 def wary(config: Config, care: Care) -> Care:
@@ -183,7 +178,7 @@ def handed_on(shield: Shield, taught: Taught, drawn: int) -> bytes | None:
     """
     if not shield.config.learn_map and not taught.map.revision:
         return None
-    return replace(taught, followed=replace(taught.followed, drawn=drawn)).to_bytes()
+    return Taught(taught.map, replace(taught.followed, drawn=drawn)).to_bytes()
 
 
 _bodies: OrderedDict[tuple[str, bytes], Body] = OrderedDict()

@@ -63,7 +63,7 @@ class LearnedMap:
     def from_bytes(value: bytes) -> LearnedMap:
         """The inverse of `to_bytes`."""
         if not value:
-            return LearnedMap()
+            return NONE
         content = zlib.decompress(value)
         table = np.frombuffer(content, "<i4", offset=8).reshape(4, -1).astype(np.int64)
         cell, occupied, by, step = np.cumsum(table[0]), table[1] != 0, table[2], table[3]
@@ -71,6 +71,9 @@ class LearnedMap:
 
     def __len__(self) -> int:
         return len(self.cell)
+
+
+NONE = LearnedMap()
 
 
 def cells_of(grid: OccupancyGrid, points: Floats) -> tuple[Ints, int]:
