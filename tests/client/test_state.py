@@ -221,11 +221,21 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
 @pytest.mark.parametrize(
     ("why", "line"),
     [
-        ([-0.3, 4], "F[50,100] Region2 could no longer be kept: it would come 4 steps too late"),
-        ([-0.3, 1], "F[50,100] Region2 could no longer be kept: it would come 1 step too late"),
-        ([-0.3, None], "F[50,100] Region2 could no longer be kept: it would fail by 0.3"),
-        ([None, None], "F[50,100] Region2 could no longer be kept"),
-        ([0.05, 2], "F[50,100] Region2 could still be kept, but not with the margin and the slack asked for"),
+        (
+            [-0.3, 4],
+            "no way was found that still keeps F[50,100] Region2: the best one comes 4 steps too late",
+        ),
+        (
+            [-0.3, 1],
+            "no way was found that still keeps F[50,100] Region2: the best one comes 1 step too late",
+        ),
+        ([-0.3, None], "no way was found that still keeps F[50,100] Region2: the best one misses it by 0.3"),
+        ([None, None], "no way was found that still keeps F[50,100] Region2"),
+        (
+            [0.05, None],
+            "the rule could still be kept, but no policy proposed the way, or it leads where the robot has "
+            "run into something",
+        ),
     ],
 )
 def test_a_decision_says_why_an_action_is_forbidden(why, line):
@@ -235,6 +245,26 @@ def test_a_decision_says_why_an_action_is_forbidden(why, line):
     assert decision.why("m") == "m is not forbidden"
     with pytest.raises(errors.InputError, match="no such action"):
         decision.why("x")
+
+
+@pytest.mark.parametrize(
+    ("margin", "slack", "late", "line"),
+    [
+        (0.04, 20, 2, "but 2 steps later than the session allows: it keeps 20 steps in hand"),
+        (0.04, 0, None, "but with less to spare than the session asks for (0.04 m, 0 steps)"),
+    ],
+)
+def test_what_the_session_keeps_in_hand_is_told_apart_from_the_rule(margin, slack, late, line):
+    told = {"conjunct": "F[50,100] Region2", "robustness": 0.3, "late_by": late}
+    answer = decided(0, M, explanations=[None, told, None], margin=margin, slack=slack)
+    decision, _ = step(session(), 0, answer)
+    assert decision.why("b") == f"b is forbidden: F[50,100] Region2 could still be kept, {line}"
+
+
+def test_a_signal_that_may_rise_is_told_as_one_that_may():
+    told = {"conjunct": "G[0,60] (call > 0.5 -> F[0,12] Dock)", "robustness": -0.3, "late_by": 1}
+    decision, _ = step(session(), 0, decided(0, M, explanations=[None, told, None], any_signal=True))
+    assert decision.why("b").endswith("comes 1 step too late, should its signals call for it")
 
 
 def test_a_step_that_was_not_asked_to_explain_says_so():

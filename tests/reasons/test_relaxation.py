@@ -65,9 +65,7 @@ def test_a_refusal_says_which_of_both_it_is():
     history = np.array([cells_of([("F", 0, 9, "A")]).pose(0, 0, 0)])
     sealed = refusal(shield([("F", 0, 1, "A")]), history, {})
     assert sealed.proved
-    assert sealed.message.startswith(
-        "no future from here satisfies the formula: whatever the robot does, it breaks"
-    )
+    assert sealed.message.startswith("no way from here keeps the rule: whatever the robot does, it breaks")
     (told,) = sealed.details["conjuncts"]
     assert (told["formula"], told["feasible_alone"], told["late_by"]) == ("F[0,1] A", False, 1)
     assert np.isclose(told["robustness"], -0.1)  # the middle of the next cell of 0.2 m

@@ -122,12 +122,37 @@ class Explanation:
     late_by: int | None
 
     def __str__(self) -> str:
-        if self.robustness is not None and self.robustness > 0.0:
-            return f"{self.conjunct} could still be kept, but not with the margin and the slack asked for"
-        told = f"{self.conjunct} could no longer be kept"
+        if self.is_kept:
+            return f"{self.conjunct} could still be kept, but with less to spare than the session asks for"
+        told = f"no way was found that still keeps {self.conjunct}"
         if self.late_by is not None:
-            return f"{told}: it would come {self.late_by} step{'s' if self.late_by != 1 else ''} too late"
-        return told if self.robustness is None else f"{told}: it would fail by {-self.robustness:.3g}"
+            return f"{told}: the best one comes {_steps(self.late_by)} too late"
+        return (
+            told if self.robustness is None else f"{told}: the best one misses it by {-self.robustness:.3g}"
+        )
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the best future keeps it, though not as the session asks for."""
+        return self.robustness is not None and self.robustness > 0.0
+
+    def beside(self, margin: float, slack: int) -> str:
+        """The same, where J asked for a margin [m] and slack [steps]."""
+        if not self.is_kept:
+            return str(self)
+        if slack and self.late_by is not None:
+            later = f"{_steps(self.late_by)} later than the session allows"
+            return f"{self.conjunct} could still be kept, but {later}: it keeps {_steps(slack)} in hand"
+        if margin or slack:
+            return f"{self} ({margin:.2g} m, {_steps(slack)})"
+        return (
+            "the rule could still be kept, but no policy proposed the way, or it leads where the robot has "
+            "run into something"
+        )
+
+
+def _steps(count: int) -> str:
+    return f"{count} step{'s' if count != 1 else ''}"
 
 
 @dataclass(frozen=True)
@@ -171,8 +196,8 @@ class Decision:
 
     def why(self, action: int | str) -> str:
         """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden:
-        F[50,100] Region2 could no longer be kept: it would come 4 steps too late". The step has to have
-        asked: explain=True.
+        no way was found that still keeps F[50,100] Region2: the best one comes 4 steps too late". The step
+        has to have asked: explain=True.
 
         Raises InputError for an action that there is not.
         """
@@ -188,7 +213,11 @@ class Decision:
         if self.explanations is None:
             return f"{name}: the step was not asked to explain (explain=True)"
         told = self.explanations[i]
-        return f"{name} is not forbidden" if told is None else f"{name} is forbidden: {told}"
+        if told is None:
+            return f"{name} is not forbidden"
+        why = told.beside(self.margin, self.slack)
+        called = ", should its signals call for it" if self.any_signal and "->" in told.conjunct else ""
+        return f"{name} is forbidden: {why}{called}"
 
 
 @dataclass(frozen=True)

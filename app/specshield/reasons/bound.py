@@ -133,11 +133,18 @@ class _Ahead:
             return None
         for bit, goal in enumerate(self.goals):
             need, least = goal.need, float(np.where(met >> bit & 1 == 0, steps[:, bit], 0.0).min())
+            kept = " and ".join(
+                str(guard.formula)
+                for guard in self.guards
+                if guard.formula is not need.formula and guard.first <= step + 1 and guard.end >= need.last
+            )
+            beside = f" while {kept} is kept" if kept else ""
             if least == math.inf:
-                return f"no way leads to where {need.formula} can be met"
+                return f"no way leads to where {need.formula} can be met{beside}"
             if step + least > need.last:
                 sooner = f"at least {step + int(least) - self.known.now} steps"
-                return f"{need.formula} is out of reach: {sooner}, and {need.last - self.known.now} are left"
+                left = f"{need.last - self.known.now} are left"
+                return f"{need.formula} is out of reach{beside}: {sooner}, and {left}"
         return "not all of these can be reached in time, in whatever order: " + ", ".join(
             str(goal.need.formula) for goal in self.goals
         )

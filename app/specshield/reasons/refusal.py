@@ -93,16 +93,16 @@ def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> R
     relaxed = relaxations(shield, history, signals)
     if relaxed.kept:  # what was simulated is right, whatever a bound says
         return Refusal(
-            f"the policies found no future from here that satisfies the formula, though a search found one "
-            f"among {relaxed.tried}: policies of another method, or with finer options, may find it too",
+            f"the policies found no way from here that keeps the rule, though a search found one among "
+            f"{relaxed.tried} that were tried: policies of another method, or finer options, may find it too",
             False,
             relaxed.conjuncts,
         )
     if bound is not None:
-        return Refusal(f"no future from here satisfies the formula: {bound}", True, relaxed.conjuncts)
+        return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
     message = (
-        f"no future from here that satisfies the formula was found among {relaxed.tried} of the policies "
-        f"and of a search; {_wrong(relaxed.conjuncts)}"
+        f"of the {relaxed.tried} ways that the policies and a search tried from here, none keeps the rule; "
+        f"{_wrong(relaxed.conjuncts)}"
     )
     return Refusal(message, False, relaxed.conjuncts)
 
@@ -111,18 +111,20 @@ def _wrong(conjuncts: Sequence[Conjunct]) -> str:
     """What the conjuncts say of it, in words."""
     failing = [each for each in conjuncts if not each.feasible_alone]
     if failing:
-        return "; ".join(map(_fails, failing))
+        alone = " even alone" if len(conjuncts) > 1 else ""
+        return "; ".join(_fails(each, alone) for each in failing)
     late = [each for each in conjuncts if each.late_by is not None]
     if late:
         return f"each part can be kept alone, and all can if {' or '.join(map(_ends_later, late))}"
-    return "each part can be kept alone"
+    return "each part can be kept alone, but no way was found to keep all of them"
 
 
-def _fails(conjunct: Conjunct) -> str:
-    told = f"no way was found to keep {_shown(conjunct)} even alone"
+def _fails(conjunct: Conjunct, alone: str) -> str:
+    told = f"no way was found to keep {_shown(conjunct)}{alone}"
     late = conjunct.late_by
     if late is None:
-        return f"{told}: its robustness is {conjunct.robustness:.3g} at most"
+        nearest = f": the nearest that was found misses it by {-conjunct.robustness:.3g}"
+        return f"{told}{nearest if math.isfinite(conjunct.robustness) else ''}"
     return f"{told}: the best one comes {late} step{'s' if late != 1 else ''} too late"
 
 

@@ -151,7 +151,7 @@ def _best(
         ahead = np.where(run[:, k] > 0, -run[:, k], ahead)  # what is being met was begun in time
         is_open = met >> k & 1 == 0
         hopeless |= is_open & (step + ahead > goal.due)
-        spare = np.where(is_open, np.minimum(spare, goal.need.last - step - ahead), spare)
+        spare = np.where(is_open, np.minimum(spare, goal.due - step - ahead), spare)
     order = np.argsort(-spare, kind="stable")
     order = order[~hopeless[order]]
     chosen = []

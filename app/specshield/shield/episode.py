@@ -66,9 +66,9 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
     if not best > SATISFIED_ABOVE:
         found = f"the best robustness found is {best:.3f}" if len(rho) else "; ".join(warnings)
         raise InfeasibleStart(
-            f"no future from here was found that satisfies the formula: {found}",
-            path="initial_pose", got=list(pose),
-            expected="a pose from which some action, followed by a policy, satisfies it; or allow_infeasible",
+            f"no way from here was found that keeps the rule: {found}",
+            path="initial_pose", got=[round(v, 3) for v in pose],
+            expected="a pose from which the rule can be kept; or allow_infeasible",
         )  # fmt: skip
 
 

@@ -79,7 +79,7 @@ def _explained(
     best: Explanation | None = None
     nearest, rank = Explanation(str(parts[0].conjunct), -math.inf, None), (2, math.inf)
     for earlier, rows in _futures(shield, prefix, judged, motion):
-        if best is not None and best.late_by is not None and best.late_by <= earlier:
+        if rank[0] == 0 and rank[1] <= earlier:
             break  # what comes now is as late or later
         samples = samples_of(shield, prefix.poses, prefix.foreseen, rows)
         rho = np.array([values_of(part.asked, samples) for part in parts])  # [parts, rows]
@@ -90,9 +90,14 @@ def _explained(
                 if robustness > nearest.robustness:
                     nearest = Explanation(str(parts[i].conjunct), robustness, None)
                 continue
-            late = late_by(parts[i].asked, {name: values[n] for name, values in samples.items()}, above)
+            row = {name: values[n] for name, values in samples.items()}
+            late = late_by(parts[i].asked, row, above)
             order = (1, -robustness) if late is None else (0, late)
             if order < rank:
+                if (
+                    robustness <= SATISFIED_ABOVE
+                ):  # of the rule's own window, not of the one cut short by slack
+                    late = late_by(parts[i].conjunct, row, SATISFIED_ABOVE)
                 best, rank = Explanation(str(parts[i].conjunct), robustness, late), order
     return best or nearest
 

@@ -30,5 +30,5 @@ def switch(
         why = f"no future was found that satisfies it: {best}"
     raise InfeasibleSwitch(
         f"the new rule cannot be kept from here: {why}", path="policy_id",
-        expected="a rule that some action from x_t, followed by a policy, satisfies; or clock 'restart'",
+        expected="a rule that can be kept from x_t; or clock 'restart'",
     )  # fmt: skip

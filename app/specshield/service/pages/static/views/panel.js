@@ -30,10 +30,12 @@ export function prior(logits) {
 export function whyNot(decision, action) {
   const value = decision.robustness[action];
   const told = decision.explanations?.[action];
+  if (told && told.robustness > 0) return `${told.conjunct} could still be kept, but not with ${inHand(decision)} in hand`;
   if (told) {
-    const late = told.late_by ? `${told.late_by} steps too late` : null;
-    const misses = told.robustness === null ? null : `misses by ${metres(Math.abs(told.robustness))}`;
-    return `${told.conjunct} could not be kept: ${[late, misses].filter(Boolean).join(", ") || "no way was found"}`;
+    const late = told.late_by ? `the best one comes ${told.late_by} steps too late` : null;
+    const misses = told.robustness === null ? null : `it misses by ${Math.abs(told.robustness).toFixed(2)}`;
+    const found = [late, misses].filter(Boolean).join(", ");
+    return `no way was found that still keeps ${told.conjunct}${found && `: ${found}`}`;
   }
   if (value === null || value === undefined) return "was not looked at";
   if (value > 0) return `keeps the rule by ${metres(value)}, but not with ${inHand(decision)} in hand`;
