@@ -5,7 +5,7 @@ hcd, rcd     SafeDec's next-step decoding (decoding.py)
 simplex      the model's draw where it is feasible, else the certified continuation takes over
 paper        the paper's decision rule with our DQN alone, rolled out at every step; hard projection
 ours         reachability and the learned pi_phi, witnesses handed on from step to step; hard projection
-lookahead    ours, feasible actions weighted by what the rule will still cost the model from there
+lookahead    ours, and once the rule has cost 1 nat, feasible actions weighted by what it will still cost
 """
 
 from __future__ import annotations

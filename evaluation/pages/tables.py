@@ -91,8 +91,8 @@ def better_in_short(found: Found) -> Iterator[str]:
                 where.setdefault((method, name), []).append(title(results))
     yield "## What does better than ours"
     yield (
-        "Of the first table's cells, and of all methods: those that keep the rule as often and whose "
-        "95 % interval of the difference in KL or steps lies below 0, or that do more main tasks "
+        "Of all methods, in the cases and models of the first table, those that keep the rule as often and "
+        "whose 95 % interval of the difference in KL or steps lies below 0, or that do more main tasks "
         "(p < 0.05). Of so many comparisons, a few are so by chance. The figures are on the page of the "
         "cases; noise, other models and other tasks are on theirs."
     )

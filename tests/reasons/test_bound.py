@@ -45,6 +45,11 @@ def circle(x, radius=0.3):
     [
         ("F[0,15] Far", False, "F[0,15] Far is out of reach: at least 18 steps, and 15 are left"),
         ("F[0,400] Far", True, "no way leads to where F[0,400] Far can be met"),
+        (
+            "F[0,400] Far and G[0,400] not Strip",
+            False,
+            "no way leads to where F[0,400] Far can be met while G[0,400] not Strip is kept",
+        ),
         ("F[2,9] Near and G[2,9] not Near", False, "asks for 'Near and not Near', which holds nowhere"),
         ("F[0,9] (Near and Far)", False, "asks for 'Near and Far', which holds nowhere"),
         ("F[0,60] x > 11", False, "asks for 'x > 11', which holds nowhere"),
@@ -60,7 +65,8 @@ def circle(x, radius=0.3):
 )
 def test_a_proof_says_what_rules_the_formula_out(formula, wall, said):
     signals = {"call": 0.0} if "call" in formula else {}
-    task = hall(formula, {"Near": circle(2.0), "Far": circle(6.0)}, wall, signals=signals)
+    strip = {"type": "rectangle", "min": [4.0, -1.0], "max": [4.8, 3.0]}
+    task = hall(formula, {"Near": circle(2.0), "Far": circle(6.0), "Strip": strip}, wall, signals=signals)
     why = proof(task, make_body(task.robot, task.grid), np.array([[2.0, 1.0, 0.0]]), {})
     assert (why is None) is (said is None), why
     assert said is None or said in why

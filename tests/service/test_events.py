@@ -12,16 +12,25 @@ from typing import Any
 import httpx
 
 from tests.service.world import ahead
-from tests.serving import serving
+from tests.serving import serving, wait_for
 
 END = "end"
 
 
 def read(
-    url: str, session: str, after: int | None = None, most: int = 10_000, last: int | None = None, **more: Any
+    url: str,
+    session: str,
+    after: int | None = None,
+    most: int = 10_000,
+    last: int | None = None,
+    found: list[Any] | None = None,
+    **more: Any,
 ) -> list[Any]:
-    """(id, data as text) of each event until the stream ends; `END` as the id of the last one."""
-    found: list[Any] = []
+    """(id, data as text) of each event until the stream ends; `END` as the id of the last one.
+
+    found: a list that is filled as they come.
+    """
+    found = [] if found is None else found
     with contextlib.suppress(httpx.RemoteProtocolError):  # a server that was stopped
         _read(found, f"{url}/v1/sessions/{session}/events", after, most, last, **more)
     return found
@@ -60,7 +69,7 @@ class Reader(threading.Thread):
         self.start()
 
     def run(self) -> None:
-        self.found = read(*self._args, **self._options)
+        read(*self._args, **self._options, found=self.found)
 
 
 def test_every_decision_is_told_once_and_as_it_was_answered(server, client, begin, step):
@@ -109,6 +118,7 @@ def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_i
             local.join()
             assert [t for t, _ in local.found] == [0, 1, 2]
             assert [t for t, _ in read(other.url, session, after=0, most=2)] == [1, 2]
+            wait_for(lambda: len(reader.found) == 3, 60.0)  # a server that stops tells nothing more
         reader.join(30.0)
         assert not reader.is_alive()
         assert [t for t, _ in reader.found] == [0, 1, 2]

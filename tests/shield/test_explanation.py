@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
 from tests.oracles.cells import MOTIONS, Cells, Exhaustive
 
@@ -31,10 +32,10 @@ def after(parts, history):
     return cells.feasible(history)
 
 
-def explained(parts, history):
+def explained(parts, history, slack=0):
     cells, told = rule(parts)
-    decision = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=True)
-    return decision, told
+    shield = make_shield([Exhaustive(cells)], Config(slack=slack))
+    return decide(shield, history, EVEN, explain=True), told
 
 
 def test_what_is_late_would_be_kept_with_a_window_that_ends_so_much_later_and_with_none_that_ends_sooner():
@@ -69,6 +70,29 @@ def test_what_is_late_would_be_kept_with_a_window_that_ends_so_much_later_and_wi
             assert after(others + enough, history)[motion]
             assert not after([*others, (op, start, end + why.late_by - 1, place)], history)[motion]
     assert seen["late"] > 20, seen
+
+
+def test_how_late_a_way_comes_is_counted_from_the_rules_own_window_also_with_slack():
+    late = kept = 0
+    cells, _ = rule([("F", 0, 5, "A")])
+    for i, j, heading in np.ndindex(3, 3, 4):
+        for end in (2, 3, 4):
+            history = [cells.pose(i, j, heading)]
+            decision, _ = explained([("F", 0, end, "A")], history, slack=1)
+            if decision.spec_status != "pending":
+                continue
+            exact = after([("F", 0, end, "A")], history)
+            for motion, why in enumerate(decision.explanations[:MOTIONS]):
+                if why is None or why.late_by is None:
+                    continue
+                assert (why.robustness > 0.0) == exact[motion]
+                if exact[motion]:  # it is the slack that is missing
+                    kept += 1
+                    continue
+                late += 1
+                assert after([("F", 0, end + why.late_by, "A")], history)[motion]
+                assert not after([("F", 0, end + why.late_by - 1, "A")], history)[motion]
+    assert late > 10, (late, kept)
 
 
 def test_an_action_that_breaks_a_keep_out_is_told_so():

@@ -128,7 +128,9 @@ class Explanation:
         if self.late_by is not None:
             return f"{told}: the best one comes {_steps(self.late_by)} too late"
         return (
-            told if self.robustness is None else f"{told}: the best one misses it by {-self.robustness:.3g}"
+            told
+            if self.robustness is None
+            else f"{told}: the best one misses it by {abs(self.robustness):.3g}"
         )
 
     @property

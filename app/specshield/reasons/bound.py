@@ -136,7 +136,7 @@ class _Ahead:
             kept = " and ".join(
                 str(guard.formula)
                 for guard in self.guards
-                if guard.formula is not need.formula and guard.first <= step + 1 and guard.end >= need.last
+                if guard.formula is not need.formula and guard.first <= step
             )
             beside = f" while {kept} is kept" if kept else ""
             if least == math.inf:

@@ -79,7 +79,7 @@ def switch(
         taught, _ = teach(shield, carry, history, None, None)
         told = refusal(on_map(shield, taught.map), history, signals or {})
         raise InfeasibleSwitch(
-            f"the new rule cannot be kept from here: {told.message}",
+            f"the new rule was not taken: {told.message}",
             path=error.path, got=error.got, expected=error.expected, **told.details,
         ) from None  # fmt: skip
 
@@ -123,7 +123,7 @@ def _fails(conjunct: Conjunct, alone: str) -> str:
     told = f"no way was found to keep {_shown(conjunct)}{alone}"
     late = conjunct.late_by
     if late is None:
-        nearest = f": the nearest that was found misses it by {-conjunct.robustness:.3g}"
+        nearest = f": the nearest that was found misses it by {abs(conjunct.robustness):.3g}"
         return f"{told}{nearest if math.isfinite(conjunct.robustness) else ''}"
     return f"{told}: the best one comes {late} step{'s' if late != 1 else ''} too late"
 

@@ -94,9 +94,8 @@ def _explained(
             late = late_by(parts[i].asked, row, above)
             order = (1, -robustness) if late is None else (0, late)
             if order < rank:
-                if (
-                    robustness <= SATISFIED_ABOVE
-                ):  # of the rule's own window, not of the one cut short by slack
+                # Of the rule's own window, not of the one that slack cuts short.
+                if robustness <= SATISFIED_ABOVE:
                     late = late_by(parts[i].conjunct, row, SATISFIED_ABOVE)
                 best, rank = Explanation(str(parts[i].conjunct), robustness, late), order
     return best or nearest

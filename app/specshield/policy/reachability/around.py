@@ -35,7 +35,7 @@ from specshield.robot.dynamics import around, displacement, motion_count, step, 
 from specshield.rule.progress import ALWAYS, PENDING, advance
 
 # Chosen by hand; python -m evaluation worlds says what comes of them.
-POSES = 8_192  # that one search may come to, in some 12 ms: a power of two
+POSES = 8_192  # that one search may come to, in some 12 ms; a power of two, for the hash table
 FEWER = 2_048  # the same, where one decision tries several maps
 ONWARD = 0.1  # [steps] of slack that a step farther on its way is worth
 PLACE_GRAIN = 20.0  # [1/m] places that round to the same multiples of its inverse count once
@@ -81,7 +81,7 @@ def go_around(
         np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most),
         Heap(np.empty(most, np.int32), np.empty(most)),
     )  # fmt: skip
-    seen = np.empty(4 * POSES, np.int32)
+    seen = np.empty(4 * most, np.int32)
     way, led = np.empty(steps, np.int64), np.empty((steps, 3))
     copy_progress(status, run, scratch.status, scratch.run)
     n, outcome = 0, FAILED
@@ -193,13 +193,15 @@ def _reach(
             if is_broken(scratch.status):
                 continue
             _put(tree, count, x, y, theta, scratch, s + 1, here, m)
-            if not _is_new(tree, count, seen):
+            slot = _slot_of(tree, count, seen)
+            if slot < 0:
                 continue
             ahead = slack_at(
                 body, rules, tables, x, y, theta, t + s + 1, scratch.status, scratch.run, scratch.corners,
                 UNKNOWN,
             )  # fmt: skip
             if ahead < BAND:
+                seen[slot] = -1  # the end of its chain; its row goes to the next pose
                 continue
             tree.rank[count] = ahead + ONWARD * (s + 1)
             size = push(tree.heap, size, count, -tree.rank[count])
@@ -235,11 +237,13 @@ def _put(
 
 
 @leaf
-def _is_new(tree: Tree, i: int, seen: Int32s) -> bool:
-    """Whether no earlier row has the place, heading and progress of row `i`, which is then remembered."""
+def _slot_of(tree: Tree, i: int, seen: Int32s) -> int:
+    """Where in the hash table row `i` is remembered from now on; -1 where an earlier row has its place,
+    heading and progress. At most a quarter of the table is taken, since each of `most` rows takes one slot.
+    """
     a, b, c = _rounded(tree.pose, i)
     key = a * 73856093 ^ b * 19349663 ^ c * 83492791
-    slot = (key ^ key >> 15) & (seen.shape[0] - 1)
+    slot: int = (key ^ key >> 15) & (seen.shape[0] - 1)
     while seen[slot] >= 0:
         other = seen[slot]
         d, e, f = _rounded(tree.pose, other)
@@ -247,10 +251,10 @@ def _is_new(tree: Tree, i: int, seen: Int32s) -> bool:
         for k in range(tree.status.shape[1]):
             same = same and tree.status[i, k] == tree.status[other, k]
         if same and tree.step[other] <= tree.step[i]:
-            return False
+            return -1
         slot = (slot + 1) & (seen.shape[0] - 1)
     seen[slot] = i
-    return True
+    return slot
 
 
 @leaf

@@ -52,7 +52,8 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
     action: int | None = None
 
     def unpacked(self) -> Carry:
-        poses = np.frombuffer(self.next_poses, "<f8").reshape(-1, 3)
+        # Writable: kernels were compiled for that.
+        poses = np.frombuffer(self.next_poses, "<f8").reshape(-1, 3).copy()
         return Carry(
             self.t,
             poses,

@@ -65,9 +65,9 @@ class Pace:
     """How long decisions with some policies take.
 
     They are made on the event loop, since handing one to a thread and back costs about as much as most of
-    them take. The first few are made in a thread. On the event loop only the clock is asked, until two close
-    together were longer than SHORT. The clock alone does not tell a long decision from a busy machine, so the
-    processor's time of the few that follow is measured, where they are.
+    them take. The first few are made in threads, the others on the event loop, by the clock alone. Where two
+    close together took longer than SHORT, that may be the decisions or a busy machine: so for the next few,
+    on the event loop too, the processor's time is measured.
     After one that computed longer than SHORT the next WATCHED are made in threads; after several of LONG, all
     of them in another process.
     """

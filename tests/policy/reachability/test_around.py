@@ -1,0 +1,52 @@
+"""The search for a way around: what it has come to is told from what is new, however much is turned away."""
+
+import numpy as np
+
+from specshield.policy.heap import Heap
+from specshield.policy.reachability.around import FEWER, POSES, Tree, _slot_of
+from specshield.policy.reachability.policy import synthesise
+from specshield.robot.dynamics import make_body
+from tests.policy.rooms import flat
+
+
+def empty(rows):
+    ints = (np.zeros(rows, np.int32) for _ in range(3))
+    heap = Heap(np.empty(rows, np.int32), np.empty(rows))
+    return Tree(
+        np.zeros((rows, 3)),
+        np.zeros((rows, 1), np.int8),
+        np.zeros((rows, 1), np.int64),
+        *ints,
+        np.zeros(rows),
+        heap,
+    )
+
+
+def test_poses_that_are_turned_away_take_no_room_and_hide_nothing():
+    random, rows = np.random.default_rng(0), 512
+    tree, seen, count = empty(rows + 1), np.full(4 * rows, -1, np.int32), 0
+    kept = []
+    for _ in range(20 * rows):  # ten times what the table holds
+        pose = random.uniform(0.0, 20.0, 3)
+        tree.pose[count] = pose
+        slot = _slot_of(tree, count, seen)
+        if slot < 0:
+            continue
+        assert seen[slot] == count
+        if random.random() < 0.9 or count == rows:
+            seen[slot] = -1
+        else:
+            kept.append(pose)
+            count += 1
+    assert count > rows / 2
+    assert (seen >= 0).sum() == count
+    for pose in kept:  # none of those that were kept is new
+        tree.pose[count] = pose
+        assert _slot_of(tree, count, seen) < 0
+
+
+def test_one_of_several_maps_is_searched_less():
+    task = flat("F[0,30] West")
+    policy, body = synthesise(task), make_body(task.robot, task.grid)
+    assert policy.on_body(body).most == POSES
+    assert policy.on_body(body, True).most == FEWER < POSES
