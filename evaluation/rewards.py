@@ -202,7 +202,7 @@ def _shipped() -> Iterator[str]:
             f"- The network shipped for {name} (`{options['reward']}`, {options['updates']:,} updates, "
             f"seed {card['seed']}): alone from {100 * metrics['satisfied']:.1f} % of {metrics['starts']:,} "
             f"starts, a session can open at {100 * metrics['feasible_start']:.1f} %. It was trained by "
-            "earlier code: the same settings and seed do not lead to the same network today."
+            "earlier code: the same settings and seed need not lead to the same network today."
         )
 
 

@@ -147,15 +147,18 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
 
 @pytest.mark.skipif(not HOUSES.exists(), reason="the folder of real houses is not here")
 def test_a_real_house(own):
-    """A ProcTHOR house with its rooms as regions: the rule is kept to its end."""
+    """A ProcTHOR house with its rooms and a place that is drawn: it is seen why the robot may not go straight
+    on at first; pushed, and with an obstacle, it keeps the rule to its end.
+    """
     with browsing() as (page, complaints):
         page.goto(f"{own.url}/#/maps")
         page.get_by_label("Name").fill("real-house")
         page.locator("#files").set_input_files([HOUSES / "house_0.json", HOUSES / "asset-sizes.json"])
         page.get_by_role("heading", name="real-house").wait_for()
         page.locator(".walls image").wait_for(state="attached")
+        draw(page, Floor(page), "Rectangle", (9.9, 7.0), (10.3, 7.5), "Wet")
         rule = page.get_by_role("textbox", name="Rule")
-        rule.fill("F[0,80] LivingRoom and G[0,100] not Bathroom")
+        rule.fill("F[0,80] LivingRoom and G[0,100] not (Bathroom or touches(Wet))")
         page.get_by_text("steps 0 to 100").first.wait_for()
         page.get_by_label("Name", exact=True).fill("living-room")
         page.get_by_role("button", name="Make it").click()
@@ -164,8 +167,20 @@ def test_a_real_house(own):
         page.locator(".walls image").wait_for(state="attached")
         Floor(page).click(9.75, 7.25)  # in the kitchen, where the house has its agent
         page.get_by_role("heading", name="Step 0").wait_for()
+        forbidden = page.locator("tr", has=page.locator(".cannot"), has_text="moves 0.20 m").first
+        assert (
+            "no way was found that still keeps G[0,100] not (Bathroom or touches(Wet))"
+            in forbidden.inner_text()
+        )
+        look(page, "real-house-forbidden")
+        page.get_by_role("button", name="Push the robot").click()
+        page.get_by_text("The robot was pushed").wait_for()
+        page.get_by_role("button", name="Drop an obstacle").click()
+        Floor(page).click(9.0, 6.0)
+        assert page.locator(".obstacle").count() == 1
         page.get_by_role("button", name="Run", exact=True).click()
         page.get_by_text("The episode is over").wait_for()
+        look(page, "real-house-over")
         page.get_by_role("link", name="This session's own page").click()
         page.get_by_text("over, the rule is satisfied").wait_for()
     assert complaints == []
