@@ -127,11 +127,9 @@ class Explanation:
         told = f"no way was found that still keeps {self.conjunct}"
         if self.late_by is not None:
             return f"{told}: the best one comes {_steps(self.late_by)} too late"
-        return (
-            told
-            if self.robustness is None
-            else f"{told}: the best one misses it by {abs(self.robustness):.3g}"
-        )
+        if self.robustness is None:
+            return told
+        return f"{told}: the best one misses it by {abs(self.robustness):.3g}"
 
     @property
     def is_kept(self) -> bool:
@@ -139,7 +137,7 @@ class Explanation:
         return self.robustness is not None and self.robustness > 0.0
 
     def beside(self, margin: float, slack: int) -> str:
-        """The same, where J asked for a margin [m] and slack [steps]."""
+        """The line for people, in a session that asks for a margin [m] and slack [steps] beyond the rule."""
         if not self.is_kept:
             return str(self)
         if slack and self.late_by is not None:

@@ -44,9 +44,7 @@ WORK = 200_000_000  # entries that are solved for a task, at most, where that le
 MOST, FEWEST = 64, 8  # places that have a table
 REACH = 0.3  # [m] further off than the nearest, at which a place stands for a goal 1 / e as much
 LEADERS = 16  # tables that a decision asks
-FORCED = (
-    1.0  # [nats] of KL that the rule has cost a run, from which on it weighs: ADDED of evaluation/rivals.py
-)
+FORCED = 1.0  # [nats] of KL that the rule has cost, before which nothing is weighed: evaluation/rivals.py
 NEGLIGIBLE = 0.02  # a probability, or trust, that is not worth the work
 WORST = 10.0  # [nats] above the worst action that has a D, for those that have none
 

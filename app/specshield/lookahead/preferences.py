@@ -58,7 +58,6 @@ def prepare(name: str, task: Task, proposers: Sequence[Proposer], pose: Sequence
     actions = len(task.robot.actions)
     signals = {signal: np.array([value]) for signal, value in task.signals.items()}
     even = np.full(actions, -math.log(actions))
-    preference.step(
-        preference.begin(), np.array([pose], dtype=np.float64), signals, even, np.zeros(actions, bool)
-    )
+    nothing = np.zeros(actions, bool)  # feasible: so that a preference which waits for force is run whole
+    preference.step(preference.begin(), np.array([pose], dtype=np.float64), signals, even, nothing)
     return preference
