@@ -8,11 +8,12 @@ decided again.
 from __future__ import annotations
 
 import logging
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 from specshield.errors import SpecshieldError
 from specshield.policy.reachability.policy import ReachabilityPolicy
+from specshield.service.heavy.background import Background
 from specshield.service.library import files
 from specshield.shield.decision import Shield
 from specshield.shield.proposal import Proposer
@@ -41,7 +42,7 @@ class Tables:
     """
 
     def __init__(self) -> None:
-        self._threads = ThreadPoolExecutor(1, "tables")
+        self._threads = Background("tables")
         self._newest, self._making = files.Recent[Made](ROOM), files.Recent[Future[Made]](ROOM)
 
     def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:

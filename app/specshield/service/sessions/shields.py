@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from specshield.lookahead.lookahead import AHEADS
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.robot.dynamics import make_body
 from specshield.rule.view import view_of
+from specshield.service.heavy.background import Background
 from specshield.service.heavy.tables import Tables
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
@@ -40,7 +41,7 @@ class Shields:
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
         self.tables = Tables()
-        self._preparing = ThreadPoolExecutor(1, "prepare")
+        self._preparing = Background("prepare")
         self._latest: Future[Preference] | None = None  # the last one that was asked for
 
     def slow(self, session: Session) -> bool:

@@ -1,0 +1,27 @@
+import subprocess
+import sys
+from concurrent.futures import Future
+
+import pytest
+
+from specshield.service.heavy.background import Background
+
+
+def test_calls_are_made_in_turn_and_their_errors_are_told():
+    background, before = Background("test"), Future[int]()
+    first = background.submit(before.result)
+    cancelled, second, wrong = (background.submit(f) for f in (int, lambda: 2, lambda: 1 // 0))
+    assert cancelled.cancel()
+    assert not second.done()
+    before.set_result(1)
+    assert (first.result(), second.result()) == (1, 2)
+    with pytest.raises(ZeroDivisionError):
+        wrong.result()
+
+
+def test_a_program_that_ends_does_not_wait_for_a_call():
+    program = (
+        "import time\nfrom specshield.service.heavy.background import Background\n"
+        "Background('test').submit(time.sleep, 3600)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], timeout=300, check=True)
