@@ -12,16 +12,23 @@ from specshield.shield.taught import Taught
 NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
 
 
-def carried_over(carry: Carry | None, same_map: bool, same_robot: bool, later: int) -> Carry | None:
+def begun(way: bytes | None) -> Carry | None:
+    """What a session begins with. way: as `Carry` has it."""
+    return None if way is None else Carry(NEVER, np.empty((0, 3)), (), way=way)
+
+
+def carried_over(
+    carry: Carry | None, same_map: bool, same_robot: bool, later: int, way: bytes | None = None
+) -> Carry | None:
     """What the last decision under the old rule hands to the first one under the new, whose windows count
     from `later` steps later.
 
     What the map has learned stays where the map is the same, what is known of the robot where the robot is;
     where both are and the clock goes on, so does what the last motion should have led to. Continuations are
-    of the old rule.
+    of the old rule; `way` is one of the new.
     """
     if carry is None:
-        return None
+        return begun(way)
     stays = same_map and same_robot and later == 0
     return replace(
         carry,
@@ -33,6 +40,7 @@ def carried_over(carry: Carry | None, same_map: bool, same_robot: bool, later: i
         threshold_left=None,
         learned=_learned(carry.learned, later) if same_map else None,
         action=carry.action if stays else None,
+        way=way,
     )
 
 

@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from specshield.reasons.refusal import refusal
+from specshield.handover import begun
+from specshield.reasons.refusal import begin, refusal
 from specshield.reasons.relaxation import relaxations
-from specshield.shield.episode import make_shield
+from specshield.shield.episode import decide, make_shield
 from tests.oracles.cells import Cells, Scripted, waits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (4, 4), "D": (1, 0)}
@@ -39,7 +40,7 @@ def test_each_conjunct_alone_and_how_late_it_is():
         if exists(parts, history):
             continue
         relaxed = relaxations(make_shield([Scripted(cells, waits)]), history, {})
-        assert not relaxed.kept
+        assert relaxed.way is None
         for part, told in zip(parts, relaxed.conjuncts, strict=True):
             op, start, end, place = part
             others = [other for other in parts if other != part]
@@ -76,6 +77,11 @@ def test_a_way_that_the_policies_missed_is_not_denied():
     missed = refusal(shield([("F", 0, 4, "A")]), history, {})
     assert not missed.proved
     assert "a search found one" in missed.message
+    feasible, way = begin(shield([("F", 0, 4, "A")]), history[0], False)
+    assert feasible
+    first = decide(shield([("F", 0, 4, "A")]), history, None, True, carry=begun(way))
+    assert first.mode == "completion"
+    assert bytes([first.action, *first.witness]) == way
 
 
 def test_what_was_not_found_is_not_called_impossible_and_a_later_end_that_would_do_is_named():

@@ -20,6 +20,7 @@ END = {"type": "circle", "center": [3.2, 1.5], "radius": 0.4}  # entered by the 
 ORIGIN = {"type": "circle", "center": START[:2], "radius": 0.3}
 LATER = {"formula": "F[0,8] End", "regions": {"End": END}}
 TOO_SOON = {"formula": "F[0,2] End", "regions": {"End": END}}
+BEHIND = {"formula": "F[0,20] Origin", "regions": {"Origin": ORIGIN}}  # its policy drives ahead for ever
 BOTH = {"formula": "F[0,3] Origin and F[0,20] End", "regions": {"End": END, "Origin": ORIGIN}}
 ALARMED = {"formula": "F[0,16] End and G[0,16] alarm < 1", "regions": {"End": END}, "signals": {"alarm": 0.0}}
 AHEAD = [40.0, 0.0, 0.0, 0.0, None]  # so that the drawn action is the first
@@ -116,6 +117,21 @@ def test_what_cannot_be_kept_changes_nothing(client, begin, step, switch):
     assert state(client, session) == before
     assert record_of(client, session) == record
     driven(step, session, poses[3:], since=3)
+
+
+def test_a_way_that_a_search_found_and_no_policy_did_is_taken(
+    server, client, begin, step, switch, capsys, tmp_path
+):
+    session, poses = begin(), ahead(5)
+    driven(step, session, poses[:5])
+    assert switch(session, 5, BEHIND, clock="restart").status_code == 200
+    t, pose = 5, poses[5]
+    while (answer := step(session, t, [pose], logits=AHEAD).json())["spec_status"] == "pending":
+        assert answer["mode"] == "shaped"
+        t, pose = t + 1, answer["next_poses"][answer["action"]]
+    assert answer["spec_status"] == "satisfied"
+    status, said = told(capsys, tmp_path, record_of(client, session), data_dir=server.data_dir)
+    assert status == 0, said
 
 
 def test_a_history_that_counts_and_one_that_does_not(begin, step, switch):

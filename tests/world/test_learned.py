@@ -68,3 +68,18 @@ def test_what_is_no_list_of_points_is_refused_with_its_name(points):
     with pytest.raises(SampleError) as refused:
         check_points(points, "occupied")
     assert refused.value.path == "occupied"
+
+
+def test_the_clearance_near_new_cells_is_that_of_a_map_made_anew():
+    random = np.random.default_rng(0)
+    for _ in range(40):
+        height, width = (int(side) for side in random.integers(3, 60, 2))
+        grid = OccupancyGrid(random.random((height, width)) < 0.02, 0.05)
+        corner, size = random.integers(0, (height, width)), random.integers(1, 8, 2)
+        some = np.zeros((height, width), bool)
+        some[corner[0] : corner[0] + size[0], corner[1] : corner[1] + size[1]] = True
+        new = np.flatnonzero(some & (random.random((height, width)) < 0.6))
+        known = learn(grid, LearnedMap(), 0, new, occupied=True)
+        made = applied(grid, known)
+        anew = OccupancyGrid(made.occupied, 0.05)
+        np.testing.assert_array_equal(made.clearance, anew.clearance)

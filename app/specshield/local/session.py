@@ -29,7 +29,7 @@ from specshield.reasons import refusal
 from specshield.robot.dynamics import wrap
 from specshield.shield import decision as core
 from specshield.shield import episode
-from specshield.shield.decision import Carry, Shield
+from specshield.shield.decision import Shield
 from specshield.shield.signals import any_signal
 from specshield.task import Task, check_signals
 
@@ -48,7 +48,13 @@ class LocalSession:
     """
 
     def __init__(
-        self, policy: LocalShield, shield: Shield, shaping: str, info: SessionInfo, initial_pose: Pose
+        self,
+        policy: LocalShield,
+        shield: Shield,
+        shaping: str,
+        info: SessionInfo,
+        initial_pose: Pose,
+        way: bytes | None = None,
     ) -> None:
         self.info = info
         self.t = 0
@@ -57,7 +63,7 @@ class LocalSession:
         self._shaping, self._initial = shaping, initial_pose
         self._rules = [Rule(policy, shield)]
         self._first = dict(shield.task.signals)
-        self._carry: Carry | None = None
+        self._carry = handover.begun(way)
         self._poses: list[Pose] = []
         self._signals: dict[str, list[float]] = {name: [] for name in shield.task.signals}
         self._decisions: dict[int, Decision] = {}
@@ -151,8 +157,10 @@ class LocalSession:
         seen, signals = rule.since([*self._poses, x_t]), rule.signals(held)
         same_map = self.info.map_id == policy.task.grid.content_hash
         same_robot = old.policy.card["robot"] == policy.card["robot"]
-        carry = handover.carried_over(self._carry, same_map, same_robot, rule.origin - old.origin)
-        refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
+        later = rule.origin - old.origin
+        carry = handover.carried_over(self._carry, same_map, same_robot, later)
+        way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
+        carry = handover.carried_over(self._carry, same_map, same_robot, later, way)
         known = self._poses if pose is None else [*self._poses, x_t]
         ended = old.told(old.verdict(known, held)[0])
         self._rules.append(rule)

@@ -166,7 +166,7 @@ class LocalShield:
         if shaping != PROJECTION:
             check_preferring(config)
         shield = self.configured(config, shaping)
-        feasible = refusal.begin(shield, pose, allowed)
+        feasible, way = refusal.begin(shield, pose, allowed)
         status, _ = episode.close(shield, [pose])
         info = SessionInfo(
             id=id,
@@ -181,7 +181,7 @@ class LocalShield:
             rules=(Rule(self, shield).told(status),),
             any_signal=any_signal(shield, np.array([pose], np.float64)),
         )
-        return LocalSession(self, shield, shaping, info, pose)
+        return LocalSession(self, shield, shaping, info, pose, way)
 
     def configured(self, config: Config, shaping: str) -> Shield:
         """The shield with a session's settings."""

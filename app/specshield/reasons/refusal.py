@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
+from specshield.handover import begun
 from specshield.reasons.bound import proof
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.shield import switching
@@ -29,6 +31,7 @@ class Refusal:
     message: str
     proved: bool
     conjuncts: tuple[Conjunct, ...]
+    way: bytes | None = None  # as `Relaxed` has it
 
     @property
     def details(self) -> dict[str, Any]:
@@ -45,8 +48,9 @@ class Refusal:
         return {"proved": self.proved, "conjuncts": shown}
 
 
-def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> bool:
-    """Whether a session can begin at `pose` (x, y, theta) with a future that satisfies the rule.
+def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tuple[bool, bytes | None]:
+    """Whether a session can begin at `pose` (x, y, theta) with a future that satisfies the rule, and such a
+    way (as `Carry` has it) where a search found one and no policy did.
 
     Raises InputError for a session that would end before its rule is decided, PoseError, and InfeasibleStart
     unless `allow_infeasible`.
@@ -61,23 +65,35 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> bool
         start(shield, pose)
     except InfeasibleStart as error:
         if allow_infeasible:
-            return False
+            return False, None
         told = refusal(shield, np.array([pose], np.float64), {})
+        if told.way is not None:
+            with suppress(InfeasibleStart):
+                start(shield, pose, told.way)
+                return True, told.way
         raise InfeasibleStart(
             told.message, path=error.path, got=error.got, expected=error.expected, **told.details
         ) from None
-    return True
+    return True, None
 
 
 def switch(
     shield: Shield, history: Floats, signals: Signals | None, carry: Carry | None, elsewhere: bool
-) -> None:
-    """As in shield/switching.py; the InfeasibleSwitch that is raised says what is wrong with the rule."""
+) -> bytes | None:
+    """As in shield/switching.py; a way that a search found where no policy did is returned, as `begin` does.
+    The InfeasibleSwitch that is raised says what is wrong with the rule.
+    """
     try:
         switching.switch(shield, history, signals, carry, elsewhere)
+        return None
     except InfeasibleSwitch as error:
         taught, _ = teach(shield, carry, history, None, None)
         told = refusal(on_map(shield, taught.map), history, signals or {})
+        if told.way is not None:
+            found = begun(told.way) if carry is None else replace(carry, way=told.way)
+            with suppress(InfeasibleSwitch):
+                switching.switch(shield, history, signals, found, elsewhere)
+                return told.way
         raise InfeasibleSwitch(
             f"the new rule was not taken: {told.message}",
             path=error.path, got=error.got, expected=error.expected, **told.details,
@@ -89,15 +105,16 @@ def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> R
 
     history [t + 1, 3], signals {name: [t + 1]}, which are taken to hold their last values.
     """
-    bound = proof(shield.task, shield.body, history, signals)
     relaxed = relaxations(shield, history, signals)
-    if relaxed.kept:  # what was simulated is right, whatever a bound says
+    if relaxed.way is not None:
         return Refusal(
             f"the policies found no way from here that keeps the rule, though a search found one among "
             f"{relaxed.tried} that were tried: policies of another method, or finer options, may find it too",
             False,
             relaxed.conjuncts,
+            relaxed.way,
         )
+    bound = proof(shield.task, shield.body, history, signals)
     if bound is not None:
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
     message = (

@@ -48,26 +48,26 @@ class Conjunct:
 
 @dataclass(frozen=True)
 class Relaxed:
-    """conjuncts: of the rule. tried: how many futures were judged. kept: whether one of them keeps the rule,
-    which the policies did not find.
+    """conjuncts: of the rule. tried: how many futures were judged. way: the motions, one a byte, of one that
+    keeps the rule, which the policies did not find.
     """
 
     conjuncts: tuple[Conjunct, ...]
     tried: int
-    kept: bool
+    way: bytes | None
 
 
 def relaxations(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Relaxed:
     """What of the rule cannot be kept after x_0..x_t, history [t + 1, 3], signals {name: [t + 1]}."""
     parts = conjuncts(shield.task.formula)
     if not shield.task.formula.names:  # it reads nothing that any future could change
-        return Relaxed((), 0, False)
+        return Relaxed((), 0, None)
     gathered = _Gathered(shield, Known(shield.task, history, signals), parts)
     _gather(gathered)
     rho, late = np.concatenate(gathered.rho, axis=1), np.concatenate(gathered.late, axis=1)
     keeps = rho > SATISFIED_ABOVE
     told = tuple(_told(part, i, rho, late, keeps) for i, part in enumerate(parts))
-    return Relaxed(told, rho.shape[1], bool(keeps.all(axis=0).any()))
+    return Relaxed(told, rho.shape[1], gathered.way)
 
 
 def way(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Ints | None:
@@ -103,19 +103,22 @@ class _Gathered:
     parts: tuple[Formula, ...]
     rho: list[Floats] = field(default_factory=list)
     late: list[Floats] = field(default_factory=list)
+    way: bytes | None = None  # the first that keeps every conjunct
 
     def judge(self, motions: Ints) -> None:
         """motions [n, m]: from x_t to the horizon, or to some steps after it."""
         samples = samples_of(self.shield, self.known.history, self.known.signals, motions)
         rows = [{name: values[n] for name, values in samples.items()} for n in range(len(motions))]
-        self.rho.append(np.array([values_of(part, samples) for part in self.parts]))
+        rho = np.array([values_of(part, samples) for part in self.parts])
+        keeps = np.flatnonzero((rho > SATISFIED_ABOVE).all(axis=0))
+        if self.way is None and len(keeps):
+            steps = self.shield.task.horizon - self.known.now
+            self.way = motions[keeps[0], : max(steps, 0)].astype(np.uint8).tobytes()
+        self.rho.append(rho)
         self.late.append(np.array([[_late(part, row) for row in rows] for part in self.parts]))
 
     def kept(self, i: int) -> bool:
         return any(bool((rho[i] > SATISFIED_ABOVE).any()) for rho in self.rho)
-
-    def all_kept(self) -> bool:
-        return any(bool((rho > SATISFIED_ABOVE).all(axis=0).any()) for rho in self.rho)
 
 
 def _late(part: Formula, samples: Mapping[str, Floats]) -> float:
@@ -141,9 +144,9 @@ def _gather(gathered: _Gathered) -> None:
         for found in _found(shield, known, ground, ways, late):
             gathered.judge(found)
 
-    if not gathered.all_kept():
+    if gathered.way is None:
         look_for(reader.alternatives(shield.task.formula))
-    if gathered.all_kept():
+    if gathered.way is not None:
         return
     some = range(min(len(parts), MOST_CONJUNCTS))
     each = [reader.alternatives(parts[i]) for i in some]

@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from specshield.errors import InputError, SpecshieldError
+from specshield.handover import begun
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.service.heavy.tables import Made, make
 from specshield.service.library.maps import Maps
@@ -18,7 +19,7 @@ from specshield.service.sessions import chain, history, record
 from specshield.service.sessions.chain import Chain, Config
 from specshield.service.sessions.config import settings_of
 from specshield.service.sessions.record import StepRecord
-from specshield.service.sessions.rules import carried_over
+from specshield.service.sessions.rules import carried_over, way
 from specshield.service.sessions.session import columns
 from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
@@ -76,7 +77,8 @@ def _decide(found: Chain, shields: Sequence[Shield]) -> int:
 
 def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, list[str]]]:
     """The steps whose decision is another one now, each with the fields that differ. shields: one a rule."""
-    configs, carry, rule = [msgspec.to_builtins(config) for config in found.configs], None, 0
+    configs, rule = [msgspec.to_builtins(config) for config in found.configs], 0
+    carry = begun(way(configs[0]))
     maps, made = dict[bytes, LearnedMap](), dict[tuple[int, bytes], Made]()
     for t, content, kept in found.decided():
         while rule < found.rule_at(t):

@@ -159,6 +159,7 @@ class Carry:
     memory: of the session's preference. residuals: what is known of the robot by now (uncertainty.py).
     threshold_left: what is left of a threshold over the episode. learned: what the session's map has that the
     policy's has not (world/learned.py). action: the one that was drawn, which the caller may have executed.
+    way: where a rule begins to hold, a continuation from there to its horizon that no policy found.
     """
 
     t: int
@@ -169,6 +170,7 @@ class Carry:
     threshold_left: float | None = None
     learned: bytes | None = None
     action: int | None = None
+    way: bytes | None = None
 
 
 @dataclass(frozen=True)

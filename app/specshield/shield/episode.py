@@ -31,6 +31,7 @@ from specshield.shield.judgement import (
     as_actions,
     feasible_mass_of,
     j_values_of,
+    recovered,
     robustness_of,
     without,
     witnesses_of,
@@ -45,9 +46,10 @@ Signals = Mapping[str, Floats]
 SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
 
 
-def start(shield: Shield, pose: Sequence[float]) -> None:
+def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> None:
     """Checks that an episode can begin at `pose` (x, y, theta): some first action has a satisfying future.
 
+    way: one that no policy knows, as `Carry` has it.
     Raises PoseError for a pose that is not finite, outside the map or in collision, else InfeasibleStart.
     """
     try:
@@ -60,7 +62,7 @@ def start(shield: Shield, pose: Sequence[float]) -> None:
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
     rho, warnings = np.array([prefix.low]), tuple[str, ...]()
     if shield.task.horizon > 0:  # else the first state says it all
-        tried = futures(prefix, shield.body, shield.proposers, None, shield.config.margin)
+        tried = futures(prefix, shield.body, shield.proposers, way, shield.config.margin)
         rho, warnings = tried.rho, tried.warnings
     best = float(rho.max(initial=-np.inf))
     if not best > SATISFIED_ABOVE:
@@ -126,7 +128,7 @@ def decide(
     told, shield = shield, on_map(shield, taught.map)
     nexts = np.empty((len(robot.motions), 3))
     touches = _look_around(shield.body, poses[-1], nexts)
-    tail, residual = _follow(carry, poses)
+    tail, residual = _follow(carry, poses, task.horizon - t, len(robot.motions))
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
@@ -143,18 +145,14 @@ def decide(
         answer = _unmodified(shield, log_prior)
     else:
         shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
-        believed = taught
         for doubt in () if judged.feasible.any() else doubted(taught, t):
-            shield, prefix, judged, withstands = judged_by_signals(
-                on_map(told, doubt.map, True), prefix, tail, spec_status, care
-            )
-            taught = doubt
-            if judged.feasible.any():
+            found = judged_by_signals(on_map(told, doubt.map, True), prefix, tail, spec_status, care)
+            if found[2].feasible.any():
+                (shield, prefix, judged, withstands), taught = found, doubt
+                said = (*said, "no way was left, so what was run into is tried again")
+                touches = _look_around(shield.body, poses[-1], nexts)
                 break
-        if taught is not believed:
-            said = (*said, "no way was left, so what was run into is tried again")
-            touches = _look_around(shield.body, poses[-1], nexts)
-        judged = without(judged, shield, doubtful(told, taught, poses[-1]))
+        judged = without(recovered(shield, judged), shield, doubtful(told, taught, poses[-1]))
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)
@@ -307,16 +305,23 @@ def _wrapped(poses: Floats) -> bool:
     return True
 
 
-def _follow(carry: Carry | None, poses: Floats) -> tuple[bytes | None, tuple[float, float] | None]:
-    """The tail of the witness that the robot followed to x_t, and how far x_t is from where f leads."""
+def _follow(
+    carry: Carry | None, poses: Floats, steps: int, motions: int
+) -> tuple[bytes | None, tuple[float, float] | None]:
+    """The tail of the witness that the robot followed to x_t, or the way that a new rule came with, and how
+    far x_t is from where f leads. steps: to the horizon; motions: how many the robot has.
+    """
+    way = None if carry is None else carry.way
+    if way is not None and (len(way) != steps or max(way, default=0) >= motions):
+        way = None
     if carry is None or carry.t != len(poses) - 2:
-        return None, None
+        return way, None
     gap = np.empty(len(carry.next_poses))
     off = _gaps(carry.next_poses, poses[-1], gap)
     near = gap.min() + SAME_POSE  # a blocked move leads where waiting does
     fits = zip(carry.witnesses, gap.tolist(), strict=True)
     tail = next((witness for witness, far in fits if far <= near and witness is not None), None)
-    return tail or None, off
+    return way or tail or None, off
 
 
 @leaf

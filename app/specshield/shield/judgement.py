@@ -26,6 +26,7 @@ class Judged:
     """The actions' futures at one step."""
 
     tried: Futures
+    part: Prefix  # as what can still be kept sees it
     best: Best
     feasible_motion: Bools  # [M]
     feasible: Bools  # [A], S_t; false for a terminal action
@@ -56,20 +57,26 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     if lowered or (care.has_slack and _some(best)):
         aimed = aim(shield, care, part, tried, kept, leaves)
         best, feasible = aimed.best, aimed.kept
-    some, first, said = bool(feasible.any()), tried.preferred, tried.warnings
-    if recovers(shield.config):
-        said = (*said, *given_up(prefix)) if violated else said
-        if not some:
-            first, more = most_kept(shield, part, tried)
-            said = (*said, *more)
-        tried = replace(tried, warnings=said)
+    some, first = bool(feasible.any()), tried.preferred
+    if violated and recovers(shield.config):
+        tried = replace(tried, warnings=(*tried.warnings, *given_up(prefix)))
     if tail and feasible[tail[0]]:
         first = tail[0]
     elif some and not feasible[first]:
         first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
     completion = int(robot.representative[first])
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
-    return Judged(tried, best, feasible, *by_action, completion, aimed.margin, aimed.slack, aimed.lowered)
+    asked_and_had = aimed.margin, aimed.slack, aimed.lowered
+    return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had)
+
+
+def recovered(shield: Shield, judged: Judged) -> Judged:
+    """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words."""
+    if judged.feasible.any() or not recovers(shield.config):
+        return judged
+    first, said = most_kept(shield, judged.part, judged.tried)
+    tried = replace(judged.tried, warnings=(*judged.tried.warnings, *said))
+    return replace(judged, tried=tried, completion=int(shield.task.robot.representative[first]))
 
 
 def without(judged: Judged, shield: Shield, doubtful: Bools) -> Judged:

@@ -37,8 +37,7 @@ from specshield.world.learned import (
 )
 
 # [steps] what a way around something takes that only contacts show. Chosen by hand: of 60 runs in cases 1 and
-# 2, `evaluation worlds --world obstacle --sensing contact` keeps 58 and 52 with 12, and 59 and 57 with 20 (59
-# and 56 since searches among guesses are shorter).
+# 2, `evaluation worlds --world obstacle --sensing contact` keeps 58 and 52 with 12, and 59 and 57 with 20.
 AROUND = 20
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand

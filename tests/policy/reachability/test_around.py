@@ -1,9 +1,11 @@
 """The search for a way around: what it has come to is told from what is new, however much is turned away."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from specshield.policy.heap import Heap
-from specshield.policy.reachability.around import FEWER, POSES, Tree, _slot_of
+from specshield.policy.reachability.around import Tree, _slot_of
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot.dynamics import make_body
 from tests.policy.rooms import flat
@@ -45,8 +47,13 @@ def test_poses_that_are_turned_away_take_no_room_and_hide_nothing():
         assert _slot_of(tree, count, seen) < 0
 
 
-def test_one_of_several_maps_is_searched_less():
-    task = flat("F[0,30] West")
-    policy, body = synthesise(task), make_body(task.robot, task.grid)
-    assert policy.on_body(body).most == POSES
-    assert policy.on_body(body, True).most == FEWER < POSES
+def test_where_a_search_on_one_of_several_maps_gives_up_nothing_else_is_tried():
+    """The tables know of a door to the goal, and the map has none."""
+    task = flat("F[0,60] East")
+    sealed = task.grid.occupied.copy()
+    sealed[:, 20] = True
+    body, policy = make_body(task.robot, replace(task.grid, occupied=sealed)), synthesise(task)
+    history = np.array([[*task.grid.to_map([0.7, 1.5]), 0.0]])
+    whole, quick = (policy.on_body(body, guess).propose(history, {}, 0.0) for guess in (False, True))
+    assert (quick.motions[:, 1:] == task.robot.wait_motion).all()
+    assert (whole.motions[:, 1:] != task.robot.wait_motion).any()

@@ -17,7 +17,7 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.heap import Heap, pop, push
-from specshield.policy.lattice import reads_heading
+from specshield.policy.lattice import coordinates, find_corners, reads_heading
 from specshield.policy.reachability.guide import (
     Guide,
     Scratch,
@@ -41,6 +41,7 @@ ONWARD = 0.1  # [steps] of slack that a step farther on its way is worth
 PLACE_GRAIN = 20.0  # [1/m] places that round to the same multiples of its inverse count once
 HEADING_GRAIN = 60.0 / (2.0 * math.pi)  # [1/rad]
 BAND = -3.0  # [steps] of slack: how far the tables may err
+NO_WAY, GAVE_UP = -1, -2  # in place of a way: there is none among the poses searched; they were too many
 LEGS = 8  # searches for one way, each to the next goal
 
 
@@ -61,21 +62,23 @@ class Tree(NamedTuple):
 
 @kernel
 def go_around(
-    guide: Guide, past: float, history: Floats, signals: Floats, poses: Floats, motions: Ints, most: int
-) -> int:
-    """Searches for a way from x_t to every goal, unless one is known. Returns its first motion, -1 where
-    there is none; then motions (M, T - t) hold it, and after each other motion the way back to it.
+    guide: Guide, past: float, history: Floats, signals: Floats, known: int, poses: Floats, motions: Ints,
+    most: int,
+) -> int:  # fmt: skip
+    """Searches for a way from x_t to every goal, unless one is known. Returns its first motion; then motions
+    (M, T - t) hold it, and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the
+    search came to `most` poses.
 
-    poses (M, T - t, 3): the ways that are known; overwritten. most: the poses that a search may come to. The
-    other arguments are those of `continue_all`.
+    poses (M, T - t, 3): the ways that are known, the first `known` of them; overwritten. The other arguments
+    are those of `continue_all`.
     """
     t, k_count, steps = history.shape[0] - 1, guide.rules.kind.shape[0], motions.shape[1]
     status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
     recall(guide.rules, past, history, signals, status, run)
     forgive(guide.rules, t, status)
     scratch = make_scratch(guide.rules, motions.shape[0])
-    if guide.wait < 0 or _is_known(guide, t, status, run, poses, scratch):
-        return -1
+    if guide.wait < 0 or _is_known(guide, t, status, run, poses[:known], scratch):
+        return NO_WAY
     tree = Tree(
         np.empty((most, 3)), np.empty((most, k_count), np.int8), np.empty((most, k_count), np.int64),
         np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most),
@@ -91,7 +94,7 @@ def go_around(
             x, y, theta = led[n - 1, 0], led[n - 1, 1], led[n - 1, 2]
         found = _reach(guide, t + n, steps - n, x, y, theta, tree, seen, scratch)
         if found < 0:
-            return -1
+            return int(found)
         length = tree.step[found]
         at = found
         while tree.parent[at] >= 0:
@@ -103,15 +106,15 @@ def go_around(
         n += length
         copy_progress(tree.status[found], tree.run[found], scratch.status, scratch.run)
         if n == 0:
-            return -1
+            return NO_WAY
         outcome, n = climb(guide, t, n, way, led, scratch)
         if outcome == SETTLED_ALL:
             break
         if outcome == FAILED:
-            return -1
+            return NO_WAY
         copy_progress(scratch.high_status, scratch.high_run, scratch.status, scratch.run)
     if outcome != SETTLED_ALL:
-        return -1
+        return NO_WAY
     _after_each(guide, t, history[t], status, run, way, led, motions, poses, scratch)
     return int(way[0])
 
@@ -160,7 +163,7 @@ def _reach(
     scratch: Scratch,
 ) -> int:  # fmt: skip
     """The row of a pose from where a climb can go on: one more goal is settled there, or only time is needed
-    for that. -1 where the search comes to none. The scratch holds the progress at (x, y, theta).
+    for that. Else NO_WAY or GAVE_UP. The scratch holds the progress at (x, y, theta).
     """
     body, rules, tables, _ = guide
     seen[:] = -1
@@ -175,11 +178,11 @@ def _reach(
         s = tree.step[here]
         if s > 0 and _arrived(guide, t + s, here, tree, scratch):
             return int(here)
-        if s >= steps:
+        if s >= steps or count == tree.step.shape[0]:
             continue
         before_x, before_y, before = tree.pose[here, 0], tree.pose[here, 1], tree.pose[here, 2]
         cos, sin, room = around(body, before_x, before_y, before)
-        read = False
+        read, corners = False, UNKNOWN  # what is the same after each turn: whether it is known, and how many
         for m in range(motion_count(body)):
             x, y, theta = step_from(body, before_x, before_y, before, cos, sin, room, m)
             stays = x == before_x and y == before_y
@@ -196,9 +199,12 @@ def _reach(
             slot = _slot_of(tree, count, seen)
             if slot < 0:
                 continue
+            if stays and corners == UNKNOWN:
+                v, u, _ = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
+                corners = find_corners(tables.cell, v, u, scratch.corners)
             ahead = slack_at(
-                body, rules, tables, x, y, theta, t + s + 1, scratch.status, scratch.run, scratch.corners,
-                UNKNOWN,
+                body, rules, tables, x, y, theta, t + s + 1, scratch.status, scratch.run,
+                scratch.corners if stays else scratch.ahead, corners if stays else UNKNOWN,
             )  # fmt: skip
             if ahead < BAND:
                 seen[slot] = -1  # the end of its chain; its row goes to the next pose
@@ -206,7 +212,7 @@ def _reach(
             tree.rank[count] = ahead + ONWARD * (s + 1)
             size = push(tree.heap, size, count, -tree.rank[count])
             count += 1
-    return -1
+    return GAVE_UP if count == tree.step.shape[0] else NO_WAY
 
 
 @leaf

@@ -21,7 +21,7 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.reachability.around import FEWER, POSES, go_around
+from specshield.policy.reachability.around import FEWER, GAVE_UP, NO_WAY, POSES, go_around
 from specshield.policy.reachability.guide import Guide, share_with_slack
 from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
 from specshield.policy.reachability.method import Settings
@@ -60,7 +60,7 @@ class ReachabilityPolicy:
     tables: Tables
     narrow: Bools
     told: bool = True  # whether the tables were made for the map that the policy goes by
-    most: int = POSES  # that one search for a way around may come to
+    guess: bool = False  # whether that is one of several maps that one decision tries
 
     @property
     def id(self) -> str:
@@ -77,9 +77,10 @@ class ReachabilityPolicy:
     def on_body(self, body: Body, guess: bool = False) -> ReachabilityPolicy:
         """The policy on another map: its tables suggest what they did, its ways are those that there are.
 
-        guess: whether the map is one of several that are tried in one decision.
+        guess: whether the map is one of several that are tried in one decision. Where a short search for a
+        way around gives up, nothing else is tried then.
         """
-        other = replace(self, told=False, most=FEWER if guess else POSES)
+        other = replace(self, told=False, guess=guess)
         other.__dict__.update(_body=body, _rules=self._rules)
         return other
 
@@ -110,7 +111,14 @@ class ReachabilityPolicy:
         proposals = []
         for past in pasts(rules, history, rows):
             motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
-            poses = np.empty((*motions.shape, 3))
+            poses, ways = np.empty((*motions.shape, 3)), np.empty_like(motions)
+            around = NO_WAY
+            if self.guess:
+                around = go_around(guide, past, history, rows, 0, poses, ways, FEWER)
+            if around == GAVE_UP:
+                ways[:], ways[:, 0] = guide.wait, np.arange(len(ways))
+                proposals.append(Proposal(ways, guide.wait))
+                continue
             if self.narrow.any() and guide.wait >= 0:
                 preferred = continue_narrow(
                     guide, self.narrow, self._top, effort, past, history, rows, motions, poses
@@ -118,11 +126,10 @@ class ReachabilityPolicy:
             else:
                 preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, int(preferred)))
-            if not self.told:
-                ways = np.empty_like(motions)
-                first = go_around(guide, past, history, rows, poses, ways, self.most)
-                if first >= 0:
-                    proposals.append(Proposal(ways, int(first)))
+            if not (self.told or self.guess):
+                around = go_around(guide, past, history, rows, len(poses), poses, ways, POSES)
+            if around >= 0:
+                proposals.append(Proposal(ways, int(around)))
         return joined(*proposals)
 
     def weights(self) -> bytes:

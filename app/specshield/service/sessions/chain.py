@@ -66,6 +66,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     begins: int = msgspec.field(name="from", default=0)
     origin: int = 0
     before: str = ""
+    way: str = ""
 
 
 @dataclass(frozen=True)

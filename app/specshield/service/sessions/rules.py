@@ -3,7 +3,8 @@
 A session's stored config is a line of JSON for each of its rules. The first line is what the session began
 with. A switch adds a line: the whole config from then on, and beside it `from`, the first step that the rule
 decides; `origin`, the step from which its windows count; `clock`, as it was asked for; `before`, the link of
-the chain (record.py) that the switch follows, in hex.
+the chain (record.py) that the switch follows, in hex. `way`: the motions that the rule began with, in hex,
+where a search found them and no policy did; else empty.
 
 The rows have a column for each signal that a rule so far declares: those of the first rule in alphabetical
 order, then what each further one adds.
@@ -68,7 +69,12 @@ def widened(rows: Floats, names: Sequence[str], signals: Mapping[str, float]) ->
 def carried_over(carry: Carry | None, old: Config, new: Config) -> Carry | None:
     """What the last decision under the old rule hands to the first one under the new."""
     same_map, same_robot = old["map_id"] == new["map_id"], old["robot"] == new["robot"]
-    return handover.carried_over(carry, same_map, same_robot, origin(new) - origin(old))
+    return handover.carried_over(carry, same_map, same_robot, origin(new) - origin(old), way(new))
+
+
+def way(config: Config) -> bytes | None:
+    """The way that the rule began with, where a search found one and no policy did."""
+    return bytes.fromhex(config["way"]) if config.get("way") else None
 
 
 def told(rules: Sequence[Config], verdicts: Sequence[str]) -> list[dict[str, Any]]:

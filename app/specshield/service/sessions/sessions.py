@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from specshield import handover
 from specshield.arrays import Floats
 from specshield.errors import FragmentError, InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
@@ -40,7 +41,7 @@ from specshield.service.sessions.session import (
     pack,
 )
 from specshield.service.sessions.shields import Shields, refused
-from specshield.service.sessions.state import State
+from specshield.service.sessions.state import State, pack_carry
 from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
@@ -95,7 +96,11 @@ class Sessions:
             raise
         content = files.to_json(config)
         feasible, withstands = begun
-        state = State(1, 0, feasible, status, self._expiry(), record.digest(content), any_signal=withstands)
+        carry = handover.begun(rules.way(config))
+        state = State(
+            1, 0, feasible, status, self._expiry(), record.digest(content),
+            carry=None if carry is None else pack_carry(carry), any_signal=withstands,
+        )  # fmt: skip
         stored_as = scoped(key.name, config["id"])
         await self._store.create(stored_as, content, Change(state.packed(), pack(rows)))
         try:  # whoever deletes a policy sees this session now, or has marked the policy before
@@ -263,7 +268,7 @@ def begin(
     records = [policies.find(key, owner) for key in request.policies]
     ids = [record.id for record in records]
     shield = replace(shields.get(ids, settings), preference=preference)
-    feasible = refusal.begin(shield, request.initial_pose, request.allow_infeasible)
+    feasible, way = refusal.begin(shield, request.initial_pose, request.allow_infeasible)
     task, about = shield.task, records[0].about
     signals = dict(sorted(task.signals.items()))
     rows = np.array([[*request.initial_pose, *signals.values()]])
@@ -277,5 +282,6 @@ def begin(
         "created_at": files.now(),
         "owner": owner,
         "nonce": secrets.token_hex(8),
+        "way": (way or b"").hex(),
     }
     return config, (feasible, any_signal(shield, rows[:, :3])), status, rows

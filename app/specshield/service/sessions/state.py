@@ -50,6 +50,7 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
     threshold_left: float | None = None
     learned: bytes | None = None
     action: int | None = None
+    way: bytes | None = None
 
     def unpacked(self) -> Carry:
         # Writable: kernels were compiled for that.
@@ -63,6 +64,7 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
             self.threshold_left,
             self.learned,
             self.action,
+            self.way,
         )
 
 
@@ -76,6 +78,7 @@ def pack_carry(carry: Carry) -> PackedCarry:
         carry.threshold_left,
         carry.learned,
         carry.action,
+        carry.way,
     )
 
 

@@ -207,6 +207,7 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
         "origin": origin,
         "clock": wanted.clock,
         "before": before.hex(),
+        "way": "",
     }
     signals = config["spec"]["signals"]
     names = [*session.signal_names, *rules.added(session.signal_names, signals)]
@@ -218,13 +219,15 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
         signal_names=names,
     )
     carry = None if session.state.carry is None else session.state.carry.unpacked()
-    carry = rules.carried_over(carry, old, config)
+    known = rules.carried_over(carry, old, config)
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
     elsewhere = any(old[name] != config[name] for name in ("map_id", "robot"))
-    refusal.switch(shield, seen[:, :3], columns(seen, names), carry, elsewhere)
-    known = made.since
-    status = episode.close(shield, known[:, :3], columns(known, names))[0] if len(known) else "pending"
+    way = refusal.switch(shield, seen[:, :3], columns(seen, names), known, elsewhere)
+    config["way"] = (way or b"").hex()
+    carry = rules.carried_over(carry, old, config)
+    rows = made.since
+    status = episode.close(shield, rows[:, :3], columns(rows, names))[0] if len(rows) else "pending"
     state = msgspec.structs.replace(
         session.state,
         length=len(made.rows),

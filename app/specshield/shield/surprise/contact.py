@@ -15,6 +15,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
+from specshield.robot.body import centre
 from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
@@ -110,14 +111,14 @@ def cells_met(body: Body, pose: Floats, motion: int, driven: Floats) -> list[tup
     x, y = far * np.cos(aside), far * np.sin(aside)
     rim = (gap > -TOUCH) & (gap <= body.resolution)
     thing = np.hypot(x - body.radius - 0.5 * THING, y) <= 0.5 * THING
-    clear = np.unique(np.concatenate([cells_under(body, at, UNDER) for at in driven]))
     parts = (
         (BEHIND, thing & ~rim),
         (LEFT, rim & (aside > ARC) & (aside <= ASIDE)),
         (RIGHT, rim & (aside < -ARC) & (aside >= -ASIDE)),
         (CONTACT, rim & (np.abs(aside) <= ARC)),
     )
-    return [(by, np.setdiff1d(cells[part], clear)) for by, part in parts]
+    clear = _gaps(body, cells, driven) < -UNDER
+    return [(by, cells[part & ~clear]) for by, part in parts]
 
 
 def _direction(body: Body, pose: Floats, motion: int) -> float:
@@ -138,18 +139,28 @@ def cells_under(body: Body, pose: Floats, deep: float) -> Ints:
 
 def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floats]:
     """The cells within `beyond` [m] of the footprint, how far each is from it, and where from its centre."""
-    x, y, theta = pose
-    c, s, h = math.cos(theta), math.sin(theta), body.resolution
-    dx = x + body.offset_x * c - body.offset_y * s - body.origin_x
-    dy = y + body.offset_x * s + body.offset_y * c - body.origin_y
-    u, v = body.cos_yaw * dx + body.sin_yaw * dy, body.cos_yaw * dy - body.sin_yaw * dx
+    h, (u, v) = body.resolution, centre(body, *pose)
     reach = body.radius + beyond + h
     height, width = body.occupied.shape
     rows = np.arange(max(math.floor((v - reach) / h), 0), min(math.floor((v + reach) / h) + 1, height))
     columns = np.arange(max(math.floor((u - reach) / h), 0), min(math.floor((u + reach) / h) + 1, width))
     row, column = (each.ravel() for each in np.meshgrid(rows, columns, indexing="ij"))
-    du = np.maximum(np.maximum(column * h - u, u - (column + 1) * h), 0.0)
-    dv = np.maximum(np.maximum(row * h - v, v - (row + 1) * h), 0.0)
+    cells = row * width + column
     yaw = math.atan2(body.sin_yaw, body.cos_yaw)
     bearing = np.arctan2((row + 0.5) * h - v, (column + 0.5) * h - u) + yaw
-    return row * width + column, np.hypot(du, dv) - body.radius, bearing
+    return cells, _gaps(body, cells, pose[None]), bearing
+
+
+@kernel
+def _gaps(body: Body, cells: Ints, poses: Floats) -> Floats:
+    """How far each cell [n] is from the footprint at the nearest of the poses [m, 3]; below 0: under it."""
+    h, width = body.resolution, body.occupied.shape[1]
+    gap = np.full(cells.shape[0], np.inf)
+    for pose in poses:
+        u, v = centre(body, pose[0], pose[1], pose[2])
+        for i in range(cells.shape[0]):
+            row, column = cells[i] // width, cells[i] % width
+            du = max(max(column * h - u, u - (column + 1) * h), 0.0)
+            dv = max(max(row * h - v, v - (row + 1) * h), 0.0)
+            gap[i] = min(gap[i], math.hypot(du, dv) - body.radius)
+    return gap
