@@ -189,8 +189,8 @@ def relaxed(world: World, conjuncts: Sequence[Mapping[str, Any]]) -> World | Non
         return None
     steps, i = min(late)
     part, parts = world.parts[i], list(world.parts)
-    dwells = part.kind == "FG"
-    parts[i] = replace(part, c1=part.c1 + steps) if dwells else replace(part, b=part.b + steps)
+    later = {"FG": {"c1": part.c1 + steps}, "G": {"a": part.a + steps}, "F": {"b": part.b + steps}}
+    parts[i] = replace(part, **later[part.kind])
     formula = " and ".join(part.text for part in parts)
     task = make_task(world.task.grid, world.task.robot, formula, world.regions)
     return replace(world, parts=parts, task=task)

@@ -232,14 +232,15 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
         ([-0.3, None], "no way was found that still keeps F[50,100] Region2: the best one misses it by 0.3"),
         ([None, None], "no way was found that still keeps F[50,100] Region2"),
         (
-            [0.05, None],
-            "the rule could still be kept, but no policy proposed the way, or it leads where the robot has "
-            "run into something",
+            [-0.3, None, "on the best one 'A' is not met"],
+            "no way was found that still keeps F[50,100] Region2: on the best one 'A' is not met",
         ),
+        ([0.05, None, "a way is known that keeps the rule"], "a way is known that keeps the rule"),
     ],
 )
 def test_a_decision_says_why_an_action_is_forbidden(why, line):
     told = {"conjunct": "F[50,100] Region2", "robustness": why[0], "late_by": why[1]}
+    told |= {"detail": why[2]} if len(why) > 2 else {}
     decision, _ = step(session(), 0, decided(0, M, explanations=[None, told, None]))
     assert decision.why("b") == decision.why(B) == f"b is forbidden: {line}"
     assert decision.why("m") == "m is not forbidden"

@@ -115,16 +115,21 @@ class Residual:
 class Explanation:
     """Why an action is forbidden: the part of the rule that its best future does not keep, its robustness
     there [m], and by how many steps that future comes too late (None where time is not what is missing).
+    detail: what else there is to say, such as which half of an `until` fails, and when.
     """
 
     conjunct: str
     robustness: float | None
     late_by: int | None
+    detail: str | None = None
 
     def __str__(self) -> str:
         if self.is_kept:
-            return f"{self.conjunct} could still be kept, but with less to spare than the session asks for"
+            less = f"{self.conjunct} could still be kept, but with less to spare than the session asks for"
+            return self.detail or less
         told = f"no way was found that still keeps {self.conjunct}"
+        if self.detail is not None:
+            return f"{told}: {self.detail}"
         if self.late_by is not None:
             return f"{told}: the best one comes {_steps(self.late_by)} too late"
         if self.robustness is None:
@@ -138,17 +143,14 @@ class Explanation:
 
     def beside(self, margin: float, slack: int) -> str:
         """The line for people, in a session that asks for a margin [m] and slack [steps] beyond the rule."""
-        if not self.is_kept:
+        if not self.is_kept or self.detail is not None:
             return str(self)
         if slack and self.late_by is not None:
             later = f"{_steps(self.late_by)} later than the session allows"
             return f"{self.conjunct} could still be kept, but {later}: it keeps {_steps(slack)} in hand"
         if margin or slack:
             return f"{self} ({margin:.2g} m, {_steps(slack)})"
-        return (
-            "the rule could still be kept, but no policy proposed the way, or it leads where the robot has "
-            "run into something"
-        )
+        return str(self)
 
 
 def _steps(count: int) -> str:

@@ -26,6 +26,7 @@ from specshield.client.wire import Logits, Numbers, Points, logit_values, point_
 from specshield.errors import HistoryConflict, SessionFinished, StepConflict
 from specshield.local.rule import Rule
 from specshield.reasons import refusal
+from specshield.reasons.explanation import explanations
 from specshield.robot.dynamics import wrap
 from specshield.shield import decision as core
 from specshield.shield import episode
@@ -123,7 +124,7 @@ class LocalSession:
             witnesses,
             None if occupied is None else np.array(point_values(occupied, "occupied")).reshape(-1, 2),
             None if free is None else np.array(point_values(free, "free")).reshape(-1, 2),
-            explain,
+            explanations if explain else None,
         )
         answer = _answer(replace(made, t=self.t), self.info, over, witnesses, explain)
         self._poses.append(x_t)
@@ -259,7 +260,7 @@ class LocalSession:
         told = {each.name: getattr(decision, each.name) for each in fields(decision) if each.name not in OWN}
         told["residual"] = None if decision.residual is None else dict(vars(decision.residual))
         if decision.explanations is not None:
-            told["explanations"] = [None if e is None else dict(vars(e)) for e in decision.explanations]
+            told["explanations"] = [_told(why) for why in decision.explanations]
         return {name: value for name, value in told.items() if value is not None or name not in ASKED}
 
 
@@ -283,10 +284,19 @@ def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool,
     return Decision(**values, execute=execute, action_names=info.actions)
 
 
+def _told(why: Explanation | None) -> dict[str, Any] | None:
+    """As the service tells it: without a detail where there is none."""
+    if why is None:
+        return None
+    return {name: value for name, value in vars(why).items() if name != "detail" or value is not None}
+
+
 def _explained(made: core.Decision) -> tuple[Explanation | None, ...]:
     return tuple(
         None
         if why is None
-        else Explanation(why.conjunct, why.robustness if math.isfinite(why.robustness) else None, why.late_by)
+        else Explanation(
+            why.conjunct, why.robustness if math.isfinite(why.robustness) else None, why.late_by, why.detail
+        )
         for why in made.explanations
     )

@@ -10,10 +10,10 @@ from specshield.arrays import Floats
 from specshield.errors import MapError
 from specshield.policy.dqn.environment import free_poses
 from specshield.reasons.bound import contradiction
+from specshield.reasons.lateness import samples_of, values_of
 from specshield.reasons.relaxation import way
 from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Config, Shield, make_shield
-from specshield.shield.explanation import samples_of, values_of
 from specshield.shield.proposal import Proposer
 from specshield.shield.signals import any_signal
 from specshield.stl import SATISFIED_ABOVE

@@ -8,7 +8,7 @@ alternative, none satisfies the formula.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 from specshield.stl import Always, And, Eventually, Formula, Implies, Not, Or, Until
@@ -22,7 +22,8 @@ MOST_INSTANTS = 8  # steps of a G at which an F below it is asked for
 class Need:
     """`predicate` holds at every step from s to s + stay, for some step s from `first` to `last`.
 
-    part: the need as the formula has it, where some of its window is over by now.
+    part: the need as the formula has it, where some of its window is over by now. before: what has to hold at
+    every step until then, as the left side of an until; a search heeds it, and a proof does without.
     """
 
     predicate: Formula
@@ -30,6 +31,7 @@ class Need:
     last: int
     stay: int
     part: Formula | None = None
+    before: Formula | None = None
 
     @property
     def end(self) -> int:
@@ -86,6 +88,8 @@ class Reader:
                 return self._some(child, a + c, b + d)
             case Until(c, d, left, right):
                 then = self._some(right, a + c, b + d)
+                if a == b and is_predicate(left) and is_predicate(right):
+                    then = tuple(tuple(replace(need, before=left) for need in way) for way in then)
                 return _all([then, self._every(left, a, a + c - 1)]) if a == b and c > 0 else then
         return NOTHING
 

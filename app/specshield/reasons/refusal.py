@@ -14,11 +14,14 @@ from specshield.arrays import Floats
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
 from specshield.handover import begun
 from specshield.reasons.bound import proof
+from specshield.reasons.lateness import steps
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.shield import switching
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.episode import Signals, start
 from specshield.shield.taught import on_map, teach
+from specshield.stl import Always
+from specshield.stl.fragment import is_predicate
 
 MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST
 LONGEST = 400
@@ -142,12 +145,13 @@ def _fails(conjunct: Conjunct, alone: str) -> str:
     if late is None:
         nearest = f": the nearest that was found misses it by {abs(conjunct.robustness):.3g}"
         return f"{told}{nearest if math.isfinite(conjunct.robustness) else ''}"
-    return f"{told}: the best one comes {late} step{'s' if late != 1 else ''} too late"
+    return f"{told}: the best one comes {steps(late)} too late"
 
 
 def _ends_later(conjunct: Conjunct) -> str:
-    late = conjunct.late_by
-    return f"the window of {_shown(conjunct)} ended {late} step{'s' if late != 1 else ''} later"
+    part = conjunct.formula
+    does = "began" if isinstance(part, Always) and is_predicate(part.child) else "ended"
+    return f"the window of {_shown(conjunct)} {does} {steps(conjunct.late_by or 0)} later"
 
 
 def _shown(conjunct: Conjunct) -> str:

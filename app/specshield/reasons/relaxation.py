@@ -16,14 +16,14 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.reasons.course import Course, course
 from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known
+from specshield.reasons.lateness import late_by, later, may_be_late, samples_of, values_of
 from specshield.reasons.needs import Alternatives, Need, Reader
 from specshield.reasons.search import Wanted, search
 from specshield.robot.dynamics import calmest_motion
 from specshield.rule.residual import joined
 from specshield.shield.decision import Shield
-from specshield.shield.explanation import ends_later, late_by, samples_of, values_of
 from specshield.shield.feasibility import futures, prefix_of
-from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
 MOST_LATE = 150  # [steps] that a window is tried to end later, at most. Chosen by hand
 MOST_TRIED = 3  # alternatives of one conjunct, or of all, that are searched for
@@ -36,8 +36,9 @@ class Conjunct:
 
     feasible_alone: whether a future was found that keeps it, whatever becomes of the others. robustness: the
     highest found beside the others, where these can be kept without it, else of it alone [m]; -inf where
-    nothing was tried. late_by: how many steps later its window would have to end, for it alone where it is
-    not feasible alone, else for the whole rule; None where no later end of it was found to do.
+    nothing was tried. late_by: how many steps later its window would have to end (that of a G over a place,
+    to begin), for it alone where it is not feasible alone, else for the whole rule; None where none was found
+    to do.
     """
 
     formula: Formula
@@ -115,16 +116,17 @@ class _Gathered:
             steps = self.shield.task.horizon - self.known.now
             self.way = motions[keeps[0], : max(steps, 0)].astype(np.uint8).tobytes()
         self.rho.append(rho)
-        self.late.append(np.array([[_late(part, row) for row in rows] for part in self.parts]))
+        now = self.known.now
+        self.late.append(np.array([[_late(part, row, now) for row in rows] for part in self.parts]))
 
     def kept(self, i: int) -> bool:
         return any(bool((rho[i] > SATISFIED_ABOVE).any()) for rho in self.rho)
 
 
-def _late(part: Formula, samples: Mapping[str, Floats]) -> float:
+def _late(part: Formula, samples: Mapping[str, Floats], now: int) -> float:
     if float(values_of(part, samples)) > SATISFIED_ABOVE:
         return 0.0
-    late = late_by(part, samples, SATISFIED_ABOVE)
+    late = late_by(part, samples, now, SATISFIED_ABOVE)
     return np.inf if late is None else float(late)
 
 
@@ -150,7 +152,8 @@ def _gather(gathered: _Gathered) -> None:
         return
     some = range(min(len(parts), MOST_CONJUNCTS))
     each = [reader.alternatives(parts[i]) for i in some]
-    timed = [ends_later(parts[i], 1) is not None for i in some]
+    driven = shield.task.samples(known.history, known.signals)
+    timed = [later(parts[i], 1) is not None and may_be_late(parts[i], driven, known.now) for i in some]
     for i in some:
         if not gathered.kept(i):
             look_for(each[i])
@@ -168,12 +171,9 @@ def _found(
     shield: Shield, known: Known, ground: Ground, ways: Alternatives, may_be_late: Alternatives
 ) -> Iterator[Ints]:
     """Futures [1, m] that meet the needs of some alternative; those of `may_be_late` may begin later."""
-    late = {need.formula for way in may_be_late for need in way if need.first < need.last or not need.stay}
+    late = {need.formula for way in may_be_late for need in way}
     for needs in ways[:MOST_TRIED]:
-        relaxed = [
-            replace(need, last=need.last + MOST_LATE, part=need.formula) if need.formula in late else need
-            for need in needs
-        ]
+        relaxed = [_relaxed(need) if need.formula in late else need for need in needs]
         asked = course(relaxed, known, ground)
         if isinstance(asked, str):
             continue
@@ -181,6 +181,13 @@ def _found(
         found = search(known, ground, shield.body, asked.guards, _wanted(asked, late), until)
         if found is not None:
             yield found[None]
+
+
+def _relaxed(need: Need) -> Need:
+    """The same, but it may end later; or begin later, where it holds throughout a window that is to come."""
+    if need.first == need.last and need.stay:
+        return replace(need, last=need.end, stay=0, part=need.formula)
+    return replace(need, last=need.last + MOST_LATE, part=need.formula)
 
 
 def _wanted(asked: Course, late: set[Formula]) -> list[Wanted]:
@@ -191,4 +198,5 @@ def _wanted(asked: Course, late: set[Formula]) -> list[Wanted]:
 def _want(need: Need, far: Floats, late: bool) -> Wanted:
     if need.first == need.last:
         return Wanted(replace(need, stay=0), far, need.last)
-    return Wanted(replace(need, last=need.last - MOST_LATE) if late else need, far, need.last)
+    within = not late or isinstance(need.part, Always)
+    return Wanted(need if within else replace(need, last=need.last - MOST_LATE), far, need.last)

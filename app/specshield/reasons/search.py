@@ -103,6 +103,10 @@ def search(
             run[:, k] = np.where(holds & (step >= goal.need.first), run[:, k] + 1, 0)
             met[run[:, k] > goal.need.stay] |= 1 << k
             waiting |= holds & (step < goal.need.first)
+        keep = _so_far(known, goals, poses, met)
+        if not keep.all():
+            poses, met, run, parent, motion = poses[keep], met[keep], run[keep], parent[keep], motion[keep]
+            waiting = waiting[keep]
         if (met == every).any():
             node = int(tree.add(poses, step, parent, motion)[np.argmax(met == every)])
             return np.array(tree.way(node, wait) + [wait] * (until - step), np.int64)
@@ -127,6 +131,15 @@ def _kept(known: Known, guards: Sequence[Need], poses: Floats, step: int) -> Boo
     for guard in guards:
         if guard.first <= step <= guard.end:
             keep &= known.at(guard.predicate, poses)
+    return keep
+
+
+def _so_far(known: Known, goals: Sequence[Wanted], poses: Floats, met: Ints) -> Bools:
+    """Which poses keep what has to hold until a goal is met, unless it is."""
+    keep = np.ones(len(poses), np.bool_)
+    for k, goal in enumerate(goals):
+        if goal.need.before is not None:
+            keep &= (met >> k & 1 == 1) | known.at(goal.need.before, poses)
     return keep
 
 

@@ -12,6 +12,7 @@ import msgspec
 from specshield.errors import InputError, SpecshieldError
 from specshield.handover import begun
 from specshield.lookahead.preferences import PROJECTION, prepare
+from specshield.reasons.explanation import explanations
 from specshield.service.heavy.tables import Made, make
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
@@ -125,7 +126,7 @@ def _again(
         carry,
         kept.all_witnesses,
         *points,
-        kept.explain,
+        explanations if kept.explain else None,
     )
     made = record.make(
         replace(decision, t=t),

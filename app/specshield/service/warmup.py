@@ -20,6 +20,7 @@ from specshield.policy.dqn.network import make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.reachability.policy import synthesise
+from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, motion_count
@@ -62,7 +63,7 @@ def _decide(task: Task) -> None:
         episode.start(shield, START)
         first = episode.decide(shield, [START], logits)
         second = [START, first.next_poses[0].tolist()]
-        episode.decide(shield, second, logits, carry=first.carry, occupied=[[1.9, 0.5]], explain=True)
+        episode.decide(shield, second, logits, carry=first.carry, occupied=[[1.9, 0.5]], explain=explanations)
     refusal(shield, np.array([START]), {})
 
 

@@ -178,12 +178,14 @@ class Explanation:
     """Why an action is forbidden.
 
     conjunct: the part of the formula that its best future does not keep. robustness: of that part on it [m].
-    late_by: by how many steps the future comes too late, None where time is not what is missing.
+    late_by: by how many steps the future comes too late, None where time is not what is missing. detail: what
+    else is to be said to a person, None where that is all.
     """
 
     conjunct: str
     robustness: float
     late_by: int | None
+    detail: str | None = None
 
 
 @dataclass(frozen=True)

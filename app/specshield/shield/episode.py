@@ -7,14 +7,14 @@ be made anywhere, and made again.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from specshield.arrays import Floats
+from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
@@ -23,9 +23,8 @@ from specshield.shield import shaping
 from specshield.shield.caution import threshold
 from specshield.shield.caution.experience import learn, remember
 from specshield.shield.caution.threshold import chances, left_of, next_left
-from specshield.shield.decision import Carry, Config, Decision, Mode, Reason, Shield, make_shield
-from specshield.shield.explanation import explanations
-from specshield.shield.feasibility import futures, prefix_of
+from specshield.shield.decision import Carry, Config, Decision, Explanation, Mode, Reason, Shield, make_shield
+from specshield.shield.feasibility import Prefix, futures, prefix_of
 from specshield.shield.judgement import (
     Judged,
     as_actions,
@@ -43,6 +42,7 @@ from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
 
 Signals = Mapping[str, Floats]
+Explainer = Callable[[Shield, Prefix, Judged | None, Bools], tuple[Explanation | None, ...]]
 SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
 
 
@@ -109,15 +109,15 @@ def decide(
     witnesses: bool = False,
     occupied: ArrayLike | None = None,
     free: ArrayLike | None = None,
-    explain: bool = False,
+    explain: Explainer | None = None,
 ) -> Decision:
     """One decision of Algorithm 1, at t = len(history) - 1.
 
     history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main
     task is over; signals {name: [t + 1]}; carry: what the decision at t - 1 handed on; witnesses: give every
-    action's; occupied, free [n, 2]: what the robot's sensors see of the map now; explain: say why each action
-    that is forbidden is. Raises LogitsError for logits that are missing, NaN, +inf, all -inf or of the wrong
-    number.
+    action's; occupied, free [n, 2]: what the robot's sensors see of the map now; explain: what says of each
+    action that is forbidden why it is (reasons/explanation.py). Raises LogitsError for logits that are
+    missing, NaN, +inf, all -inf or of the wrong number.
     """
     task, robot = shield.task, shield.task.robot
     poses = _history(history)
@@ -139,7 +139,7 @@ def decide(
     margin_decided = prefix.low > asked or prefix.high <= asked  # whatever follows, it is kept or it is not
 
     answer: _Answer
-    withstands = spec_status == "satisfied"
+    withstands, doubts = spec_status == "satisfied", np.zeros(len(robot.motions), np.bool_)
     if t >= task.horizon or (spec_status == "satisfied" and margin_decided):
         judged = None
         answer = _unmodified(shield, log_prior)
@@ -152,7 +152,8 @@ def decide(
                 said = (*said, "no way was left, so what was run into is tried again")
                 touches = _look_around(shield.body, poses[-1], nexts)
                 break
-        judged = without(recovered(shield, judged), shield, doubtful(told, taught, poses[-1]))
+        doubts = doubtful(told, taught, poses[-1])
+        judged = without(recovered(shield, judged), shield, doubts)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)
@@ -201,7 +202,7 @@ def decide(
         threshold_left=left,
         map_revision=taught.map.revision,
         any_signal=withstands if shield.config.any_signal and task.signals else None,
-        explanations=explanations(shield, prefix, judged, margin, slack) if explain else (),
+        explanations=explain(shield, prefix, judged, doubts) if explain is not None else (),
         carry=Carry(
             t,
             nexts,

@@ -10,10 +10,11 @@ class Residual(msgspec.Struct, frozen=True):
     rotation: float
 
 
-class Explanation(msgspec.Struct, frozen=True):
+class Explanation(msgspec.Struct, frozen=True, omit_defaults=True):
     conjunct: str
     robustness: float | None
     late_by: int | None
+    detail: str | None = None
 
 
 class StepAnswer(msgspec.Struct, frozen=True, kw_only=True):

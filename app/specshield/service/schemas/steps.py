@@ -94,6 +94,11 @@ class Explanation(Answer):
     late_by: int | None = Field(
         description="By how many steps that future comes too late; null where time is not what is missing."
     )
+    detail: str | None = Field(
+        None,
+        description="In words: which half of an `until` fails and when, when the place of a `G` is reached "
+        "or left, or that a way is known which the policies did not find. Absent where the rest says it all.",
+    )
 
 
 class StepResponse(Answer):

@@ -213,7 +213,7 @@ def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
 
 def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
     return tuple(
-        None if why is None else Explanation(why.conjunct, _finite(why.robustness), why.late_by)
+        None if why is None else Explanation(why.conjunct, _finite(why.robustness), why.late_by, why.detail)
         for why in decision.explanations
     )
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import SpecshieldError
+from specshield.reasons.explanation import explanations
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
@@ -243,7 +244,7 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
         request.witnesses,
         occupied,
         free,
-        request.explain,
+        explanations if request.explain else None,
     )
     if len(since) < len(session.rows):  # the rule's clock began after the session
         decision = replace(decision, t=request.t)

@@ -1,12 +1,15 @@
 """What an explanation says is true: checked against every future of a robot on whole cells."""
 
 import math
+import re
 
 import numpy as np
+import pytest
 
+from specshield.reasons.explanation import explanations
 from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
-from tests.oracles.cells import MOTIONS, Cells, Exhaustive
+from tests.oracles.cells import MOTIONS, WAIT, Cells, Exhaustive, Scripted
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (2, 2)}
 EVEN = np.zeros(5)
@@ -35,7 +38,7 @@ def after(parts, history):
 def explained(parts, history, slack=0):
     cells, told = rule(parts)
     shield = make_shield([Exhaustive(cells)], Config(slack=slack))
-    return decide(shield, history, EVEN, explain=True), told
+    return decide(shield, history, EVEN, explain=explanations), told
 
 
 def test_what_is_late_would_be_kept_with_a_window_that_ends_so_much_later_and_with_none_that_ends_sooner():
@@ -112,7 +115,7 @@ def test_without_being_asked_nothing_is_explained_and_the_decision_is_the_same()
     cells, _ = rule([("F", 0, 3, "A")])
     shield, history = make_shield([Exhaustive(cells)]), [cells.pose(0, 0, 0)]
     plain = decide(shield, history, EVEN)
-    asked = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=True)
+    asked = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=explanations)
     assert plain.explanations == ()
     assert np.array_equal(plain.distribution, asked.distribution)
     assert plain.j_values == asked.j_values
@@ -120,5 +123,83 @@ def test_without_being_asked_nothing_is_explained_and_the_decision_is_the_same()
 
 def test_when_the_rule_is_over_every_action_is_allowed():
     cells, _ = rule([("F", 0, 1, "A")])
-    decision = decide(make_shield([Exhaustive(cells)]), [cells.pose(2, 0, 0)] * 3, EVEN, explain=True)
+    decision = decide(make_shield([Exhaustive(cells)]), [cells.pose(2, 0, 0)] * 3, EVEN, explain=explanations)
     assert decision.explanations == (None,) * 5
+
+
+def until(end):
+    """not B U[0,end] A, and no more."""
+
+    def keeps(inside):
+        first = np.where(inside["A"].any(axis=-1), inside["A"].argmax(axis=-1), 99)
+        broken = np.where(inside["B"].any(axis=-1), inside["B"].argmax(axis=-1), 99)
+        return (first <= end) & (broken >= first)
+
+    return Cells(f"not B U[0,{end}] A", keeps, {"A": (2, 0), "B": (1, 0)})
+
+
+def test_of_an_until_it_is_said_which_half_fails_and_when():
+    seen = {"late": 0, "broken": 0, "late and broken": 0, "not met": 0}
+    for i, j, heading in np.ndindex(4, 3, 4):
+        for end in (2, 4):
+            cells = until(end)
+            history = [cells.pose(i, j, heading)]
+            decision = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=explanations)
+            if decision.spec_status != "pending" or (i, j) in ((1, 1), (1, 0)):
+                continue
+            exact = cells.feasible(history)
+            for motion, why in enumerate(decision.explanations[:MOTIONS]):
+                assert (why is None) == exact[motion]
+                if why is None:
+                    continue
+                met, broken = (re.search(rf"'{side}' is {what} at step (\d+)", why.detail)
+                               for side, what in (("A", "met"), ("not B", "broken")))  # fmt: skip
+                if why.late_by is not None:
+                    seen["late"] += 1
+                    assert broken is None
+                    assert int(met[1]) == end + why.late_by
+                    assert until(end + why.late_by).feasible(history)[motion]
+                elif met is not None:
+                    seen["broken" if int(met[1]) <= end else "late and broken"] += 1
+                    assert int(broken[1]) < int(met[1])
+                else:
+                    seen["not met"] += 1
+                    assert "'A' is not met" in why.detail
+    assert seen["late"] > 10, seen
+
+
+def dwells(begin):
+    """G[begin,5] A."""
+    return Cells(f"G[{begin},5] A", lambda inside: inside["A"][..., begin:6].all(axis=-1), {"A": (2, 0)})
+
+
+def test_of_a_place_to_be_in_from_some_step_on_it_is_said_when_it_is_reached():
+    seen = 0
+    for i, j, heading in np.ndindex(4, 3, 4):
+        for begin in (2, 3):
+            cells = dwells(begin)
+            history = [cells.pose(i, j, heading)]
+            decision = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=explanations)
+            exact = cells.feasible(history)
+            for motion, why in enumerate(decision.explanations[:MOTIONS]):
+                assert (why is None) == exact[motion] or (i, j) == (1, 1)
+                if why is None or why.late_by is None:
+                    continue
+                seen += 1
+                first = begin + why.late_by
+                assert f"'A' is met at step {first}, {why.late_by} step" in why.detail
+                assert dwells(first).feasible(history)[motion]
+                assert not dwells(first - 1).feasible(history)[motion]
+    assert seen > 10
+
+
+@pytest.mark.parametrize("motion", [0, 1, 2])
+def test_a_way_that_the_policies_missed_is_not_denied(motion):
+    cells, _ = rule([("F", 0, 5, "A")])
+    shield = make_shield([Scripted(cells, lambda t, first: [0, 0] if first == WAIT else [WAIT] * 9)])
+    decision = decide(shield, [cells.pose(0, 0, 0)], EVEN, explain=explanations)
+    why = decision.explanations[motion]
+    assert cells.feasible([cells.pose(0, 0, 0)])[motion]
+    assert decision.j_values[motion] == 0.0
+    assert why.robustness > 0.0
+    assert why.detail == "a way is known that keeps the rule, but the policies did not find it"

@@ -1,0 +1,193 @@
+"""Why an action is forbidden: the conjunct that fails, by how much, and how many steps too late.
+
+An action is forbidden where no future was proposed that keeps all conjuncts. Of its futures, those that keep
+all conjuncts but one say which one that is. Where that conjunct would be kept if its window ended later, the
+fewest such steps are given. Futures that come too late are not proposed as such, so some are made here: from
+where the action leads, back onto a witness of another action; and what the proposers would do if the clock
+stood some steps earlier. Where one of all these keeps the rule after all, that is what is said.
+
+Nothing here decides anything: what an action's J is has been settled before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats, Ints
+from specshield.reasons.lateness import in_words, late_by, samples_of, steps, values_of
+from specshield.robot.dynamics import motion_count, step
+from specshield.rule.residual import again, left_over, still_open
+from specshield.shield.decision import Explanation, Shield
+from specshield.shield.feasibility import Prefix
+from specshield.shield.judgement import Judged
+from specshield.shield.proposal import ask
+from specshield.stl import SATISFIED_ABOVE, Formula
+
+# Chosen by hand; an explanation costs some 10 ms.
+DEPTH = 2  # motions after which a witness is met again
+EARLIER = (1, 2, 4, 8, 16, 32)  # steps by which the proposers' clock is put back
+SAME = 1e-6  # [m] and [rad]: poses this near are one pose
+
+Rank = tuple[int, float]
+KEEPS_ALL, KEPT, LATE, BROKEN, SEVERAL, NOTHING = range(6)  # what a future shows, the most telling first
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A conjunct as the formula has it, and what J asks for in its place."""
+
+    conjunct: Formula
+    asked: Formula
+
+
+def explanations(
+    shield: Shield, prefix: Prefix, judged: Judged | None, doubtful: Bools
+) -> tuple[Explanation | None, ...]:
+    """One an action: None where it is allowed, or terminal.
+
+    prefix: as the whole formula sees it. judged: None where the rule forbids nothing any more. doubtful [M]:
+    motions that lead where the robot has run into something.
+    """
+    robot = shield.task.robot
+    if judged is None or not prefix.formula.names:
+        return (None,) * len(robot.actions)
+    found: dict[int, Explanation] = {}
+    for motion in np.flatnonzero(~judged.feasible_motion).tolist():
+        found[motion] = _Motion(shield, prefix, judged, motion, bool(doubtful[motion])).explained()
+    return tuple(found.get(motion) for motion in robot.motion_of.tolist())
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """A motion from x_t that is forbidden."""
+
+    shield: Shield
+    prefix: Prefix
+    judged: Judged
+    motion: int
+    doubtful: bool
+
+    def explained(self) -> Explanation:
+        """By its most telling future: one that keeps all conjuncts; else all but one, the least late or else
+        the most robust; else the one that comes nearest to keeping all, and the conjunct that it keeps least.
+        """
+        parts = self.parts()
+        best, rank = Explanation(str(parts[0].conjunct), -math.inf, None), (NOTHING, math.inf)
+        for earlier, rows in self.futures():
+            if rank[0] == KEEPS_ALL or (rank[0] in (KEPT, LATE) and rank[1] <= earlier):
+                break  # what comes now is as late or later
+            samples = samples_of(self.shield, self.prefix.poses, self.prefix.foreseen, rows)
+            rho = np.array([values_of(part.conjunct, samples) for part in parts])  # [parts, rows]
+            asked = np.array([values_of(part.asked, samples) for part in parts])
+            for n in range(len(rows)):
+                row = {name: values[n] for name, values in samples.items()}
+                order, told = self.shows(parts, rho[:, n], asked[:, n], row)
+                if order < rank:
+                    best, rank = told, order
+        return best
+
+    def parts(self) -> list[_Part]:
+        """The conjuncts that can still be kept, and the broken G that are enforced again."""
+        prefix, slack = self.prefix, self.judged.slack
+        samples = prefix.task.samples(prefix.poses, prefix.signals)
+        kept, broken = left_over(prefix.formula, samples, prefix.t)
+        parts = [
+            _Part(each, still_open(prefix.task, each, prefix.poses, prefix.rows, slack) if slack else each)
+            for each in kept
+        ]
+        enforced = [again([each], prefix.t + 1)[0] for each in broken]
+        parts += [_Part(each, each) for each in enforced]
+        return parts or [_Part(prefix.formula, prefix.formula)]
+
+    def shows(
+        self, parts: Sequence[_Part], rho: Floats, asked: Floats, row: dict[str, Floats]
+    ) -> tuple[Rank, Explanation]:
+        """What a future shows, and how telling that is. rho, asked [parts]: of the conjuncts, and of what J
+        asks for; row {name: [m]}: what the formula reads along it.
+        """
+        above, now = SATISFIED_ABOVE + self.judged.margin, self.prefix.t
+        failing = np.flatnonzero(rho <= SATISFIED_ABOVE)
+        if not len(failing):
+            i, lacking = int(np.argmin(asked)), bool((asked <= above).any()) and not self.doubtful
+            late = late_by(parts[i].asked, row, now, above) if lacking else None
+            order = (KEPT, math.inf if late is None else late) if lacking else (KEEPS_ALL, 0.0)
+            detail = None if lacking else self.known()
+            return order, Explanation(str(parts[i].conjunct), float(rho[i]), late, detail)
+        i = int(np.argmin(rho))
+        conjunct = parts[i].conjunct
+        late = late_by(conjunct, row, now, SATISFIED_ABOVE) if len(failing) == 1 else None
+        told = Explanation(str(conjunct), float(rho[i]), late, in_words(conjunct, row, now))
+        if late is not None:
+            return (LATE, late), told
+        return (BROKEN if len(failing) == 1 else SEVERAL, -told.robustness), told
+
+    def known(self) -> str:
+        """Why a motion is forbidden of which a future is known that keeps all that is asked."""
+        if self.doubtful:
+            return "the rule could still be kept, but the robot has run into something there"
+        told = "a way is known that keeps the rule, but the policies did not find it"
+        margin, slack = self.judged.margin, self.judged.slack
+        if not margin and not slack:
+            return told
+        return (
+            f"{told}, or it leaves less to spare than the session asks for ({margin:.2g} m, {steps(slack)})"
+        )
+
+    def futures(self) -> Iterator[tuple[int, Ints]]:
+        """Motions [n, m] from x_t that begin with this one, to the horizon or to some steps after it; and of
+        how many steps at least what they keep would come too late.
+        """
+        shield, prefix, tried = self.shield, self.prefix, self.judged.tried
+        own = tried.motions[tried.motions[:, 0] == self.motion]
+        yield 0, own if len(own) else np.full((1, prefix.steps), self.motion)
+        x_next = _after(shield, prefix.poses[-1], self.motion)
+        for ways in self.rejoined(x_next).values():
+            yield 0, np.array(ways)
+        before = 0
+        for earlier in EARLIER:
+            if earlier > prefix.t + 1:
+                return
+            # As though x_{t+1} were reached `earlier` steps sooner than it is.
+            upto = prefix.t + 1 - earlier
+            history = np.concatenate([prefix.poses[:upto], x_next[None]])
+            signals = {name: np.append(values[:upto], values[-1:]) for name, values in prefix.signals.items()}
+            left, count = prefix.task.horizon - upto, motion_count(shield.body)
+            for proposer in shield.proposers if left > 0 else ():
+                given, _ = ask(proposer, history, signals, 0.0, count, left)
+                if given is not None:
+                    yield before, np.column_stack([np.full(len(given.motions), self.motion), given.motions])
+            before = earlier
+
+    def rejoined(self, x_next: Floats) -> dict[int, list[Ints]]:
+        """Goes on by another action's witness from where that is met again: ways by the steps they lose."""
+        shield, tried, found = self.shield, self.judged.tried, dict[int, list[Ints]]()
+        x_t, rows = self.prefix.poses[-1:], self.judged.best.row[self.judged.feasible_motion].tolist()
+        ways = [(tried.motions[row], np.concatenate([x_t, tried.poses[row]])) for row in rows]
+        front = [(x_next, [self.motion])]
+        for depth in range(DEPTH + 1 if ways else 0):
+            for pose, taken in front:
+                for motions, poses in ways:
+                    off = np.abs(poses[: len(taken)] - pose)
+                    turned = np.minimum(off[:, 2], 2.0 * math.pi - off[:, 2])
+                    met = np.flatnonzero(np.maximum(off[:, :2].max(axis=1), turned) < SAME)
+                    if len(met):
+                        way = np.append(taken, motions[met[-1] :])
+                        found.setdefault(len(taken) - int(met[-1]), []).append(way)
+            if found:
+                break
+            if depth < DEPTH:
+                front = [
+                    (_after(shield, pose, m), [*taken, m])
+                    for pose, taken in front
+                    for m in range(motion_count(shield.body))
+                ]
+        return dict(sorted(found.items()))
+
+
+def _after(shield: Shield, pose: Floats, motion: int) -> Floats:
+    x, y, theta = pose.tolist()
+    return np.array(step(shield.body, x, y, theta, motion), np.float64)

@@ -1,0 +1,132 @@
+"""How a future stands to one conjunct: its robustness, how late it comes, and in words which half of it fails
+and when.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from specshield.arrays import Bools, Floats, Ints
+from specshield.errors import SampleError
+from specshield.robot.dynamics import simulate
+from specshield.shield.decision import Shield
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Implies, Until, robustness
+from specshield.stl.fragment import is_predicate
+
+
+def samples_of(
+    shield: Shield, history: Floats, signals: Mapping[str, Floats], motions: Ints
+) -> dict[str, Floats]:
+    """What the formula reads along x_0..x_t and each row of motions [n, m]: {name: [n, t + 1 + m]}."""
+    poses = np.empty((len(motions), len(history) + motions.shape[1], 3))
+    poses[:, : len(history)] = history
+    for row, joined in zip(motions, poses, strict=True):
+        simulate(shield.body, history[-1], np.ascontiguousarray(row, np.int64), joined[len(history) :])
+    return shield.task.samples(poses, signals)
+
+
+def values_of(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
+    """rho along each trajectory, -inf on all where the formula's arithmetic is not finite on one of them."""
+    some = next(iter(samples.values()))
+    try:
+        return np.broadcast_to(robustness(formula, {n: samples[n] for n in formula.names}), some.shape[:-1])
+    except SampleError:
+        return np.full(some.shape[:-1], -np.inf)
+
+
+def late_by(part: Formula, samples: Mapping[str, Floats], now: int, above: float) -> int | None:
+    """The fewest steps later that the window of an F or U would have to end for its rho to be above `above`,
+    or that of a G over a place to be in to begin; None where no later one that the samples [m] reach would
+    do, or the G has begun by step `now`.
+    """
+    if later(part, 1) is None or not may_be_late(part, samples, now):
+        return None
+
+    def kept(late: int) -> bool:
+        return float(values_of(later(part, late) or part, samples)) > above
+
+    low, high = 0, min(len(values) for values in samples.values()) - 1 - part.horizon
+    if isinstance(part, Always) and is_predicate(part.child):
+        high = part.b - part.a
+    if high < 1 or not kept(high):
+        return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if kept(middle) else (middle, high)
+    return high
+
+
+def later(part: Formula, late: int) -> Formula | None:
+    """The same with the window of its F or U, alone or below a G as in a patrol, ending so much later; or
+    that of its G over a predicate beginning so much later.
+    """
+    match part:
+        case Eventually() | Until():
+            return replace(part, b=part.b + late)
+        case Always(a, b, child) if is_predicate(child):
+            return replace(part, a=min(a + late, b)) if a < b else None
+        case Always(child=child) if inner := later(child, late):
+            return replace(part, child=inner)
+        case Implies(right=right) if inner := later(right, late):
+            return replace(part, right=inner)
+    return None
+
+
+def may_be_late(part: Formula, samples: Mapping[str, Floats], now: int) -> bool:
+    """Not a G over a predicate that has begun, or that the robot leaves as it begins."""
+    if not isinstance(part, Always) or not is_predicate(part.child):
+        return True
+    return part.a > now + 1 or (part.a > now and not _holds(part.child, samples)[now])
+
+
+def in_words(part: Formula, samples: Mapping[str, Floats], now: int) -> str | None:
+    """What fails of an U or G over predicates along x_0.., and when; None of other conjuncts, and where
+    nothing fails. samples {name: [m]}; now: the last step that has been driven.
+    """
+    match part:
+        case Until(a, b, left, right) if is_predicate(left) and is_predicate(right):
+            return _of_until(part, _holds(left, samples), _holds(right, samples))
+        case Always(a, b, child) if is_predicate(child):
+            holds = _holds(child, samples)
+            failing = np.flatnonzero(~holds[: b + 1])
+            failing = failing[failing >= max(a, now)]
+            if not len(failing):
+                return None
+            if not may_be_late(part, samples, now):
+                return f"on the best one '{child}' is broken at step {failing[0]}"
+            met = np.flatnonzero(holds[failing[0] :])
+            if not len(met) or failing[0] > a or failing[0] + met[0] > b:
+                return f"on the best one '{child}' does not hold at step {failing[0]}"
+            first = int(failing[0] + met[0])
+            after = f"{steps(first - a)} after its window begins"
+            return f"on the best one '{child}' is met at step {first}, {after}"
+    return None
+
+
+def _of_until(part: Until, left: Bools, right: Bools) -> str | None:
+    """left, right [m]: where each side holds."""
+    met = np.flatnonzero(right[part.a :])
+    broken = np.flatnonzero(~left[: part.a + met[0]] if len(met) else ~left)
+    breaks = f"'{part.left}' is broken at step {broken[0]}" if len(broken) else ""
+    if not len(met):
+        return f"on the best one '{part.right}' is not met" + (f", and {breaks}" if breaks else "")
+    first = part.a + int(met[0])
+    if first <= part.b:
+        return f"on the best one {breaks}, before '{part.right}' is met at step {first}" if breaks else None
+    told = f"'{part.right}' is met at step {first}, {steps(first - part.b)} too late"
+    if breaks:
+        return f"on the best one {breaks}, and {told}"
+    return f"on the best one '{part.left}' holds until then, but {told}"
+
+
+def _holds(predicate: Formula, samples: Mapping[str, Floats]) -> Bools:
+    """At each step [m]; nowhere where the predicate's arithmetic is not finite on some of them."""
+    each = {name: values[:, None] for name, values in samples.items()}  # every step is a trajectory of one
+    return np.asarray(values_of(predicate, each) > SATISFIED_ABOVE)
+
+
+def steps(count: int) -> str:
+    return f"{count} step{'s' if count != 1 else ''}"
