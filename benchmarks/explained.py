@@ -9,8 +9,9 @@ shares nothing with the shield but f: whether there is a way that keeps the rule
 it can be kept alone, and beside the others if its window ended (of `G[a,b] place`: began) later.
 
 Markdown for a reader, who is to judge of each whether it is true and understood. At the end is counted what
-can be without one: how often a way is there that the policies did not find, whether the line says so, and how
-often the search knows a way that is less late than the one that is named.
+can be without one: how often a way is there and whether the line says so, how often the search knows a way
+that is less late than the one that is named; and of all forbidden actions of these episodes, how often a way
+is known that the policies did not find.
 """
 
 from __future__ import annotations
@@ -29,7 +30,6 @@ from benchmarks.ways import Disc, Part, earliest, rule
 from evaluation.model.floor_plans import random_house
 from specshield.client.models import Decision
 from specshield.errors import InfeasibleStart
-from specshield.local.session import LocalSession
 from specshield.local.shield import LocalShield
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
@@ -44,6 +44,7 @@ FORWARD = int(STRETCH.action_names.index("m"))
 METHODS = ("reachability", "planner")
 KINDS = ("reach", "until", "stay", "out", "dwell")
 UNCERTAINTIES = ("none", "learned")
+KNOWN = "a way is known"  # as the line says it
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Case:
 
     def way(self, history: Floats, parts: Sequence[Part] | None = None) -> bool:
         parts = self.parts if parts is None else parts
-        until = max(part.b + part.dwell for part in parts)
+        until = max([len(history) - 1, *(part.b + part.dwell for part in parts)])
         return earliest(self.body, STRETCH.wait_motion, history, parts, until) >= 0
 
 
@@ -114,48 +115,45 @@ def _disc(pose: Floats, least: float, most: float, random: Random) -> Disc:
     return round(float(pose[0]), 2), round(float(pose[1]), 2), round(random.uniform(least, most), 2)
 
 
-def _driven(case: Case, seed: int, upto: int, explain: bool) -> tuple[list[Decision], list[Floats]]:
-    """The decisions at steps 0 to `upto`, the last one explained if asked for, and the poses there."""
+def _driven(case: Case, seed: int) -> tuple[list[Decision], list[Floats]]:
+    """The decisions of an episode, each explained, and the poses at which they were made."""
     random = np.random.default_rng([seed, case.number, 2])
     pose, decisions, poses = case.pose, list[Decision](), list[Floats]()
-    session: LocalSession = case.shield.session(
-        initial_pose=tuple(pose.tolist()), uncertainty=case.uncertainty, seed=seed
-    )
+    session = case.shield.session(initial_pose=tuple(pose.tolist()), uncertainty=case.uncertainty, seed=seed)
     with session:
-        while session.t <= min(upto, case.shield.task.horizon - 1) and session.spec_status == "pending":
+        while session.t < case.shield.task.horizon and session.spec_status == "pending":
             logits = np.where(STRETCH.terminal, -np.inf, random.normal(0.0, 2.0, len(STRETCH.actions)))
             logits[FORWARD] += 2.0
-            decisions.append(session.step(pose, logits, explain=explain and session.t == upto))
+            decisions.append(session.step(pose, logits, explain=True))
             poses.append(pose)
             pose = np.array(decisions[-1].next_poses[decisions[-1].execute])
     return decisions, poses
 
 
-def forbidden(case: Case, seed: int, counts: Counter[str]) -> bool:
-    """Prints one forbidden action of an episode, drawn at random; False where there is none."""
+def forbidden(case: Case, seed: int, counts: Counter[str]) -> None:
+    """Prints one forbidden action of an episode, drawn at random, if there is one."""
     random = np.random.default_rng([seed, case.number, 3])
+    decisions, poses = _driven(case, seed)
     choices = [
-        (decision.t, action)
-        for decision in _driven(case, seed, LONGEST + AFTER, False)[0]
+        (t, int(action), told)
+        for t, decision in enumerate(decisions)
         for action in STRETCH.representative
-        if decision.j_values[action] == 0.0 and decision.mode != "violated"
+        if (told := (decision.explanations or ())[action]) is not None and decision.mode != "violated"
     ]
     if not choices:
-        return False
-    t, action = choices[random.integers(len(choices))]
-    decisions, poses = _driven(case, seed, t, True)
-    decision = decisions[-1]
-    x_t = poses[-1]
+        return
+    counts[f"forbidden in all episodes, {case.uncertainty}"] += len(choices)
+    for _, _, told in choices:
+        counts[f"of these a way is known, {case.uncertainty}"] += KNOWN in (told.detail or "")
+    t, action, told = choices[random.integers(len(choices))]
+    decision, x_t = decisions[t], poses[t]
     x_next = np.array(step(case.body, *x_t.tolist(), int(STRETCH.motion_of[action])))
-    history = np.array([*poses, x_next])
+    history = np.array([*poses[: t + 1], x_next])
     _heading(case, f"forbidden at step {t}")
     print(f"- asked: '{STRETCH.action_names[action]}' at {_shown(x_t)}, which leads to {_shown(x_next)}")
     if decision.margin or decision.slack:
         print(f"- in hand: {decision.margin:.3g} m, {decision.slack} steps")
-    line = decision.why(int(action))
-    print(f"- **told: {line}**")
-    told = decision.explanations[action] if decision.explanations is not None else None
-    assert told is not None
+    print(f"- **told: {decision.why(action)}**")
     way = _searched(case, history)
     counts["forbidden"] += 1
     counts["a way is there"] += way
@@ -163,11 +161,10 @@ def forbidden(case: Case, seed: int, counts: Counter[str]) -> bool:
         counts["a way is there, and the line does not say so"] += 1
         print("- THE LINE DOES NOT SAY THAT A WAY IS THERE")
     _late(case, history, told.conjunct, told.late_by, way, counts)
-    return True
 
 
-def refused(case: Case, counts: Counter[str]) -> bool:
-    """Prints what a refusal says; False where the start is accepted."""
+def refused(case: Case, counts: Counter[str]) -> None:
+    """Prints what a refusal says, where the start is refused."""
     try:
         case.shield.session(initial_pose=tuple(case.pose.tolist()), uncertainty=case.uncertainty)
     except InfeasibleStart as error:
@@ -180,8 +177,6 @@ def refused(case: Case, counts: Counter[str]) -> bool:
         if way and "a search found one" not in error.message:
             counts["a way is there, and the line does not say so"] += 1
             print("- THE LINE DOES NOT SAY THAT A WAY IS THERE")
-        return True
-    return False
 
 
 def _heading(case: Case, what: str) -> None:
@@ -271,9 +266,9 @@ def main() -> None:
             except InfeasibleStart:
                 counts["refused, though the search finds a way"] += 1
         number += 1
-    print("\n| what | of | count |\n|---|--:|--:|")
+    print("\n| what | count |\n|---|--:|")
     for what, count in counts.items():
-        print(f"| {what} | {asked.n} | {count} |")
+        print(f"| {what} | {count} |")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from specshield.reasons.explanation import explanations
 from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
 from tests.oracles.cells import MOTIONS, WAIT, Cells, Exhaustive, Scripted
+from tests.reasons.rules_on_cells import dwells, until
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (2, 2)}
 EVEN = np.zeros(5)
@@ -127,17 +128,6 @@ def test_when_the_rule_is_over_every_action_is_allowed():
     assert decision.explanations == (None,) * 5
 
 
-def until(end):
-    """not B U[0,end] A, and no more."""
-
-    def keeps(inside):
-        first = np.where(inside["A"].any(axis=-1), inside["A"].argmax(axis=-1), 99)
-        broken = np.where(inside["B"].any(axis=-1), inside["B"].argmax(axis=-1), 99)
-        return (first <= end) & (broken >= first)
-
-    return Cells(f"not B U[0,{end}] A", keeps, {"A": (2, 0), "B": (1, 0)})
-
-
 def test_of_an_until_it_is_said_which_half_fails_and_when():
     seen = {"late": 0, "broken": 0, "late and broken": 0, "not met": 0}
     for i, j, heading in np.ndindex(4, 3, 4):
@@ -166,11 +156,6 @@ def test_of_an_until_it_is_said_which_half_fails_and_when():
                     seen["not met"] += 1
                     assert "'A' is not met" in why.detail
     assert seen["late"] > 10, seen
-
-
-def dwells(begin):
-    """G[begin,5] A."""
-    return Cells(f"G[{begin},5] A", lambda inside: inside["A"][..., begin:6].all(axis=-1), {"A": (2, 0)})
 
 
 def test_of_a_place_to_be_in_from_some_step_on_it_is_said_when_it_is_reached():

@@ -7,6 +7,7 @@ from specshield.reasons.refusal import begin, refusal
 from specshield.reasons.relaxation import relaxations
 from specshield.shield.episode import decide, make_shield
 from tests.oracles.cells import Cells, Scripted, waits
+from tests.reasons.rules_on_cells import dwells, until
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (4, 4), "D": (1, 0)}
 
@@ -56,6 +57,22 @@ def test_each_conjunct_alone_and_how_late_it_is():
             )
             assert not exists([*beside, (op, start, min(end + told.late_by - 1, 6), place)], history)
     assert min(seen.values()) >= 3, seen
+
+
+def test_how_late_an_until_and_a_place_to_be_in_come():
+    seen = 0
+    for column, heading in ((0, 1), (0, 2), (3, 0), (3, 1), (3, 3)):
+        for rule, at in ((until, 1), (dwells, 2)):
+            cells = rule(at)
+            history = np.array([cells.pose(column, 0, heading)])
+            if cells.feasible(history).any():
+                continue
+            (told,) = relaxations(make_shield([Scripted(cells, waits)]), history, {}).conjuncts
+            if told.late_by is not None:
+                seen += 1
+                assert rule(at + told.late_by).feasible(history).any()
+                assert not rule(at + told.late_by - 1).feasible(history).any()
+    assert seen >= 4
 
 
 def shield(parts):
