@@ -4,8 +4,8 @@
 
 Robots of case 1 drive as they are told (`next_poses[execute]`), each one step after another. For HTTP with
 JSON, HTTP with MessagePack and the WebSocket with MessagePack: CPU time of server and store a step, and of
-the store alone [us, user and system, of the processes], p50 and p99 as the robots wait [ms], bytes sent and
-received with their heads.
+the store alone [us, user and system, of the processes, from when all sessions have begun], p50 and p99 as
+the robots wait [ms], bytes sent and received with their heads.
 With `--ways session` a step is to begin a session and to close it. The bare route validates the same body by
 the same pydantic schema, and answers the JSON of a step, under the same uvicorn. Both are asked by the same
 client in another process. CPU time is what to compare: others may use the machine.
@@ -27,7 +27,6 @@ from typing import Any
 
 import msgpack
 import numpy as np
-import websockets
 
 from specshield.service.schemas.steps import StepRequest
 from specshield.sim.service import _free_port, follow_parent, own_server
@@ -37,7 +36,9 @@ Ask = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
 
 
 class Connection:
-    """One robot's connection over HTTP/1.1, with as little as will do: the client shall not be the limit."""
+    """One robot's connection, by HTTP/1.1 or a WebSocket, with as little as will do: the client shall not be
+    the limit.
+    """
 
     def __init__(self, port: int, packed: bool = False) -> None:
         self._port, self._packed = port, packed
@@ -64,6 +65,37 @@ class Connection:
         found: dict[str, Any] = msgpack.unpackb(answer) if self._packed else json.loads(answer)
         return found
 
+    async def upgrade(self, path: str) -> None:
+        key = "dGhlIHNhbXBsZSBub25jZQ=="  # any will do (RFC 6455, 1.2)
+        head = (
+            f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{self._port}\r\nUpgrade: websocket\r\n"
+            f"Connection: Upgrade\r\nSec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n\r\n"
+        )
+        self._writer.write(head.encode())
+        top = await self._reader.readuntil(b"\r\n\r\n")
+        if top.split()[1] != b"101":
+            raise RuntimeError(top.decode())
+
+    async def tell(self, body: dict[str, Any]) -> dict[str, Any]:
+        """One message each way, in MessagePack; binary frames as RFC 6455, 5.2 has them, with a mask of 0."""
+        content = msgpack.packb(body)
+        size = (
+            bytes([0xFE]) + len(content).to_bytes(2, "big")
+            if len(content) > 125
+            else bytes([0x80 + len(content)])
+        )
+        frame = b"\x82" + size + bytes(4) + content
+        self._writer.write(frame)
+        head = await self._reader.readexactly(2)
+        short = head[1] < 126
+        length = head[1] if short else int.from_bytes(await self._reader.readexactly(2), "big")
+        answer = await self._reader.readexactly(length)
+        self.sent, self.got = self.sent + len(frame), self.got + (2 if short else 4) + length
+        found: dict[str, Any] = msgpack.unpackb(answer)
+        if head[0] != 0x82 or "status" in found:
+            raise RuntimeError(found)
+        return found
+
 
 async def robot(
     ask: Ask, pose: list[float], steps: int, random: np.random.Generator, waits: list[float]
@@ -78,14 +110,20 @@ async def robot(
 
 
 async def drive(
-    url: str, bare: int, way: str, robots: int, steps: int, seed: int
+    url: str,
+    bare: int,
+    way: str,
+    robots: int,
+    steps: int,
+    seed: int,
+    ready: Callable[[], None] = lambda: None,
 ) -> tuple[list[float], tuple[int, int]]:
     """Every robot's waits [s], and the bytes that all sent and got. way: `bare`, `json`, `msgpack`, `stream`
-    or `session`. bare: that route's port.
+    or `session`. bare: that route's port. ready: called when all sessions have begun, before the first step.
     """
-    port, waits, sockets = int(url.rpartition(":")[2]), list[float](), []
+    port, waits = int(url.rpartition(":")[2]), list[float]()
     asks: list[Ask] = []
-    connections: list[Any] = []
+    connections: list[Connection] = []
     for i in range(robots):
         made = Connection(port)
         await made.open()
@@ -96,24 +134,21 @@ async def drive(
         start = {"policy_id": CASE, "initial_pose": [4.5, 5.0, HEADING], "seed": seed + i}
         id = (await made.post("/v1/sessions", start))["id"]
         path = f"/v1/sessions/{id}/steps"
-        if way == "stream":
-            address = f"ws://127.0.0.1:{port}/v1/sessions/{id}/stream"
-            sockets.append(await websockets.connect(address, compression=None, ping_interval=None))
-            connections.append(Connection(port))  # which counts alone
-            asks.append(lambda body, s=sockets[-1], c=connections[-1]: _over(s, c, body))
-            continue
         connection = Connection(bare if way == "bare" else port, way == "msgpack")
         await connection.open()
         connections.append(connection)
-        asks.append(lambda body, c=connection, p=path: c.post(p, body))
+        if way == "stream":
+            await connection.upgrade(f"/v1/sessions/{id}/stream")
+            asks.append(connection.tell)
+        else:
+            asks.append(lambda body, c=connection, p=path: c.post(p, body))
+    ready()
     await asyncio.gather(
         *(
             robot(ask, [4.5, 5.0, HEADING], steps, np.random.default_rng([seed, i]), waits)
             for i, ask in enumerate(asks)
         )
     )
-    for each in sockets:
-        await each.close()
     return waits, (sum(each.sent for each in connections), sum(each.got for each in connections))
 
 
@@ -122,18 +157,6 @@ async def _session(connection: Connection, seed: int) -> dict[str, Any]:
     id = (await connection.post("/v1/sessions", start))["id"]
     await connection.post(f"/v1/sessions/{id}/close", {})
     return {"action": None}
-
-
-async def _over(stream: Any, count: Connection, body: dict[str, Any]) -> dict[str, Any]:
-    sent = msgpack.packb(body)
-    await stream.send(sent)
-    got = await stream.recv()
-    # The head of a frame of 126 to 65,535 bytes: 4 bytes, and 4 of a mask from the client (RFC 6455, 5.2).
-    count.sent, count.got = count.sent + len(sent) + 8, count.got + len(got) + 4
-    found: dict[str, Any] = msgpack.unpackb(got)
-    if "status" in found:
-        raise RuntimeError(found)
-    return found
 
 
 def cpu(pids: list[int]) -> float:
@@ -179,10 +202,14 @@ def _run(
 ) -> dict[str, float]:
     """What a step costs these processes while `count` robots drive."""
     store = [pid for pid in pids if "valkey" in _command(pid).split(" ")[0]]
-    before, stored, sessions = cpu(pids), cpu(store), count * steps
-    waits, (sent, got) = asyncio.run(drive(url, port, way, count, steps, seed))
-    row = {"us": 1e6 * (cpu(pids) - before) / sessions, "store": 1e6 * (cpu(store) - stored) / sessions}
-    row |= {"sent": sent / sessions, "got": got / sessions}
+    before, taken = list[float](), count * steps
+
+    def ready() -> None:
+        before.extend((cpu(pids), cpu(store)))
+
+    waits, (sent, got) = asyncio.run(drive(url, port, way, count, steps, seed, ready))
+    row = {"us": 1e6 * (cpu(pids) - before[0]) / taken, "store": 1e6 * (cpu(store) - before[1]) / taken}
+    row |= {"sent": sent / taken, "got": got / taken}
     return row | {f"p{q}": 1e3 * float(np.percentile(waits, q)) for q in (50, 99)}
 
 

@@ -186,7 +186,7 @@ def openapi() -> None:
     from specshield.service.app import create_app
     from specshield.service.settings import read_settings
 
-    print(json.dumps(create_app(read_settings()).openapi(), indent=1, sort_keys=True))
+    print(json.dumps(create_app(read_settings()).routes.openapi(), indent=1, sort_keys=True))
 
 
 def demo(

@@ -23,7 +23,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 @pytest.fixture(scope="module")
 def told():
-    return create_app(Settings()).openapi()
+    return create_app(Settings()).routes.openapi()
 
 
 def operations(told):

@@ -24,6 +24,7 @@ def oddities(grid: OccupancyGrid, body: Body, poses: Floats) -> Iterator[str]:
         spans = f"({low_x:g}, {low_y:g}) to ({high_x:g}, {high_y:g})"
         yield f"the pose ({x:g}, {y:g}) is off the map, which spans {spans} in metres"
     if len(poses) > 1:
-        moved, most = math.hypot(*(poses[-1, :2] - poses[-2, :2])), longest_motions(body)[0]
-        if moved > most + JUMP:
+        last_x, last_y, _ = poses[-2].tolist()
+        moved = math.hypot(x - last_x, y - last_y)
+        if moved > JUMP and moved > (most := longest_motions(body)[0]) + JUMP:
             yield f"the pose is {moved:.3g} m from the one before; the robot's longest motion is {most:g} m"

@@ -12,6 +12,7 @@ from functools import partial
 
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
+from starlette.types import Receive, Scope, Send
 
 from specshield import __version__
 from specshield.errors import SpecshieldError, StoreError
@@ -57,7 +58,23 @@ order: check a formula, send a map, begin a session, decide a step, close, read 
 """
 
 
-def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None = None) -> FastAPI:
+class Application:
+    """The routes, and around them what every request passes, outside of FastAPI's own layers: a step needs
+    none of those, and would pay for each.
+    """
+
+    def __init__(self, routes: FastAPI, settings: Settings) -> None:
+        self.routes = routes
+        steps = StreamRoute(StepRoute(routes), settings.max_body_bytes)
+        # Nothing is read for who may not ask.
+        self._around = Observe(Guard(Bodies(steps, settings), settings.hosts))
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope["app"] = self.routes
+        await self._around(scope, receive, send)
+
+
+def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None = None) -> Application:
     """The application. Nothing is opened before it starts.
 
     embedded: this process's share in the embedded store, where it has one already; left at the end.
@@ -77,13 +94,8 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
         app.include_router(module.router)
     app.include_router(events.overview)
     problems.install(app)
-    app.add_middleware(StepRoute)  # the innermost
-    app.add_middleware(StreamRoute, max_message=settings.max_body_bytes)
-    app.add_middleware(Bodies, settings=settings)  # nothing is read for who may not ask
-    app.add_middleware(Guard, allowed_hosts=settings.hosts)
-    app.add_middleware(Observe)  # the outermost
     app.openapi = lambda: described(app)  # type: ignore[method-assign]
-    return app
+    return Application(app, settings)
 
 
 @asynccontextmanager

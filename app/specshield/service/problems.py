@@ -110,6 +110,15 @@ def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -
     return ProblemResponse(error, status, extra)
 
 
+def failed() -> Response:
+    """For what nobody expected. Whoever sends it raises the error again: uvicorn writes the traceback to the
+    log and closes the connection, which the caller has to know before it asks there again.
+    """
+    return response(
+        errors.ServerError("the server failed on this request; its log says more"), {"Connection": "close"}
+    )
+
+
 class ProblemResponse(Response):
     """A problem document. Once it is sent, `scope["state"]["problem"]` is its type."""
 
@@ -246,10 +255,7 @@ def install(app: FastAPI) -> None:
         return response(errors.InsufficientStorage("the server's disk is full", expected="a disk with room"))
 
     async def unknown(request: Request, error: Exception) -> Response:
-        # The traceback goes to the log: starlette raises the error again after this answer, and uvicorn then
-        # closes the connection, which the caller has to know before it asks there again.
-        failed = errors.ServerError("the server failed on this request; its log says more")
-        return response(failed, {"Connection": "close"})
+        return failed()
 
     app.add_exception_handler(SpecshieldError, known)
     app.add_exception_handler(RequestValidationError, invalid)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Literal
 
 from specshield.arrays import Floats
@@ -93,6 +92,7 @@ class Config:
 class Shield:
     """A task, the policies that propose futures for it and a session's settings, prepared once.
 
+    conjunction: the formula as `conjunction_of` has it.
     Raises InputError where a preference is given to a session that does not choose within S_t.
     """
 
@@ -101,15 +101,12 @@ class Shield:
     config: Config
     body: Body = field(repr=False)
     view: View = field(repr=False)
+    conjunction: tuple[Formula, Conjuncts] = field(repr=False)
     preference: Preference | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.preference is not None:
             check_preferring(self.config)
-
-    @cached_property
-    def conjunction(self) -> tuple[Formula, Conjuncts]:
-        return conjunction_of(self.task, self.task.formula)
 
     @property
     def max_steps(self) -> int:
@@ -147,6 +144,7 @@ def make_shield(
         config or Config(),
         make_body(task.robot, task.grid),
         view_of(task, task.formula),
+        conjunction_of(task, task.formula),
         preference,
     )
 

@@ -7,9 +7,11 @@ be made anywhere, and made again.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -145,15 +147,14 @@ def decide(
         answer = _unmodified(shield, log_prior)
     else:
         shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
-        for doubt in () if judged.feasible.any() else doubted(taught, t):
+        for doubt in () if judged.some else doubted(taught, t):
             found = judged_by_signals(on_map(told, doubt.map, True), prefix, tail, spec_status, care)
-            if found[2].feasible.any():
+            if found[2].some:
                 (shield, prefix, judged, withstands), taught = found, doubt
                 said = (*said, "no way was left, so what was run into is tried again")
                 touches = _look_around(shield.body, poses[-1], nexts)
                 break
-        doubts = doubtful(told, taught, poses[-1])
-        judged = without(recovered(shield, judged), shield, doubts)
+        judged = without(recovered(shield, judged), shield, doubts := doubtful(told, taught, poses[-1]))
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)
@@ -236,7 +237,7 @@ def _answer(
     left: of a threshold over the episode (threshold.py).
     """
     terminal = shield.task.robot.terminal
-    any_feasible = bool(judged.feasible.any())
+    any_feasible = judged.some
     said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
     certified = np.zeros(len(terminal))
     certified[judged.completion] = 1.0
@@ -343,6 +344,7 @@ def _gaps(foreseen: Floats, pose: Floats, gap: Floats) -> tuple[float, float]:
 def _draw(distribution: Floats, seed: int, t: int) -> int:
     """An action drawn with the session's seed and t, so that a replay draws the same."""
     drawn = blake2b(b"%d %d" % (seed, t), digest_size=8).digest()
-    edges = distribution.cumsum()
+    shares = distribution.tolist()
+    edges = list(accumulate(shares))
     point = int.from_bytes(drawn, "big") / 2.0**64 * edges[-1]
-    return int(min(edges.searchsorted(point, side="right"), distribution.nonzero()[0][-1]))
+    return min(bisect_right(edges, point), max(a for a, share in enumerate(shares) if share != 0.0))

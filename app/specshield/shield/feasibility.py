@@ -108,7 +108,7 @@ def futures(
 
     tail: motions from x_t to the horizon, one a byte, T - t of them, simulated anew from the pose there is.
     """
-    count, rows, warnings = motion_count(body), list[Ints](), list[str]()
+    count, rows, warnings = len(prefix.task.robot.motions), list[Ints](), list[str]()
     if tail is not None and len(tail) == prefix.steps:
         rows.append(np.frombuffer(tail, np.uint8).astype(np.int64)[None])
     preferred = None

@@ -37,6 +37,11 @@ class Judged:
     slack: int  # [steps]: how much of what was asked for can be had
     margin_unattainable: bool  # it is less
 
+    @property
+    def some(self) -> bool:
+        """Whether some action is feasible."""
+        return True in self.feasible.tolist()
+
 
 def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, care: Care) -> Judged:
     """Tries the futures from x_t, and judges each motion by the best of its futures.
@@ -57,7 +62,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     if lowered or (care.has_slack and _some(best)):
         aimed = aim(shield, care, part, tried, kept, leaves)
         best, feasible = aimed.best, aimed.kept
-    some, first = bool(feasible.any()), tried.preferred
+    some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
         tried = replace(tried, warnings=(*tried.warnings, *given_up(prefix)))
     if tail and feasible[tail[0]]:
@@ -72,7 +77,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
 
 def recovered(shield: Shield, judged: Judged) -> Judged:
     """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words."""
-    if judged.feasible.any() or not recovers(shield.config):
+    if judged.some or not recovers(shield.config):
         return judged
     first, said = most_kept(shield, judged.part, judged.tried)
     tried = replace(judged.tried, warnings=(*judged.tried.warnings, *said))
@@ -81,6 +86,8 @@ def recovered(shield: Shield, judged: Judged) -> Judged:
 
 def without(judged: Judged, shield: Shield, doubtful: Bools) -> Judged:
     """Without the motions [M] that are doubtful, unless no other is feasible."""
+    if True not in doubtful.tolist():
+        return judged
     robot, sure = shield.task.robot, judged.feasible_motion & ~doubtful
     if not sure.any() or sure.sum() == judged.feasible_motion.sum():
         return judged
@@ -166,7 +173,7 @@ def _holds_now(prefix: Prefix, formula: Always) -> bool:
 
 
 def _some(best: Best) -> bool:
-    return bool(best.robustness.max() > SATISFIED_ABOVE)
+    return bool(max(best.robustness.tolist()) > SATISFIED_ABOVE)
 
 
 @kernel
@@ -206,7 +213,7 @@ def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ..
     if judged is None:
         return (None,) * len(robot.actions)
     if shield.config.evaluation == "feasibility":
-        highest = 1.0 if judged.feasible.any() else 0.0
+        highest = 1.0 if judged.some else 0.0
         pairs = zip(robot.terminal.tolist(), judged.feasible.tolist(), strict=True)
         return tuple([highest if terminal else float(feasible) for terminal, feasible in pairs])
     return _as_numbers(np.where(robot.terminal, judged.values.max(), judged.values))

@@ -67,4 +67,4 @@ def _judged_at_worst(
     proposers = tuple(p.foreseeing(held[0]) if hasattr(p, "foreseeing") else p for p in shield.proposers)
     shield, prefix = replace(shield, proposers=proposers), replace(prefix, held=held)
     judged = judge(shield, prefix, tail, False, care)
-    return (shield, prefix, judged) if judged.feasible.any() else None
+    return (shield, prefix, judged) if judged.some else None

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from specshield.arrays import Bools, Floats
+from specshield.compiled import leaf
 from specshield.robot.dynamics import Body, make_body, overlap, successors
 from specshield.shield.caution.experience import was_stopped, within_noise
 from specshield.shield.decision import Carry, Config, Shield
@@ -92,9 +93,10 @@ def teach(
         )
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses):
             motion, followed = -1, replace(followed, met=0)
-        x, y, _ = 0.5 * (poses[-2] + poses[-1])  # half way: a motion goes straight on before it turns
-        for pose in (np.array([x, y, poses[-2, 2]]), poses[-1]):
-            if overlap(body, *pose) > UNDER:
+        half_way = np.empty(3)
+        covers = _covers(body, poses[-2], poses[-1], half_way)
+        for pose, deep in zip((half_way, poses[-1]), covers, strict=True):
+            if deep:
                 known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)
         if motion >= 0:
             driven = poses[np.hypot(*(poses[:, :2] - poses[-1, :2]).T) <= NEARBY]
@@ -111,6 +113,17 @@ def teach(
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
     return Taught(own, followed, motion >= 0), said
+
+
+@leaf
+def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tuple[bool, bool]:
+    """Whether the footprint covers obstacles by more than UNDER half way between two poses (3,), and at the
+    second. half_way (3,) is written: a motion goes straight on before it turns.
+    """
+    half_way[0], half_way[1] = 0.5 * (before[0] + after[0]), 0.5 * (before[1] + after[1])
+    half_way[2] = before[2]
+    half = overlap(body, half_way[0], half_way[1], half_way[2]) > UNDER
+    return half, overlap(body, after[0], after[1], after[2]) > UNDER
 
 
 def wary(config: Config, care: Care) -> Care:
@@ -154,7 +167,7 @@ def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
     """
     known, motions = taught.map, len(told.task.robot.motions)
     marks = known.occupied & (known.by != SENT)
-    if not marks.any():
+    if not len(marks) or not marks.any():
         return np.zeros(motions, np.bool_)
     ends = np.empty((2, motions, 3))
     for end, believed in zip(ends, (known, forget(known, marks)), strict=True):

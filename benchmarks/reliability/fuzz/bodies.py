@@ -45,7 +45,7 @@ class Application:
         self._loop = asyncio.new_event_loop()
         self._life = contextlib.AsyncExitStack()
         self._loop.run_until_complete(
-            self._life.enter_async_context(self._app.router.lifespan_context(self._app))
+            self._life.enter_async_context(self._app.routes.router.lifespan_context(self._app.routes))
         )
         ends = self._loop.time() + 600.0
         while self.ask("GET", "/readyz", b"", "")[0] != 200 and self._loop.time() < ends:

@@ -7,6 +7,7 @@ bodies are on the disk, for the process that parses them.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -16,6 +17,7 @@ from specshield.service import problems
 from specshield.service.access.site import UPLOADS
 from specshield.service.bounds.body import FREE, Body
 from specshield.service.bounds.budget import Budget
+from specshield.service.bounds.protocol import ARRIVED
 from specshield.service.problems import CLIENT_GONE
 from specshield.service.settings import Settings
 
@@ -67,32 +69,24 @@ class Bodies:
 
     async def _take_in(self, scope: Scope, receive: Receive, body: Body, limit: int) -> bool:
         """Whether all of it came; else the client has gone."""
-        too_large = BodyTooLarge("the body is too large", expected=f"at most {limit} bytes", limit=limit)
         announced = _header(scope, b"content-length") or "0"
         if announced.isdigit() and int(announced) > limit:
-            raise too_large
+            raise _too_large(limit)
+        if ARRIVED in scope["state"]:
+            return await _receive(receive, body, limit, lambda: None)
         loop = asyncio.get_running_loop()
         begun = loop.time()
         try:
             async with asyncio.timeout_at(begun + self._patience) as deadline:
-                while True:
-                    message = await receive()
-                    if message["type"] == "http.disconnect":
-                        return False
-                    chunk = message.get("body", b"")
-                    if body.size + len(chunk) > limit:
-                        raise too_large
-                    await body.add(chunk)
-                    if not message.get("more_body", False):
-                        break
-                    deadline.reschedule(begun + self._patience + body.size / self._slowest)
+                return await _receive(
+                    receive, body, limit,
+                    lambda: deadline.reschedule(begun + self._patience + body.size / self._slowest),
+                )  # fmt: skip
         except TimeoutError:
             raise RequestTimeout(
                 f"the body took too long: {body.size} bytes came in {loop.time() - begun:.0f} s",
                 expected=f"all of it within {self._patience:g} s and 1 s more for each {self._slowest} bytes",
             ) from None
-        await body.end()
-        return True
 
     def _check_members(self, content: bytes | Path) -> None:
         """A schema says of each member that it does not know it: thousands would take long to say so."""
@@ -101,6 +95,26 @@ class Bodies:
                 "the body has too many members", path="body", got=content.count(b":"),
                 expected=f"at most {self._members}, and no more colons than that in texts",
             )  # fmt: skip
+
+
+async def _receive(receive: Receive, body: Body, limit: int, came: Callable[[], None]) -> bool:
+    """Whether all of the body came; else the client has gone. came: called after each part but the last."""
+    while True:
+        message = await receive()
+        if message["type"] == "http.disconnect":
+            return False
+        chunk = message.get("body", b"")
+        if body.size + len(chunk) > limit:
+            raise _too_large(limit)
+        await body.add(chunk)
+        if not message.get("more_body", False):
+            await body.end()
+            return True
+        came()
+
+
+def _too_large(limit: int) -> BodyTooLarge:
+    return BodyTooLarge("the body is too large", expected=f"at most {limit} bytes", limit=limit)
 
 
 def _replay(content: bytes | Path, receive: Receive) -> Receive:

@@ -18,6 +18,7 @@ from specshield.service import metrics, problems
 from specshield.service.bounds.corked import Corked
 from specshield.service.settings import Settings
 
+ARRIVED = "arrived"  # in `scope["state"]` once all of a request is here: no wait for it needs a limit
 KEPT_FILES = 256  # descriptors for the store, files and child processes
 
 
@@ -93,6 +94,10 @@ class BoundedProtocol(HttpToolsProtocol):
         self._in_head = False
         self._stop_waiting()
         super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        super().on_message_complete()
+        self.scope["state"][ARRIVED] = True
 
     def handle_websocket_upgrade(self) -> None:
         self._upgraded = True

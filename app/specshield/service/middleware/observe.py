@@ -7,10 +7,9 @@ import re
 import secrets
 import time
 
-from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from specshield.service import metrics
+from specshield.service import metrics, problems
 from specshield.service.watch import logs
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -31,26 +30,28 @@ class Observe:
         start = time.perf_counter()
         timing: dict[str, float] = {}
         scope.setdefault("state", {})["timing"] = timing
-        asked = Headers(scope=scope).get("x-request-id", "")
+        asked = dict(scope["headers"]).get(b"x-request-id", b"").decode("latin-1")
         request_id = asked if REQUEST_ID.fullmatch(asked) else f"{STARTED}{next(_count):08x}"
         scope["state"]["request_id"] = request_id
         logs.request.set(scope)
-        status = 500
+        status, begun = 500, False
 
         async def answer(message: Message) -> None:
-            nonlocal status
+            nonlocal status, begun
             if message["type"] == "http.response.start":
-                status = message["status"]
-                headers = MutableHeaders(scope=message)
-                headers["X-Request-Id"] = request_id
+                status, begun = message["status"], True
                 parts = {"total": time.perf_counter() - start, **timing}
-                headers["Server-Timing"] = ", ".join(
-                    f"{name};dur={1000 * dur:.3f}" for name, dur in parts.items()
-                )
+                told = ", ".join([f"{name};dur={1000 * dur:.3f}" for name, dur in parts.items()])
+                own = ((b"x-request-id", request_id.encode()), (b"server-timing", told.encode()))
+                message = {**message, "headers": [*message.get("headers", ()), *own]}
             await send(message)
 
         try:
             await self.app(scope, receive, answer)
+        except Exception:
+            if not begun:
+                await problems.failed()(scope, receive, answer)
+            raise
         finally:
             status = scope["state"].get("status", status)  # of a request that nobody waits for any more
             route = getattr(scope.get("route"), "path", "other")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 
-from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from specshield.errors import SpecshieldError
@@ -17,6 +16,7 @@ from specshield.service.routes.messages import MSGPACK, read_step, write_answer
 from specshield.service.state import Server
 
 PATH = re.compile(r"/v1/sessions/([A-Za-z0-9][A-Za-z0-9_.-]{0,63})/steps")
+PACKED, JSON = MSGPACK.encode(), b"application/json"
 
 
 class _Route:
@@ -44,7 +44,7 @@ class StepRoute:
         if body is None:  # the caller has gone
             return
         try:
-            packed = headers.get(b"content-type", b"").startswith(MSGPACK.encode())
+            packed = headers.get(b"content-type", b"").startswith(PACKED)
             request = read_step(body, packed)
             server: Server = scope["app"].state.server
             state = scope["state"]
@@ -54,9 +54,11 @@ class StepRoute:
             problems.tell(scope, error)
             await problems.response(error)(scope, receive, send)
             return
-        packed = MSGPACK.encode() in headers.get(b"accept", b"")
+        packed = PACKED in headers.get(b"accept", b"")
         content = write_answer(answer, packed)
-        await Response(content, media_type=MSGPACK if packed else "application/json")(scope, receive, send)
+        told = [(b"content-length", b"%d" % len(content)), (b"content-type", PACKED if packed else JSON)]
+        await send({"type": "http.response.start", "status": 200, "headers": told})
+        await send({"type": "http.response.body", "body": content})
 
 
 async def _body(receive: Receive) -> bytes | None:

@@ -38,6 +38,8 @@ def join(stored: Floats, t: int, poses: Floats) -> Floats:
             expected_t=length,
         )
     overlap = min(length, t + 1) - first
+    if overlap == 0:
+        return poses
     differs = np.flatnonzero(np.any(~agree(stored[first : first + overlap], poses[:overlap]), axis=1))
     if len(differs):
         row = int(differs[0])

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import struct
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -132,7 +133,7 @@ def digest(content: bytes) -> bytes:
 
 def link(last: bytes, rows: Floats) -> bytes:
     """SHA-256 of `last`, the digest of the previous record or of the config, and of the rows since then."""
-    return hashlib.sha256(last + rows.astype("<f8").tobytes()).digest()
+    return hashlib.sha256(last + rows.astype("<f8", copy=False).tobytes()).digest()
 
 
 def make(
@@ -154,9 +155,11 @@ def make(
 
     logits [A], -inf for null. names: of the rows' signals, by column.
     """
-    sent = np.array(pose, "<f8").tobytes()
+    sent = struct.pack("<3d", *pose)
     actions = np.empty((len(decision.distribution), COLUMNS))
-    actions[:, 0], actions[:, 1], actions[:, 2:] = decision.j_values, decision.robustness, decision.next_poses
+    for column, values in enumerate((decision.j_values, decision.robustness)):
+        actions[:, column] = [math.nan if value is None else value for value in values]
+    actions[:, 2:] = decision.next_poses
     rows, table, pool = _pack_table(actions, row)
     return StepRecord(
         format=FORMAT,
@@ -285,25 +288,21 @@ def _finite(value: float) -> float | None:
 
 def _known(row: Floats) -> Floats:
     """[6]: numbers that need no room of their own. Where an action does not turn, theta is that of x_t."""
-    return np.array([row[0], row[1], row[2], 0.0, 1.0, np.nan], "<f8")
+    return np.array([*row[:3].tolist(), 0.0, 1.0, math.nan], "<f8")
 
 
 def _pack_table(actions: Floats, row: Floats) -> tuple[bytes, bytes, bytes]:
     """`rows`, `table` and `pool` of a record. actions [A, 5]; NaN stands for null."""
-    content, width, distinct = actions.astype("<f8").tobytes(), 8 * COLUMNS, dict[bytes, int]()
+    content, width, distinct = actions.astype("<f8", copy=False).tobytes(), 8 * COLUMNS, dict[bytes, int]()
     rows = bytes(
         distinct.setdefault(content[i : i + width], len(distinct)) for i in range(0, len(content), width)
     )
-    known = _known(row).view("<i8").tolist()
+    words, known = np.frombuffer(b"".join(distinct), "<i8").tolist(), _known(row).view("<i8").tolist()
     place = dict(zip(reversed(known), reversed(range(len(known))), strict=True))
-    room, pool, index = len(known) - len(place), list[int](), list[int]()
-    for word in np.frombuffer(b"".join(distinct), "<i8").tolist():
-        at = place.setdefault(word, len(place) + room)
-        if at == len(known) + len(pool):
-            pool.append(word)
-        index.append(at)
+    pool = [word for word in dict.fromkeys(words) if word not in place]
+    place.update(zip(pool, range(len(known), len(known) + len(pool)), strict=True))
     wide = "<u1" if len(known) + len(pool) <= 256 else "<u2"
-    return rows, np.array(index, wide).tobytes(), np.array(pool, "<i8").tobytes()
+    return rows, np.array([place[word] for word in words], wide).tobytes(), np.array(pool, "<i8").tobytes()
 
 
 def _unpack_table(record: StepRecord, row: Floats) -> Floats:

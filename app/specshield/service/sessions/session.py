@@ -19,8 +19,10 @@ from specshield.service.schemas.answers import StepAnswer, to_json
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import history, record
 from specshield.service.sessions import rules as ruled
+from specshield.service.sessions.config import settings_of
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
+from specshield.shield.decision import Config
 
 RACES = 10  # writes lost to others before a caller is told so
 
@@ -29,10 +31,12 @@ RACES = 10  # writes lost to others before a caller is told so
 class Session:
     """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held.
 
-    rules: the config of each rule that it has had, the one in force last. signal_names: as in the rows.
+    rules: the config of each rule that it has had, the one in force last. settings: of that one.
+    signal_names: as in the rows.
     """
 
     rules: Sequence[Mapping[str, Any]]
+    settings: Config
     state: State
     version: bytes
     rows: Floats
@@ -44,7 +48,7 @@ class Session:
         names = ruled.columns_of(rules)
         width = 3 + len(names)
         rows = np.frombuffer(stored.rows, "<f8", state.length * width).reshape(-1, width)
-        return Session(rules, state, stored.version, rows, names)
+        return Session(rules, settings_of(rules[-1]), state, stored.version, rows, names)
 
     @property
     def config(self) -> Mapping[str, Any]:
@@ -67,7 +71,9 @@ class Session:
     def extended(self, t: int, poses: Floats, signals: Mapping[str, float]) -> Session:
         """The session with its history up to t; signals that are not sent hold their last value."""
         added = history.join(self.poses, t, poses)
-        rows = np.vstack([self.rows, np.hstack([added, np.repeat(self.rows[-1:, 3:], len(added), axis=0)])])
+        known, width = self.rows.shape
+        rows = np.empty((known + len(added), width))
+        rows[:known], rows[known:, :3], rows[known:, 3:] = self.rows, added, self.rows[-1, 3:]
         for name, value in signals.items():
             rows[t, 3 + self.signal_names.index(name)] = value
         return replace(self, rows=rows)

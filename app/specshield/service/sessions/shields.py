@@ -15,13 +15,13 @@ from specshield.errors import FragmentError
 from specshield.lookahead.lookahead import AHEADS
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.robot.dynamics import make_body
+from specshield.rule.early import conjunction_of
 from specshield.rule.view import view_of
 from specshield.service.heavy.background import Background
 from specshield.service.heavy.tables import Tables
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
 from specshield.service.sessions import rules
-from specshield.service.sessions.config import settings_of
 from specshield.service.sessions.session import Session, columns
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
@@ -70,7 +70,7 @@ class Shields:
 
     def of(self, session: Session) -> Shield:
         """The session's shield, with its preference if that is at hand."""
-        shield = self.get(session.config["policy_ids"], settings_of(session.config))
+        shield = self.get(session.config["policy_ids"], session.settings)
         if session.config["shaping"] == PROJECTION:
             return shield
         return replace(shield, preference=self._preference_at_hand(shield, session))
@@ -92,7 +92,7 @@ class Shields:
         since = rows[rules.origin(config) :]
         if not len(since):
             return "pending", (-math.inf, math.inf)
-        shield = Shield(task, (), Config(), body, view)
+        shield = Shield(task, (), Config(), body, view, conjunction_of(task, task.formula))
         return episode.close(shield, since[:, :3], columns(since, names))
 
     def settled(self, session: Session) -> Session:

@@ -71,7 +71,7 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
 def pack_carry(carry: Carry) -> PackedCarry:
     return PackedCarry(
         carry.t,
-        carry.next_poses.astype("<f8").tobytes(),
+        carry.next_poses.astype("<f8", copy=False).tobytes(),
         carry.witnesses,
         carry.memory,
         carry.residuals,

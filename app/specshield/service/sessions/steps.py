@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -133,8 +132,9 @@ class Steps:
         current = False  # whether the session is what the store has just shown
         for _ in range(RACES):
             if session is None:
-                with _clock(timing, "store"):
-                    found = await self._store.load(id, request.t)
+                asked = time.perf_counter()
+                found = await self._store.load(id, request.t)
+                _add(timing, "store", asked)
                 if found is None:
                     raise missing(id)
                 session, step, current = Session.of(found), found.step, True
@@ -150,8 +150,9 @@ class Steps:
                 session = None
                 continue
             change, state = self._change(decided, request)
-            with _clock(timing, "store"):
-                written = await self._store.append(id, session.version, change)
+            asked = time.perf_counter()
+            written = await self._store.append(id, session.version, change)
+            _add(timing, "store", asked)
             if isinstance(written, bytes):
                 told_later = len(decided.session.rows) - 1 - session.state.length
                 answer = record.told(decided.decision, request.witnesses, request.explain)
@@ -273,8 +274,5 @@ def _learns(session: Session, request: StepBody) -> bool:
     return changed or bool(request.occupied) or bool(request.free)
 
 
-@contextmanager
-def _clock(timing: dict[str, float], name: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
+def _add(timing: dict[str, float], name: str, start: float) -> None:
     timing[name] = timing.get(name, 0.0) + time.perf_counter() - start

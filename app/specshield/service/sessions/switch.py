@@ -28,7 +28,7 @@ from specshield.service.library import files
 from specshield.service.library.policies import Policies
 from specshield.service.schemas.sessions import SwitchRequest
 from specshield.service.sessions import history, record, rules
-from specshield.service.sessions.config import asked_by
+from specshield.service.sessions.config import asked_by, settings_of
 from specshield.service.sessions.session import (
     RACES,
     Session,
@@ -215,6 +215,7 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
     made = replace(
         session,
         rules=[*session.rules, config],
+        settings=settings_of(config),
         rows=rules.widened(session.rows, session.signal_names, signals),
         signal_names=names,
     )

@@ -86,7 +86,7 @@ class _Link(asyncio.Protocol):
         self._connection = connection  # kept, or its transport would be closed
         self._transport: asyncio.Transport = connection._writer.transport
         self._transport.set_protocol(self)
-        self._reader = hiredis.Reader()
+        self._reader, self._unsent = hiredis.Reader(), list[bytes]()
         self._waiting = deque[tuple[asyncio.Future[Any], float]]()
         self._loop = asyncio.get_running_loop()
         self._watch: asyncio.TimerHandle | None = None
@@ -95,16 +95,26 @@ class _Link(asyncio.Protocol):
     async def send(self, command: tuple[Any, ...], deadline: float) -> Any:
         if self.closed:
             raise redis.ConnectionError("the connection is closed")
-        try:
-            self._transport.write(hiredis.pack_command(command))
-        except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
-            self.close()
-            raise redis.ConnectionError(str(error)) from error
+        if not self._unsent:
+            self._loop.call_soon(self._flush)
+        self._unsent.append(hiredis.pack_command(command))
         answer: asyncio.Future[Any] = self._loop.create_future()
         self._waiting.append((answer, deadline))
         if self._watch is None:
             self._watch = self._loop.call_at(deadline, self._late)
         return await answer
+
+    def _flush(self) -> None:
+        """Sends all that callers asked for in one round of the event loop: the store then writes to its disk
+        once for all of it.
+        """
+        content = b"".join(self._unsent)
+        self._unsent.clear()
+        try:
+            self._transport.write(content)
+        except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
+            self._transport.abort()
+            self.connection_lost(error)
 
     def data_received(self, data: bytes) -> None:
         self._reader.feed(data)

@@ -49,32 +49,32 @@ def aim(shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Float
         _, leaves = rho_of(prefix, tried)
     asked = np.zeros(len(parts.kind), np.int64)
     still = np.empty(len(asked), np.bool_)
-    soonest = _ask(
+    next_due, high = _ask(
         parts, prefix.known, prefix.t, care.noise, care.stride, care.least, care.chance, still, asked
     )
-    next_due = int(asked[soonest]) if soonest >= 0 else 0
 
-    def at(most: int) -> Best:
+    def at(most: int) -> tuple[Best, bool]:
         rows, robustness = np.empty(motions, np.int64), np.empty(motions)
-        _best_open(parts, still, prefix.t, asked, most, leaves, whole, tried.motions, rows, robustness)
-        return Best(robustness, rows)
+        highest = _best_open(
+            parts, still, prefix.t, asked, most, leaves, whole, tried.motions, rows, robustness
+        )
+        return Best(robustness, rows), highest > margin
 
-    motions, high = len(task.robot.motions), int(asked.max())
-    best = at(high)
-    kept = best.robustness > margin
-    if kept.any():
-        return Aimed(best, kept, care.margin, next_due, False)
+    motions = len(task.robot.motions)
+    best, had = at(high)
+    if had:
+        return Aimed(best, best.robustness > margin, care.margin, next_due, False)
     low = 0  # slack `high` cannot be had
-    best = at(low)
-    if not (best.robustness > margin).any():
+    best, had = at(low)
+    if not had:
         highest = max(float(best.robustness.max()), SATISFIED_ABOVE)
         kept = (best.robustness >= highest) & (best.robustness > SATISFIED_ABOVE)
         found = highest - SATISFIED_ABOVE
         return Aimed(best, kept, found, low, found <= shield.config.margin)
     while high - low > 1:
         middle = (low + high) // 2
-        tighter = at(middle)
-        if (tighter.robustness > margin).any():
+        tighter, had = at(middle)
+        if had:
             low, best = middle, tighter
         else:
             high = middle
@@ -85,9 +85,9 @@ def aim(shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Float
 def _ask(
     parts: Conjuncts, known: Floats, t: int, noise: Noise, stride: float, least: int, chance: float,
     still: Bools, asked: Ints,
-) -> int:  # fmt: skip
-    """Writes which conjuncts (K,) are open, and how many steps early each F of them is asked for. The F whose
-    deadline is next, -1 where there is none. A window keeps at least half its length.
+) -> tuple[int, int]:  # fmt: skip
+    """Writes which conjuncts (K,) are open, and how many steps early each F of them is asked for. The steps
+    of the F whose deadline is next, and the most of any. A window keeps at least half its length.
     """
     find_open(parts, known, t, still)
     soonest, first = -1, 0
@@ -98,15 +98,17 @@ def _ask(
             asked[k] = min(wanted, (parts.b[k] - parts.a[k]) // 2)
             if soonest < 0 or left < first:
                 soonest, first = k, left
-    return soonest
+    return (asked[soonest] if soonest >= 0 else 0), (asked.max() if asked.size else 0)
 
 
 @kernel
 def _best_open(
     parts: Conjuncts, still: Bools, t: int, asked: Ints, most: int, leaves: Floats, whole: Floats,
     motions: Ints, rows: Ints, robustness: Floats,
-) -> None:  # fmt: skip
-    """Writes the best future of each motion, as `feasibility.Best` has it, by what is open."""
+) -> float:  # fmt: skip
+    """Writes the best future of each motion, as `feasibility.Best` has it, by what is open; the highest
+    robustness of them.
+    """
     rho = np.empty(whole.shape[0])
     rate_open(parts, still, t, np.minimum(asked, most), leaves, rho)
     rows[:] = -1
@@ -116,3 +118,4 @@ def _best_open(
         value = rho[f] if whole[f] > SATISFIED_ABOVE else -np.inf
         if rows[m] < 0 or value > robustness[m]:
             rows[m], robustness[m] = f, value
+    return float(robustness.max())
