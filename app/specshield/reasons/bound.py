@@ -133,18 +133,15 @@ class _Ahead:
             return None
         for bit, goal in enumerate(self.goals):
             need, least = goal.need, float(np.where(met >> bit & 1 == 0, steps[:, bit], 0.0).min())
-            kept = " and ".join(
-                str(guard.formula)
-                for guard in self.guards
-                if guard.formula is not need.formula and guard.first <= step
-            )
-            beside = f" while {kept} is kept" if kept else ""
+            beside = [g.formula for g in self.guards if g.formula is not need.formula and g.first <= step]
+            kept = " and ".join(map(str, [*beside, *([] if need.before is None else [need.before])]))
+            also = f" while {kept} is kept" if kept else ""
             if least == math.inf:
-                return f"no way leads to where {need.formula} can be met{beside}"
+                return f"no way leads to where {need.formula} can be met{also}"
             if step + least > need.last:
                 sooner = f"at least {step + int(least) - self.known.now} steps"
                 left = f"{need.last - self.known.now} are left"
-                return f"{need.formula} is out of reach{beside}: {sooner}, and {left}"
+                return f"{need.formula} is out of reach{also}: {sooner}, and {left}"
         return "not all of these can be reached in time, in whatever order: " + ", ".join(
             str(goal.need.formula) for goal in self.goals
         )

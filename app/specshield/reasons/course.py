@@ -35,8 +35,11 @@ class Course:
     goals: tuple[Goal, ...]
 
 
-def course(needs: Sequence[Need], known: Known, ground: Ground) -> Course | str:
-    """What these needs leave to be done, or why they cannot all be met."""
+def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -> Course | str:
+    """What these needs leave to be done, or why they cannot all be met. late: how many steps later than the
+    formula has it they may be met; ways are then measured through nothing but squares that keep the guards,
+    which guides a search better and bounds nothing.
+    """
     pending: list[Need] = []
     for need in needs[:MOST_NEEDS]:
         left = need if need.first > known.now else _left(need, known.past(need.predicate), known.now)
@@ -55,7 +58,7 @@ def course(needs: Sequence[Need], known: Known, ground: Ground) -> Course | str:
         if not begun and not np.array_equal(where, ground.free):
             found.append((need, where))
     found = sorted(found, key=lambda goal: int(goal[1].sum()))
-    goals = (Goal(need, where, _far(need, where, guards, known.now, ground)) for need, where in found)
+    goals = (Goal(need, where, _far(need, where, guards, known.now, ground, late)) for need, where in found)
     return Course(guards, tuple(goals))
 
 
@@ -85,12 +88,14 @@ def _together(need: Need, guards: Sequence[Need], until: int) -> Formula:
     return And(tuple(parts)) if len(parts) > 1 else next(iter(parts))
 
 
-def _far(need: Need, where: Bools, guards: Sequence[Need], now: int, ground: Ground) -> Floats:
-    """The ways to a goal keep every guard that holds from the next step until the goal is reached. They may
-    lead through squares near those that keep it: between two steps nothing is asked.
+def _far(need: Need, where: Bools, guards: Sequence[Need], now: int, ground: Ground, late: int) -> Floats:
+    """The ways to a goal keep every guard that holds from the next step until the goal is reached. Unless it
+    may be late, they may lead through squares near those that keep it: between two steps nothing is asked.
     """
-    free = ground.free
+    free, reach = ground.free, 0.0 if late else ground.travel
     for guard in guards:
-        if guard.first <= now + 1 and guard.end >= need.last:
-            free = free & (ground.highest(guard.predicate, ground.travel / 2.0) > SATISFIED_ABOVE)
+        if guard.first <= now + 1 and guard.end >= need.last - late:
+            free = free & (ground.highest(guard.predicate, reach / 2.0) > SATISFIED_ABOVE)
+    if need.before is not None:  # the last step may leave where it holds
+        free = free & (where | (ground.highest(need.before, reach) > SATISFIED_ABOVE))
     return ground.ways_to(where, free)

@@ -23,7 +23,7 @@ class Need:
     """`predicate` holds at every step from s to s + stay, for some step s from `first` to `last`.
 
     part: the need as the formula has it, where some of its window is over by now. before: what has to hold at
-    every step until then, as the left side of an until; a search heeds it, and a proof does without.
+    every step to come until then, as the left side of an until.
     """
 
     predicate: Formula
@@ -88,7 +88,7 @@ class Reader:
                 return self._some(child, a + c, b + d)
             case Until(c, d, left, right):
                 then = self._some(right, a + c, b + d)
-                if a == b and is_predicate(left) and is_predicate(right):
+                if a == b <= self.now + 1 and is_predicate(left) and is_predicate(right):
                     then = tuple(tuple(replace(need, before=left) for need in way) for way in then)
                 return _all([then, self._every(left, a, a + c - 1)]) if a == b and c > 0 else then
         return NOTHING

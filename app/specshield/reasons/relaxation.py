@@ -174,7 +174,7 @@ def _found(
     late = {need.formula for way in may_be_late for need in way}
     for needs in ways[:MOST_TRIED]:
         relaxed = [_relaxed(need) if need.formula in late else need for need in needs]
-        asked = course(relaxed, known, ground)
+        asked = course(relaxed, known, ground, MOST_LATE if late else 0)
         if isinstance(asked, str):
             continue
         until = shield.task.horizon + (MOST_LATE if late else 0)
