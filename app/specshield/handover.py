@@ -41,6 +41,7 @@ def carried_over(
         learned=_learned(carry.learned, later) if same_map else None,
         action=carry.action if stays else None,
         way=way,
+        stuck=carry.stuck if same_map and same_robot else (),
     )
 
 

@@ -175,3 +175,21 @@ def test_noise_is_not_taken_for_a_contact(seed):
         slips = random.random() < 0.05
         poses.append(poses[-1] if slips or in_collision(body, *noisy) else noisy)
     assert decision.map_revision == 0
+
+
+def test_a_turn_that_no_map_explains_is_tried_twice_and_no_more():
+    """The robot is told that its footprint is centred: it cannot know why its back hinders a turn."""
+    walls = np.zeros((40, 80), bool)
+    walls[30:, 4:18] = True
+    grid, told = OccupancyGrid(walls, 0.05), replace(STRETCH, offset=(0.0, 0.0))
+    task = make_task(grid, told, "F[0,30] Goal", {"Goal": GOAL | {"center": [0.8, 0.4]}})
+    shield = make_shield([synthesise(task, Settings(pitch=0.1))], Config(learn_map=True))
+    real, poses, carry = make_body(STRETCH, grid), [(0.8, 1.31, 0.0)], None
+    in_vain = []
+    while len(poses) <= task.horizon:
+        decision = decide(shield, poses, None, main_task_done=True, carry=carry)
+        motion, carry = int(STRETCH.motion_of[decision.action]), decision.carry
+        poses.append(step(real, *poses[-1], motion))
+        in_vain += [(*poses[-1], motion)] if poses[-1] == poses[-2] and motion != STRETCH.wait_motion else []
+    assert decision.spec_status == "satisfied"
+    assert max(map(in_vain.count, in_vain)) == 2

@@ -149,6 +149,9 @@ def make_shield(
     )
 
 
+Stuck = tuple[float, float, float, int]  # a pose, and a motion that led nowhere from it
+
+
 @dataclass(frozen=True)
 class Carry:
     """What one decision hands to the next: each motion's next pose and its certified continuation.
@@ -157,7 +160,8 @@ class Carry:
     memory: of the session's preference. residuals: what is known of the robot by now (uncertainty.py).
     threshold_left: what is left of a threshold over the episode. learned: what the session's map has that the
     policy's has not (world/learned.py). action: the one that was drawn, which the caller may have executed.
-    way: where a rule begins to hold, a continuation from there to its horizon that no policy found.
+    way: where a rule begins to hold, a continuation from there to its horizon that no policy found. stuck:
+    as `Taught` has it.
     """
 
     t: int
@@ -169,6 +173,7 @@ class Carry:
     learned: bytes | None = None
     action: int | None = None
     way: bytes | None = None
+    stuck: tuple[Stuck, ...] = ()
 
 
 @dataclass(frozen=True)

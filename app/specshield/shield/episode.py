@@ -134,7 +134,7 @@ def decide(
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
-    care = wary(shield.config, care)
+    care = replace(wary(shield.config, care), barred=taught.barred(poses[-1]))
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
@@ -213,6 +213,7 @@ def decide(
             threshold_left=left if shield.config.threshold_over == "episode" else None,
             learned=handed_on(shield, taught, int(robot.motion_of[moved])),
             action=action,
+            stuck=taught.stuck,
         ),
     )
 
@@ -310,9 +311,7 @@ def _wrapped(poses: Floats) -> bool:
 def _follow(
     carry: Carry | None, poses: Floats, steps: int, motions: int
 ) -> tuple[bytes | None, tuple[float, float] | None]:
-    """The tail of the witness that the robot followed to x_t, or the way that a new rule came with, and how
-    far x_t is from where f leads. steps: to the horizon; motions: how many the robot has.
-    """
+    """The tail of the witness followed to x_t, or a new rule's way; how far x_t is from where f leads."""
     way = None if carry is None else carry.way
     if way is not None and (len(way) != steps or max(way, default=0) >= motions):
         way = None

@@ -57,6 +57,12 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     if violated:
         tried, best, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried)
+    if care.barred:
+        leads = np.any(tried.poses != prefix.poses[-1], axis=2)  # away from x_t
+        first_away = tried.motions[np.arange(len(kept)), np.argmax(leads, axis=1)]
+        others = np.where(np.isin(first_away, care.barred), -np.inf, kept)
+        if others.max() > SATISFIED_ABOVE:
+            kept, best = others, best_of(tried, others, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and _some(best)):

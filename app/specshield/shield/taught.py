@@ -19,7 +19,7 @@ from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.robot.dynamics import Body, make_body, overlap, successors
 from specshield.shield.caution.experience import was_stopped, within_noise
-from specshield.shield.decision import Carry, Config, Shield
+from specshield.shield.decision import Carry, Config, Shield, Stuck
 from specshield.shield.surprise.contact import NEAR, UNDER, Followed, cells_met, cells_under, contact_of
 from specshield.shield.uncertainty import Care
 from specshield.world.learned import (
@@ -46,6 +46,8 @@ NEARBY = 2.0  # [m] poses farther away than this say nothing of a thing that was
 KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 
 
+SAME_PLACE = 1e-3  # [m], [rad] a robot that differs by no more stands where it stood
+MOST_STUCK = 16  # places that are kept from which a motion led nowhere
 HEAD = struct.Struct("<h?hB")  # what `Followed` holds
 MOST_MET = 255  # contacts at one pose that HEAD can hold
 
@@ -54,12 +56,18 @@ MOST_MET = 255  # contacts at one pose that HEAD can hold
 class Taught:
     """What a session has learned: its map, and how its caller follows what is drawn.
 
-    contact: whether the last motion ran into something; it is not handed on.
+    contact: whether the last motion ran into something; it is not handed on. stuck: where the robot stood and
+    which motion led nowhere from there, though no mark explains it; handed on beside the bytes.
     """
 
     map: LearnedMap = field(default_factory=LearnedMap)
     followed: Followed = field(default_factory=Followed)
     contact: bool = False
+    stuck: tuple[Stuck, ...] = ()
+
+    def barred(self, pose: Floats) -> tuple[int, ...]:
+        """The motions that led nowhere from a pose (3,)."""
+        return tuple(motion for *at, motion in self.stuck if np.abs(pose - at).max() <= SAME_PLACE)
 
     def to_bytes(self) -> bytes:
         known = self.followed
@@ -84,6 +92,7 @@ def teach(
     grid, config, t = shield.task.grid, shield.config, len(poses) - 1
     before = Taught.from_bytes(None if carry is None else carry.learned)
     known, followed, motion = before.map, before.followed, -1
+    stuck = () if carry is None else carry.stuck
     if config.map_memory is not None:
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
@@ -112,7 +121,12 @@ def teach(
             beyond += outside
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
-    return Taught(own, followed, motion >= 0), said
+    if motion >= 0 and np.abs(poses[-1] - poses[-2]).max() <= SAME_PLACE:
+        leads = np.empty((len(shield.task.robot.motions), 3))
+        successors(body_on(shield, own), poses[-1], leads)
+        if np.abs(leads[motion] - poses[-1]).max() > SAME_PLACE:  # no mark explains it
+            stuck = (*stuck, (*poses[-1].tolist(), motion))[-MOST_STUCK:]
+    return Taught(own, followed, motion >= 0, stuck), said
 
 
 @leaf

@@ -75,7 +75,8 @@ class Care:
     """What J asks for beyond satisfaction at one step.
 
     margin [m]; least [steps]: the slack of every deadline. noise: because of which more of it is asked for.
-    stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice.
+    stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice. barred: the
+    motions that lead nowhere from x_t, so that no future goes by them first where another keeps the rule.
     """
 
     margin: float
@@ -83,6 +84,7 @@ class Care:
     noise: Noise = EXACT
     stride: float = 1.0
     chance: float = CHANCE
+    barred: tuple[int, ...] = ()
 
     @property
     def has_slack(self) -> bool:

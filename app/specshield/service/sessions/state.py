@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from specshield.shield.decision import Carry
+from specshield.shield.decision import Carry, Stuck
 
 
 class State(msgspec.Struct, frozen=True, array_like=True):
@@ -51,6 +51,7 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
     learned: bytes | None = None
     action: int | None = None
     way: bytes | None = None
+    stuck: tuple[Stuck, ...] = ()
 
     def unpacked(self) -> Carry:
         # Writable: kernels were compiled for that.
@@ -65,6 +66,7 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
             self.learned,
             self.action,
             self.way,
+            self.stuck,
         )
 
 
@@ -79,6 +81,7 @@ def pack_carry(carry: Carry) -> PackedCarry:
         carry.learned,
         carry.action,
         carry.way,
+        carry.stuck,
     )
 
 
