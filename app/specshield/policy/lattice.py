@@ -32,6 +32,7 @@ from specshield.robot.dynamics import (
 from specshield.rule.progress import STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
+from specshield.world.regions import turns_with_robot
 
 STEP_CODES = 64.0  # codes of a step in a table of steps
 INVALID = 65535  # the code of a pose that is in collision or breaks what the table keeps
@@ -317,9 +318,9 @@ def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
 @leaf
 def reads_heading(rules: Rules) -> bool:
     """Whether some predicate may depend on where the robot looks, and not only on where it is."""
-    reads, programs, point = False, rules.programs, rules.regions.point
+    reads, programs, regions = False, rules.programs, rules.regions
     for i in range(programs.ops.shape[0]):
         reads = reads or (programs.ops[i] == VALUE and programs.args[i] == HEADING)
-    for r in range(point.shape[0]):
-        reads = reads or point[r, 0] != 0.0 or point[r, 1] != 0.0
+    for r in range(regions.plain.shape[0]):
+        reads = reads or turns_with_robot(regions, r)
     return reads

@@ -96,8 +96,10 @@ def read_step(
         for s in range(signals.shape[1]):
             values[REGIONS + regions + s] = signals[min(k, held), s]
     for r in range(regions):
-        known = still if turns_with_robot(view.regions, r) else placed
-        if view.first[r] <= t <= view.last[r] and not (known and t > view.first[r]):
+        if t < view.first[r] or t > view.last[r]:
+            continue
+        known = t > view.first[r] and (still or (placed and not turns_with_robot(view.regions, r)))
+        if not known:
             fill_region(view.regions, r, x, y, theta, values)
     least = np.inf
     for n in range(tree.leaf_at.shape[0]):

@@ -81,6 +81,9 @@ class Taught:
         return Taught(LearnedMap.from_bytes(value[HEAD.size :]), Followed(*HEAD.unpack_from(value)))
 
 
+NOTHING = Taught()
+
+
 def teach(
     shield: Shield, carry: Carry | None, poses: Floats, occupied: ArrayLike | None, free: ArrayLike | None
 ) -> tuple[Taught, tuple[str, ...]]:
@@ -90,7 +93,10 @@ def teach(
     SampleError for points that are none.
     """
     grid, config, t = shield.task.grid, shield.config, len(poses) - 1
-    before = Taught.from_bytes(None if carry is None else carry.learned)
+    learned = None if carry is None else carry.learned
+    if learned is None and occupied is None and free is None and not config.learn_map:
+        return NOTHING, ()
+    before = Taught.from_bytes(learned)
     known, followed, motion = before.map, before.followed, -1
     stuck = () if carry is None else carry.stuck
     if config.map_memory is not None:
@@ -180,8 +186,7 @@ def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
     rule forbids.
     """
     known, motions = taught.map, len(told.task.robot.motions)
-    marks = known.occupied & (known.by != SENT)
-    if not len(marks) or not marks.any():
+    if not len(known) or not (marks := known.occupied & (known.by != SENT)).any():
         return np.zeros(motions, np.bool_)
     ends = np.empty((2, motions, 3))
     for end, believed in zip(ends, (known, forget(known, marks)), strict=True):

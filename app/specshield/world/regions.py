@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from specshield.arrays import Floats, Ints
+from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import MapError
 from specshield.world import checks
@@ -128,15 +128,16 @@ class PackedRegions(NamedTuple):
     kinds: int64[parts], CIRCLE, RECTANGLE or POLYGON.
     offsets: int64[parts + 1], part p has the numbers data[offsets[p]:offsets[p + 1]].
     data: float64, in metres: circle x, y, radius; rectangle xmin, ymin, xmax, ymax; polygon x, y, x, y, ...
-    grown [regions], point [regions, 2]: as in `Area`, in metres.
+    plain [regions]: whether it is the region itself, read at the robot's origin. carried [regions, 3]: the
+    point (ahead, left) that the robot carries, and how far the region is grown, as in `Area`, in metres.
     """
 
     starts: Ints
     kinds: Ints
     offsets: Ints
     data: Floats
-    grown: Floats
-    point: Floats
+    plain: Bools
+    carried: Floats
 
 
 @lru_cache(maxsize=1024)
@@ -164,24 +165,41 @@ def pack_areas(areas: Sequence[Area]) -> PackedRegions:
         np.array(kinds, dtype=np.int64),
         np.array(offsets, dtype=np.int64),
         np.array(data, dtype=np.float64),
-        np.array([area.grown for area in areas], dtype=np.float64),
-        np.array([area.point for area in areas], dtype=np.float64).reshape(-1, 2),
+        np.array([area.grown == 0.0 and area.point == (0.0, 0.0) for area in areas], dtype=np.bool_),
+        np.array([(*area.point, area.grown) for area in areas], dtype=np.float64).reshape(-1, 3),
     )
 
 
 @inlined
 def turns_with_robot(regions: PackedRegions, i: int) -> bool:
     """Whether what is read of packed region i depends on the robot's heading."""
-    return bool(regions.point[i, 0] != 0.0 or regions.point[i, 1] != 0.0)
+    if regions.plain[i]:
+        return False
+    return bool(regions.carried[i, 0] != 0.0 or regions.carried[i, 1] != 0.0)
 
 
 @inlined
 def region_distance(regions: PackedRegions, i: int, x: float, y: float, theta: float) -> float:
     """What a formula reads of packed region i at a pose of the robot (`Area`), in metres."""
-    data, best = regions.data, -np.inf
-    if turns_with_robot(regions, i):
-        ahead, left, cos, sin = regions.point[i, 0], regions.point[i, 1], math.cos(theta), math.sin(theta)
+    if regions.plain[i]:  # most are, and this is where a decision spends its time
+        return _point_distance(regions, i, x, y)
+    return _carried_distance(regions, i, x, y, theta)
+
+
+@leaf
+def _carried_distance(regions: PackedRegions, i: int, x: float, y: float, theta: float) -> float:
+    """`region_distance` of a region that is not plain."""
+    ahead, left, grown = regions.carried[i, 0], regions.carried[i, 1], regions.carried[i, 2]
+    if ahead != 0.0 or left != 0.0:
+        cos, sin = math.cos(theta), math.sin(theta)
         x, y = x + ahead * cos - left * sin, y + ahead * sin + left * cos
+    return float(_point_distance(regions, i, x, y) + grown)
+
+
+@inlined
+def _point_distance(regions: PackedRegions, i: int, x: float, y: float) -> float:
+    """Signed distance of the point (x, y) to packed region i, metres, positive inside."""
+    data, best = regions.data, -np.inf
     for part in range(regions.starts[i], regions.starts[i + 1]):
         begin, end, kind = regions.offsets[part], regions.offsets[part + 1], regions.kinds[part]
         if kind == CIRCLE:
@@ -193,7 +211,7 @@ def region_distance(regions: PackedRegions, i: int, x: float, y: float, theta: f
         else:
             d = _polygon_distance(data, begin, end, x, y)
         best = max(best, d)
-    return best + regions.grown[i] if regions.grown[i] != 0.0 else best
+    return best
 
 
 @leaf

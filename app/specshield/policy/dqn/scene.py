@@ -71,7 +71,7 @@ def make_scene(task: Task) -> Scene:
         horizon=task.horizon,
         stride=max(longest_motions(body)[0], SHORTEST_STRIDE),
         guards=np.array([r for r in range(len(task.areas)) if REGIONS + r in read], dtype=np.int64),
-        guards_turn=HEADING in read or bool(np.any(rules.regions.point != 0.0)),
+        guards_turn=HEADING in read or bool(np.any(rules.regions.carried[:, :2] != 0.0)),
         wait=task.robot.wait_motion,
     )
 

@@ -58,7 +58,7 @@ def values_at(
     count = programs.starts.shape[0] - 1
     out = np.full((count, ny, nx, headings), -np.inf, np.float32)
     values = np.empty(REGIONS + region_count(areas) + signals.shape[0])
-    turns_matter = np.any(areas.point != 0.0)
+    turns_matter = np.any(areas.carried[:, :2] != 0.0)
     stack = np.empty(STACK_SIZE)
     fill_signals(areas, signals, values)
     for j in range(ny):

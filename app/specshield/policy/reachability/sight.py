@@ -71,7 +71,7 @@ def _reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
     read = rules.programs.args[code][rules.programs.ops[code] == VALUE].astype(int)
     areas = [p - REGIONS for p in read if REGIONS <= p < REGIONS + region_count(rules.regions)]
     place = bool(areas) or bool(np.any(read < HEADING))
-    return place, bool(np.any(read == HEADING)), bool(np.any(rules.regions.point[areas] != 0.0))
+    return place, bool(np.any(read == HEADING)), bool(np.any(rules.regions.carried[areas, :2] != 0.0))
 
 
 @kernel
