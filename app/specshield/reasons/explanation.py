@@ -120,7 +120,10 @@ class _Motion:
         i = int(np.argmin(rho))
         conjunct = parts[i].conjunct
         late = late_by(conjunct, row, now, SATISFIED_ABOVE) if len(failing) == 1 else None
-        told = Explanation(str(conjunct), float(rho[i]), late, in_words(conjunct, row, now))
+        words = in_words(conjunct, row, now)
+        if words is not None and late is None:
+            words = f"{words}; it misses by {abs(rho[i]):.3g}"
+        told = Explanation(str(conjunct), float(rho[i]), late, words)
         if late is not None:
             return (LATE, late), told
         return (BROKEN if len(failing) == 1 else SEVERAL, -told.robustness), told
