@@ -200,7 +200,8 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
     rows = judged.tried.motions[judged.best.row, 1:].astype(np.uint8)
-    return tuple(rows[m].tobytes() if ok else None for m, ok in enumerate(judged.feasible_motion))
+    content, n, feasible = rows.tobytes(), rows.shape[1], judged.feasible_motion.tolist()
+    return tuple([content[m * n : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
 
 
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
