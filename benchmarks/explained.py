@@ -170,7 +170,7 @@ def refused(case: Case, counts: Counter[str]) -> None:
     except InfeasibleStart as error:
         _heading(case, "refused")
         print(f"- asked: a session from {_shown(case.pose)}")
-        print(f"- **told: {error.message}** (proved: {error.details['proved']})")
+        print(f"- **told: {error.message}** ({'' if error.details['proved'] else 'not '}proved)")
         way = _searched(case, case.pose[None])
         counts["refused"] += 1
         counts["a way is there"] += way

@@ -218,23 +218,17 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
     assert close(session(None, next_t=5), None, VERDICT)[1] == [{}]
 
 
+FAILS = "no way was found that keeps the rule; the best one found fails in F[50,100] Region2"
+
+
 @pytest.mark.parametrize(
     ("why", "line"),
     [
-        (
-            [-0.3, 4],
-            "no way was found that still keeps F[50,100] Region2: the best one comes 4 steps too late",
-        ),
-        (
-            [-0.3, 1],
-            "no way was found that still keeps F[50,100] Region2: the best one comes 1 step too late",
-        ),
-        ([-0.3, None], "no way was found that still keeps F[50,100] Region2: the best one misses it by 0.3"),
-        ([None, None], "no way was found that still keeps F[50,100] Region2"),
-        (
-            [-0.3, None, "on the best one 'A' is not met"],
-            "no way was found that still keeps F[50,100] Region2: on the best one 'A' is not met",
-        ),
+        ([-0.3, 4], f"{FAILS}: it comes 4 steps too late"),
+        ([-0.3, 1], f"{FAILS}: it comes 1 step too late"),
+        ([-0.3, None], f"{FAILS}: it misses by 0.3"),
+        ([None, None], "no way was found that keeps F[50,100] Region2"),
+        ([-0.3, None, "'A' is not met"], f"{FAILS}: 'A' is not met"),
         ([0.05, None, "a way is known that keeps the rule"], "a way is known that keeps the rule"),
     ],
 )
@@ -251,7 +245,7 @@ def test_a_decision_says_why_an_action_is_forbidden(why, line):
 @pytest.mark.parametrize(
     ("margin", "slack", "late", "line"),
     [
-        (0.04, 20, 2, "but 2 steps later than the session allows: it keeps 20 steps in hand"),
+        (0.04, 20, 2, "but 2 steps later than the session asks for, which keeps 20 steps in hand"),
         (0.04, 0, None, "but with less to spare than the session asks for (0.04 m, 0 steps)"),
     ],
 )

@@ -43,7 +43,11 @@ def circle(x, radius=0.3):
 @pytest.mark.parametrize(
     ("formula", "wall", "said"),
     [
-        ("F[0,15] Far", False, "F[0,15] Far is out of reach: at least 18 steps, and 15 are left"),
+        (
+            "F[0,15] Far",
+            False,
+            "F[0,15] Far is out of reach: at least 18 steps away, 15 steps before it is due",
+        ),
         ("F[0,400] Far", True, "no way leads to where F[0,400] Far can be met"),
         (
             "F[0,400] Far and G[0,400] not Strip",
@@ -58,7 +62,7 @@ def circle(x, radius=0.3):
         ("G[2,9] theta > 2", False, "whatever the robot does, it breaks G[2,9] theta > 2 by step 2"),
         ("G[0,20] F[0,4] Far", False, "F[0,4] Far is out of reach"),
         ("F[0,10] Far or F[0,15] Far", False, "and its 1 other ways are ruled out likewise"),
-        ("not Near U[0,12] Far", False, "F[0,12] Far is out of reach while not Near is kept"),
+        ("not Near U[0,12] Far", False, "Far by step 12 is out of reach while not Near is kept"),
         ("not Strip U[0,400] Far", False, "no way leads to where F[0,400] Far can be met while not Strip"),
         ("G[0,40] (call > 0.5 -> F[0,12] Far)", False, None),
         ("F[0,9] call > 0.5", False, "the values that the signals hold rule it out"),

@@ -127,14 +127,14 @@ class Explanation:
         if self.is_kept:
             less = f"{self.conjunct} could still be kept, but with less to spare than the session asks for"
             return self.detail or less
-        told = f"no way was found that still keeps {self.conjunct}"
+        told = f"no way was found that keeps the rule; the best one found fails in {self.conjunct}"
         if self.detail is not None:
             return f"{told}: {self.detail}"
         if self.late_by is not None:
-            return f"{told}: the best one comes {_steps(self.late_by)} too late"
+            return f"{told}: it comes {_steps(self.late_by)} too late"
         if self.robustness is None:
-            return told
-        return f"{told}: the best one misses it by {abs(self.robustness):.3g}"
+            return f"no way was found that keeps {self.conjunct}"
+        return f"{told}: it misses by {abs(self.robustness):.3g}"
 
     @property
     def is_kept(self) -> bool:
@@ -146,8 +146,8 @@ class Explanation:
         if not self.is_kept or self.detail is not None:
             return str(self)
         if slack and self.late_by is not None:
-            later = f"{_steps(self.late_by)} later than the session allows"
-            return f"{self.conjunct} could still be kept, but {later}: it keeps {_steps(slack)} in hand"
+            later = f"{_steps(self.late_by)} later than the session asks for"
+            return f"{self.conjunct} could still be kept, but {later}, which keeps {_steps(slack)} in hand"
         if margin or slack:
             return f"{self} ({margin:.2g} m, {_steps(slack)})"
         return str(self)
@@ -198,8 +198,8 @@ class Decision:
 
     def why(self, action: int | str) -> str:
         """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden:
-        no way was found that still keeps F[50,100] Region2: the best one comes 4 steps too late". The step
-        has to have asked: explain=True.
+        no way was found that keeps the rule; the best one found fails in F[50,100] Region2: it is met at step
+        104, 4 steps too late". The step has to have asked: explain=True.
 
         Raises InputError for an action that there is not.
         """

@@ -139,9 +139,10 @@ class _Ahead:
             if least == math.inf:
                 return f"no way leads to where {need.formula} can be met{also}"
             if step + least > need.last:
-                sooner = f"at least {step + int(least) - self.known.now} steps"
-                left = f"{need.last - self.known.now} are left"
-                return f"{need.formula} is out of reach{also}: {sooner}, and {left}"
+                away = f"at least {step + int(least) - self.known.now} steps away, "
+                left = f"{need.last - self.known.now} steps before it is due"
+                asked = str(need.formula) if need.before is None else f"{need.predicate} by step {need.last}"
+                return f"{asked} is out of reach{also}: {away}{left}"
         return "not all of these can be reached in time, in whatever order: " + ", ".join(
             str(goal.need.formula) for goal in self.goals
         )

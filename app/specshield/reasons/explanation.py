@@ -25,7 +25,7 @@ from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.proposal import ask
-from specshield.stl import SATISFIED_ABOVE, Formula
+from specshield.stl import SATISFIED_ABOVE, Eventually, Formula, Until
 
 # Chosen by hand; an explanation costs some 10 ms.
 DEPTH = 2  # motions after which a witness is met again
@@ -115,18 +115,39 @@ class _Motion:
             i, lacking = int(np.argmin(asked)), bool((asked <= above).any()) and not self.doubtful
             late = late_by(parts[i].asked, row, now, above) if lacking else None
             order = (KEPT, math.inf if late is None else late) if lacking else (KEEPS_ALL, 0.0)
-            detail = None if lacking else self.known()
+            detail = self.holds_back(parts[i], late) if lacking else self.known()
             return order, Explanation(str(parts[i].conjunct), float(rho[i]), late, detail)
         i = int(np.argmin(rho))
         conjunct = parts[i].conjunct
         late = late_by(conjunct, row, now, SATISFIED_ABOVE) if len(failing) == 1 else None
-        words = in_words(conjunct, row, now)
-        if words is not None and late is None:
-            words = f"{words}; it misses by {abs(rho[i]):.3g}"
-        told = Explanation(str(conjunct), float(rho[i]), late, words)
+        told = Explanation(str(conjunct), float(rho[i]), late, self.fails(conjunct, row, late, rho))
         if late is not None:
             return (LATE, late), told
         return (BROKEN if len(failing) == 1 else SEVERAL, -told.robustness), told
+
+    def fails(self, conjunct: Formula, row: dict[str, Floats], late: int | None, rho: Floats) -> str | None:
+        """How a conjunct fails on a future, and what becomes of the others; None where `late` and the
+        robustness say it all.
+        """
+        words, missed = in_words(conjunct, row, self.prefix.t, late), abs(rho.min())
+        if words is None and len(rho) > 1:
+            words = f"it misses by {missed:.3g}" if late is None else f"it comes {steps(late)} too late"
+        elif words is not None and late is None:
+            words = f"{words}; it misses by {missed:.3g}"
+        if words is None or len(rho) == 1:
+            return words
+        alone = int((rho <= SATISFIED_ABOVE).sum()) == 1
+        return f"{words}, {'while the rest of the rule is kept' if alone else 'and other parts fail too'}"
+
+    def holds_back(self, part: _Part, late: int | None) -> str | None:
+        """What is asked of a conjunct that could be kept, and is not met as soon as that."""
+        asked, slack = part.asked, self.judged.slack
+        if late is None or not slack or not isinstance(asked, (Eventually, Until)):
+            return None
+        return (
+            f"the rule could still be kept, but {part.conjunct} only at step {asked.b + late}; the session "
+            f"keeps {steps(slack)} in hand and asks for it by step {asked.b}"
+        )
 
     def known(self) -> str:
         """Why a motion is forbidden of which a future is known that keeps all that is asked."""

@@ -82,11 +82,14 @@ def may_be_late(part: Formula, samples: Mapping[str, Floats], now: int) -> bool:
     return part.a > now + 1 or (part.a > now and not _holds(part.child, samples)[now])
 
 
-def in_words(part: Formula, samples: Mapping[str, Floats], now: int) -> str | None:
-    """What fails of an U or G over predicates along x_0.., and when; None of other conjuncts, and where
-    nothing fails. samples {name: [m]}; now: the last step that has been driven.
+def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int | None) -> str | None:
+    """What fails of an F, or of an U or G over predicates, along x_0.., and when; None of other conjuncts,
+    and where nothing fails. samples {name: [m]}; now: the last step that was driven; late: its `late_by`.
     """
     match part:
+        case Eventually(_, b, child) if late is not None:
+            does = "is met" if is_predicate(child) else "begins"
+            return f"it {does} at step {b + late}, {steps(late)} too late"
         case Until(a, b, left, right) if is_predicate(left) and is_predicate(right):
             return _of_until(part, _holds(left, samples), _holds(right, samples))
         case Always(a, b, child) if is_predicate(child):
@@ -96,13 +99,13 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int) -> str | No
             if not len(failing):
                 return None
             if not may_be_late(part, samples, now):
-                return f"on the best one '{child}' is broken at step {failing[0]}"
+                return f"'{child}' is broken at step {failing[0]}"
             met = np.flatnonzero(holds[failing[0] :])
             if not len(met) or failing[0] > a or failing[0] + met[0] > b:
-                return f"on the best one '{child}' does not hold at step {failing[0]}"
+                return f"'{child}' does not hold at step {failing[0]}"
             first = int(failing[0] + met[0])
             after = f"{steps(first - a)} after its window begins"
-            return f"on the best one '{child}' is met at step {first}, {after}"
+            return f"'{child}' is met at step {first}, {after}"
     return None
 
 
@@ -112,14 +115,14 @@ def _of_until(part: Until, left: Bools, right: Bools) -> str | None:
     broken = np.flatnonzero(~left[: part.a + met[0]] if len(met) else ~left)
     breaks = f"'{part.left}' is broken at step {broken[0]}" if len(broken) else ""
     if not len(met):
-        return f"on the best one '{part.right}' is not met" + (f", and {breaks}" if breaks else "")
+        return f"'{part.right}' is not met" + (f", and {breaks}" if breaks else "")
     first = part.a + int(met[0])
     if first <= part.b:
-        return f"on the best one {breaks}, before '{part.right}' is met at step {first}" if breaks else None
+        return f"{breaks}, before '{part.right}' is met at step {first}" if breaks else None
     told = f"'{part.right}' is met at step {first}, {steps(first - part.b)} too late"
     if breaks:
-        return f"on the best one {breaks}, and {told}"
-    return f"on the best one '{part.left}' holds until then, but {told}"
+        return f"{breaks}, and {told}"
+    return f"'{part.left}' holds all the way there, but {told}"
 
 
 def _holds(predicate: Formula, samples: Mapping[str, Floats]) -> Bools:

@@ -121,7 +121,7 @@ def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> R
     if bound is not None:
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
     message = (
-        f"of the {relaxed.tried} ways that the policies and a search tried from here, none keeps the rule; "
+        f"none of the {relaxed.tried} ways that the policies and a search tried from here keeps the rule: "
         f"{_wrong(relaxed.conjuncts)}"
     )
     return Refusal(message, False, relaxed.conjuncts)
@@ -143,9 +143,9 @@ def _fails(conjunct: Conjunct, alone: str) -> str:
     told = f"no way was found to keep {_shown(conjunct)}{alone}"
     late = conjunct.late_by
     if late is None:
-        nearest = f": the nearest that was found misses it by {abs(conjunct.robustness):.3g}"
+        nearest = f"; the best one found misses it by {abs(conjunct.robustness):.3g}"
         return f"{told}{nearest if math.isfinite(conjunct.robustness) else ''}"
-    return f"{told}: the best one comes {steps(late)} too late"
+    return f"{told}; the best one found comes {steps(late)} too late"
 
 
 def _ends_later(conjunct: Conjunct) -> str:
