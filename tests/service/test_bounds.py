@@ -77,6 +77,16 @@ def test_a_head_that_comes_too_slowly_is_refused(small: RunningServer) -> None:
     assert (status, problem["type"]) == (408, "request-timeout")
 
 
+@pytest.mark.parametrize("line", ["POST /x HTTP/1.1", "GET /x HTTP/1.1", "GET /x HTTP/1.0"])
+def test_what_cannot_open_a_websocket_is_refused(small: RunningServer, line: str) -> None:
+    opening = "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nContent-Length: 2\r\n\r\n"
+    with _connect(small) as connection:
+        connection.sendall(f"{line}\r\nHost: 127.0.0.1\r\n{opening}{key}".encode())
+        status, problem = _answer(connection)
+    assert (status, problem["type"]) == (422, "invalid-input")
+
+
 def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:
     with _connect(small) as connection:
         assert connection.recv(1) == b""

@@ -6,6 +6,7 @@ that is not on the map.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -17,6 +18,7 @@ from specshield.robot import STRETCH
 from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield.episode import Config, decide, make_shield
 from specshield.shield.taught import Taught, on_map
+from specshield.shield.uncertainty import Uncertainty
 from specshield.task import make_task
 from specshield.world.learned import CONTACT, LearnedMap, learn
 from specshield.world.occupancy import OccupancyGrid
@@ -193,3 +195,27 @@ def test_a_turn_that_no_map_explains_is_tried_twice_and_no_more():
         in_vain += [(*poses[-1], motion)] if poses[-1] == poses[-2] and motion != STRETCH.wait_motion else []
     assert decision.spec_status == "satisfied"
     assert max(map(in_vain.count, in_vain)) == 2
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+@pytest.mark.parametrize("over", ["step", "episode"])
+def test_a_motion_that_leads_nowhere_is_not_tried_for_ever(over, noise):
+    """The model wants to turn left, and the robot cannot turn: nothing on any map says why."""
+    left, random = STRETCH.action_names.index("l"), np.random.default_rng(1)
+    grid = OccupancyGrid(np.zeros((60, 60), bool), 0.05)
+    task = make_task(grid, replace(STRETCH, offset=(0.0, 0.0)), "F[0,60] x > 2.2")
+    shield = make_shield(
+        [synthesise(task)], Config(learn_map=True, uncertainty=Uncertainty(), threshold_over=over)
+    )
+    logits = np.where(np.arange(len(STRETCH.actions)) == left, 3.0, -8.0)
+    poses, carry, drawn = [[1.0, 1.0, math.pi / 2]], None, []
+    for _ in range(8):
+        decision = decide(shield, poses, logits, carry=carry)
+        carry, at = decision.carry, poses[-1]
+        drawn.append(decision.action)
+        if decision.action in (AHEAD, BACK):
+            at = decision.next_poses[decision.action].tolist()
+        poses.append((np.array(at) + random.normal(0.0, noise, 3)).tolist())
+    assert drawn[0] == left
+    assert any(action != left for action in drawn[4:])
+    assert int(STRETCH.motion_of[left]) in [motion for *_, motion in carry.stuck]

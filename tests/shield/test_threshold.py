@@ -50,7 +50,13 @@ def test_v_is_never_above_what_the_best_policy_has(formula, make):
         sure = care.noise._replace(lost=max(1e9 * slip, 1e-9), kept=1e9 * (1.0 - slip))  # as Storm is told it
         care = replace(care, noise=sure)
         judged = judge(shield, prefix, None, False, care)
-        found.append((chances(shield, care, prefix, judged)[:4], vector["best"], vector["slip"]))
+        found.append(
+            (
+                chances(shield, care, prefix, judged, np.zeros(len(shield.task.robot.motions), bool))[:4],
+                vector["best"],
+                vector["slip"],
+            )
+        )
     for values, best, slip in found:
         assert np.all(values <= np.array(best) + 1e-9), (values, best, slip)
     if make is not Everything:  # which sees six motions ahead

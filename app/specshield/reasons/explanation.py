@@ -50,7 +50,7 @@ def explanations(
     """One an action: None where it is allowed, or terminal.
 
     prefix: as the whole formula sees it. judged: None where the rule forbids nothing any more. doubtful [M]:
-    motions that lead where the robot has run into something.
+    motions by which the robot was stopped before, or that lead where it has run into something.
     """
     robot = shield.task.robot
     if judged is None or not prefix.formula.names:
@@ -152,7 +152,7 @@ class _Motion:
     def known(self) -> str:
         """Why a motion is forbidden of which a future is known that keeps all that is asked."""
         if self.doubtful:
-            return "the rule could still be kept, but the robot has run into something there"
+            return "the rule could still be kept, but the robot was stopped there before"
         told = "a way is known that keeps the rule, but the policies did not find it"
         margin, slack = self.judged.margin, self.judged.slack
         if not margin and not slack:

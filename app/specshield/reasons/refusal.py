@@ -16,12 +16,14 @@ from specshield.handover import begun
 from specshield.reasons.bound import proof
 from specshield.reasons.lateness import steps
 from specshield.reasons.relaxation import Conjunct, relaxations
+from specshield.robot.dynamics import Body
 from specshield.shield import switching
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.episode import Signals, start
 from specshield.shield.taught import on_map, teach
 from specshield.stl import Always
 from specshield.stl.fragment import is_predicate
+from specshield.world.learned import SENT, forget
 
 MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST
 LONGEST = 400
@@ -58,10 +60,10 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
     Raises InputError for a session that would end before its rule is decided, PoseError, and InfeasibleStart
     unless `allow_infeasible`.
     """
-    steps, horizon = shield.config.max_steps, shield.task.horizon
-    if steps is not None and steps < horizon:
+    most, horizon = shield.config.max_steps, shield.task.horizon
+    if most is not None and most < horizon:
         raise InputError(
-            f"a session of {steps} steps ends before its rule is decided", path="max_steps", got=steps,
+            f"a session of {most} steps ends before its rule is decided", path="max_steps", got=most,
             expected=f"at least {horizon}, the rule's last step",
         )  # fmt: skip
     try:
@@ -91,7 +93,9 @@ def switch(
         return None
     except InfeasibleSwitch as error:
         taught, _ = teach(shield, carry, history, None, None)
-        told = refusal(on_map(shield, taught.map), history, signals or {})
+        known = taught.map
+        sure = on_map(shield, forget(known, known.occupied & (known.by != SENT)))  # contacts are guesses
+        told = refusal(on_map(shield, known), history, signals or {}, sure.body)
         if told.way is not None:
             found = begun(told.way) if carry is None else replace(carry, way=told.way)
             with suppress(InfeasibleSwitch):
@@ -103,10 +107,13 @@ def switch(
         ) from None  # fmt: skip
 
 
-def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Refusal:
+def refusal(
+    shield: Shield, history: Floats, signals: Mapping[str, Floats], sure: Body | None = None
+) -> Refusal:
     """Why the shield's rule cannot be kept after x_0..x_t, or was not found to be.
 
-    history [t + 1, 3], signals {name: [t + 1]}, which are taken to hold their last values.
+    history [t + 1, 3], signals {name: [t + 1]}, which are taken to hold their last values; sure: the robot on
+    a map that holds nothing that was merely guessed, on which alone something is proved.
     """
     relaxed = relaxations(shield, history, signals)
     if relaxed.way is not None:
@@ -117,7 +124,7 @@ def refusal(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> R
             relaxed.conjuncts,
             relaxed.way,
         )
-    bound = proof(shield.task, shield.body, history, signals)
+    bound = proof(shield.task, sure or shield.body, history, signals)
     if bound is not None:
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
     message = (

@@ -134,7 +134,7 @@ def decide(
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
-    care = replace(wary(shield.config, care), barred=taught.barred(poses[-1]))
+    care = replace(wary(shield.config, care), barred=taught.barred)
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
@@ -159,7 +159,7 @@ def decide(
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)
         if shield.config.threshold_over == "episode" and spec_status == "pending":
-            chance = chances(shield, care, prefix, judged)
+            chance = chances(shield, care, prefix, judged, doubts)
             left = left_of(shield, carry, chance)
         answer = _answer(shield, log_prior, judged, main_task_done, weights, chance, left)
         if spec_status == "violated":

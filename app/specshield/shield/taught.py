@@ -20,7 +20,16 @@ from specshield.compiled import leaf
 from specshield.robot.dynamics import Body, make_body, overlap, successors
 from specshield.shield.caution.experience import was_stopped, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
-from specshield.shield.surprise.contact import NEAR, UNDER, Followed, cells_met, cells_under, contact_of
+from specshield.shield.surprise.contact import (
+    NEAR,
+    UNDER,
+    Followed,
+    Near,
+    cells_met,
+    cells_under,
+    contact_of,
+    is_near,
+)
 from specshield.shield.uncertainty import Care
 from specshield.world.learned import (
     BEHIND,
@@ -38,7 +47,7 @@ from specshield.world.learned import (
 )
 
 # [steps] what a way around something takes that only contacts show. Chosen by hand: of 60 runs in cases 1 and
-# 2, `evaluation worlds --world obstacle --sensing contact` keeps 58 and 52 with 12, and 59 and 57 with 20.
+# 2, `evaluation worlds --world obstacle --sensing contact` kept 58 and 52 with 12, and 59 and 56 with 20.
 AROUND = 20
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand
@@ -46,7 +55,6 @@ NEARBY = 2.0  # [m] poses farther away than this say nothing of a thing that was
 KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 
 
-SAME_PLACE = 1e-3  # [m], [rad] a robot that differs by no more stands where it stood
 MOST_STUCK = 16  # places that are kept from which a motion led nowhere
 HEAD = struct.Struct("<h?hB")  # what `Followed` holds
 MOST_MET = 255  # contacts at one pose that HEAD can hold
@@ -57,17 +65,15 @@ class Taught:
     """What a session has learned: its map, and how its caller follows what is drawn.
 
     contact: whether the last motion ran into something; it is not handed on. stuck: where the robot stood and
-    which motion led nowhere from there, though no mark explains it; handed on beside the bytes.
+    which motion led nowhere from there, though no mark explains it; handed on beside the bytes. barred: those
+    motions that led nowhere from where the robot is now.
     """
 
     map: LearnedMap = field(default_factory=LearnedMap)
     followed: Followed = field(default_factory=Followed)
     contact: bool = False
     stuck: tuple[Stuck, ...] = ()
-
-    def barred(self, pose: Floats) -> tuple[int, ...]:
-        """The motions that led nowhere from a pose (3,)."""
-        return tuple(motion for *at, motion in self.stuck if np.abs(pose - at).max() <= SAME_PLACE)
+    barred: tuple[int, ...] = ()
 
     def to_bytes(self) -> bytes:
         known = self.followed
@@ -98,14 +104,12 @@ def teach(
         return NOTHING, ()
     before = Taught.from_bytes(learned)
     known, followed, motion = before.map, before.followed, -1
-    stuck = () if carry is None else carry.stuck
+    stuck, near = () if carry is None else carry.stuck, NEAR
     if config.map_memory is not None:
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
-        body = body_on(shield, before.map)
-        motion, followed = contact_of(
-            body, followed, poses[-2], poses[-1], carry.next_poses, within_noise(shield, carry) or NEAR
-        )
+        body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
+        motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near)
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses):
             motion, followed = -1, replace(followed, met=0)
         half_way = np.empty(3)
@@ -127,12 +131,18 @@ def teach(
             beyond += outside
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
-    if motion >= 0 and np.abs(poses[-1] - poses[-2]).max() <= SAME_PLACE:
+    if motion >= 0 and is_near(poses[-2:-1], poses[-1], near):
         leads = np.empty((len(shield.task.robot.motions), 3))
         successors(body_on(shield, own), poses[-1], leads)
-        if np.abs(leads[motion] - poses[-1]).max() > SAME_PLACE:  # no mark explains it
-            stuck = (*stuck, (*poses[-1].tolist(), motion))[-MOST_STUCK:]
-    return Taught(own, followed, motion >= 0, stuck), said
+        if not is_near(leads[motion : motion + 1], poses[-1], near):  # no mark explains it
+            known_before = [each for each in stuck if each[3] != motion or not _is_at(each, poses[-1], near)]
+            stuck = (*known_before, (*poses[-1].tolist(), motion))[-MOST_STUCK:]
+    barred = tuple(each[3] for each in stuck if _is_at(each, poses[-1], near))
+    return Taught(own, followed, motion >= 0, stuck, barred), said
+
+
+def _is_at(stuck: Stuck, pose: Floats, near: Near) -> bool:
+    return bool(is_near(np.array([stuck[:3]]), pose, near))
 
 
 @leaf
@@ -180,19 +190,21 @@ def doubted(taught: Taught, t: int) -> Iterator[Taught]:
 
 
 def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
-    """[M]: the motions from a pose (3,) that lead elsewhere if contacts are believed than if they are not.
+    """[M]: the motions from a pose (3,) that lead elsewhere if contacts are believed than if they are not,
+    and those that led nowhere before.
 
     told: the shield on the policy's map. A motion that only a mark stops may go on in truth, into what the
     rule forbids.
     """
     known, motions = taught.map, len(told.task.robot.motions)
-    if not len(known) or not (marks := known.occupied & (known.by != SENT)).any():
-        return np.zeros(motions, np.bool_)
-    ends = np.empty((2, motions, 3))
-    for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
-        successors(body_on(told, believed), pose, end)
-    differ: Bools = np.any(ends[0] != ends[1], axis=1)
-    return differ
+    doubts = np.zeros(motions, np.bool_)
+    if len(known) and (marks := known.occupied & (known.by != SENT)).any():
+        ends = np.empty((2, motions, 3))
+        for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
+            successors(body_on(told, believed), pose, end)
+        doubts |= np.any(ends[0] != ends[1], axis=1)
+    doubts[list(taught.barred)] = True
+    return doubts
 
 
 def on_map(shield: Shield, known: LearnedMap, guess: bool = False) -> Shield:

@@ -13,7 +13,7 @@ from typing import cast
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
-from specshield.errors import Busy, HeadersTooLarge, RequestTimeout, SpecshieldError
+from specshield.errors import Busy, HeadersTooLarge, InputError, RequestTimeout, SpecshieldError
 from specshield.service import metrics, problems
 from specshield.service.bounds.corked import Corked
 from specshield.service.settings import Settings
@@ -102,6 +102,10 @@ class BoundedProtocol(HttpToolsProtocol):
     def handle_websocket_upgrade(self) -> None:
         self._upgraded = True
         super().handle_websocket_upgrade()
+        opening = self.transport.get_protocol()
+        if not getattr(opening, "handshake_initiated", True):  # nothing would answer it, or end it
+            expected = "a GET of HTTP/1.1 without a body, which opens a WebSocket"
+            self._refuse(InputError("the request cannot open a WebSocket", expected=expected))
 
     def send_400_response(self, msg: str) -> None:
         if self._in_head and self._head > _settings().max_header_bytes:

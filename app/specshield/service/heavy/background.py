@@ -29,11 +29,12 @@ class Background:
             except BaseException as error:
                 future.set_exception(error)
 
-        self._calls.put(call)
         with self._lock:
             if self._thread is None:
-                self._thread = Thread(target=self._run, name=self._name, daemon=True)
-                self._thread.start()
+                thread = Thread(target=self._run, name=self._name, daemon=True)
+                thread.start()  # may fail, and is tried again with the next call
+                self._thread = thread
+        self._calls.put(call)
         return future
 
     def _run(self) -> None:

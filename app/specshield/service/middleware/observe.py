@@ -30,7 +30,7 @@ class Observe:
         start = time.perf_counter()
         timing: dict[str, float] = {}
         scope.setdefault("state", {})["timing"] = timing
-        asked = dict(scope["headers"]).get(b"x-request-id", b"").decode("latin-1")
+        asked = next((v for n, v in scope["headers"] if n == b"x-request-id"), b"").decode("latin-1")
         request_id = asked if REQUEST_ID.fullmatch(asked) else f"{STARTED}{next(_count):08x}"
         scope["state"]["request_id"] = request_id
         logs.request.set(scope)

@@ -59,8 +59,9 @@ class ProblemConjunct(Answer):
         description="The highest found of it beside the other parts, or alone where those cannot be kept [m]."
     )
     late_by: int | None = Field(
-        description="How many steps later its window would have to end: for this part alone where it is not "
-        "feasible alone, else for the whole rule. Null where no later end was found to do."
+        description="How many steps later its window would have to end, or to begin for `G[a,b] place`: for "
+        "this part alone where it is not feasible alone, else for the whole rule. Null where no such end was "
+        "found to do."
     )
 
 

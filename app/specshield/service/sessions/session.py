@@ -87,7 +87,7 @@ class Session:
 
 
 # What others are not told of a config.
-INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before")
+INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before", "way")
 
 
 def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]:

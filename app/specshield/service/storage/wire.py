@@ -137,7 +137,7 @@ class _Link(asyncio.Protocol):
             answer, _ = self._waiting.popleft()
             if not answer.done():
                 answer.set_exception(TimeoutError("the store did not answer in time"))
-                self.close()
+            self.close()  # also where nobody waits any more: else the next would get this one's answer
         if self._waiting:
             self._watch = self._loop.call_at(self._waiting[0][1], self._late)
 

@@ -33,8 +33,10 @@ from specshield.stl.tree import tree_value
 GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
 
-def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged) -> Floats:
-    """V of each action [A]; of a terminal one, 0."""
+def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: Bools) -> Floats:
+    """V of each action [A]; of a terminal one, 0. doubts [M]: motions that are not to be drawn though some
+    future by them may keep the rule, where others are feasible.
+    """
     tried, task = judged.tried, shield.task
     formula, parts = conjunction_of(task, prefix.formula)
     leaves = tried.leaves
@@ -58,6 +60,8 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged) -> Float
         values,
     )
     motion_of = task.robot.motion_of
+    if judged.some:
+        values[doubts & ~judged.feasible_motion] = 0.0
     return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0)
 
 

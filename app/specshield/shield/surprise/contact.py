@@ -51,15 +51,15 @@ def contact_of(
     foreseen [M, 3]: where f leads from `before`. near: what noise explains.
     """
     drawn = followed.drawn
-    if drawn >= 0 and _is_near(foreseen[drawn : drawn + 1], after, near):
+    if drawn >= 0 and is_near(foreseen[drawn : drawn + 1], after, near):
         return -1, _moved(followed)
-    if _is_near(before[None], after, near):  # it stands where it stood
+    if is_near(before[None], after, near):  # it stands where it stood
         if drawn < 0 or not followed.follows:
             return -1, followed
         if followed.halted == drawn or followed.met:  # what stopped it a moment ago does so again
             return drawn, replace(followed, halted=-1, met=followed.met + 1)
         return -1, replace(followed, halted=drawn)
-    if _is_near(foreseen, after, near):
+    if is_near(foreseen, after, near):
         return -1, replace(followed, follows=False, halted=-1, met=0)
     short = _short(body, before, after, foreseen, near)
     if not short.any():
@@ -74,7 +74,7 @@ def _moved(followed: Followed) -> Followed:
 
 
 @kernel
-def _is_near(poses: Floats, pose: Floats, near: Near) -> bool:
+def is_near(poses: Floats, pose: Floats, near: Near) -> bool:
     """Whether one of poses [n, 3] is the pose (3,), but for noise."""
     for i in range(len(poses)):
         far = math.hypot(poses[i, 0] - pose[0], poses[i, 1] - pose[1])

@@ -1,0 +1,38 @@
+import asyncio
+from types import SimpleNamespace
+
+import hiredis
+import pytest
+import redis
+
+from specshield.service.storage.wire import _Link
+
+
+def test_an_answer_that_comes_too_late_is_nobody_elses():
+    """Though the one who asked has gone meanwhile."""
+
+    async def scene():
+        release = asyncio.Event()
+
+        async def echo(reader, writer):
+            commands = hiredis.Reader()
+            while data := await reader.read(65536):
+                commands.feed(data)
+                await release.wait()
+                while (command := commands.gets()) is not False:
+                    writer.write(b"$%d\r\n%s\r\n" % (len(command[1]), command[1]))
+            writer.close()
+
+        server = await asyncio.start_server(echo, "127.0.0.1", 0)
+        _, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        link, loop = _Link(SimpleNamespace(_writer=writer)), asyncio.get_running_loop()
+        gone = asyncio.create_task(link.send(("GET", "one"), loop.time() + 0.05))
+        await asyncio.sleep(0.0)
+        gone.cancel()
+        loop.call_later(0.2, release.set)
+        with pytest.raises(redis.ConnectionError):
+            await link.send(("GET", "another"), loop.time() + 60.0)
+        release.set()
+        server.close()
+
+    asyncio.run(scene())
