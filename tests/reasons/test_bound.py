@@ -43,11 +43,7 @@ def circle(x, radius=0.3):
 @pytest.mark.parametrize(
     ("formula", "wall", "said"),
     [
-        (
-            "F[0,15] Far",
-            False,
-            "F[0,15] Far is out of reach: at least 18 steps away, 15 steps before it is due",
-        ),
+        ("F[0,15] Far", False, "F[0,15] Far is out of reach: at least 18 steps away, and due in 15"),
         ("F[0,400] Far", True, "no way leads to where F[0,400] Far can be met"),
         (
             "F[0,400] Far and G[0,400] not Strip",

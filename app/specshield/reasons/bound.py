@@ -140,7 +140,7 @@ class _Ahead:
                 return f"no way leads to where {need.formula} can be met{also}"
             if step + least > need.last:
                 away = f"at least {step + int(least) - self.known.now} steps away, "
-                left = f"{need.last - self.known.now} steps before it is due"
+                left = f"and due in {need.last - self.known.now}"
                 asked = str(need.formula) if need.before is None else f"{need.predicate} by step {need.last}"
                 return f"{asked} is out of reach{also}: {away}{left}"
         return "not all of these can be reached in time, in whatever order: " + ", ".join(

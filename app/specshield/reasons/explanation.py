@@ -120,24 +120,31 @@ class _Motion:
         i = int(np.argmin(rho))
         conjunct = parts[i].conjunct
         late = late_by(conjunct, row, now, SATISFIED_ABOVE) if len(failing) == 1 else None
-        told = Explanation(str(conjunct), float(rho[i]), late, self.fails(conjunct, row, late, rho))
+        told = Explanation(str(conjunct), float(rho[i]), late, self.fails(parts, i, rho, row, late))
         if late is not None:
             return (LATE, late), told
         return (BROKEN if len(failing) == 1 else SEVERAL, -told.robustness), told
 
-    def fails(self, conjunct: Formula, row: dict[str, Floats], late: int | None, rho: Floats) -> str | None:
-        """How a conjunct fails on a future, and what becomes of the others; None where `late` and the
-        robustness say it all.
+    def fails(
+        self, parts: Sequence[_Part], i: int, rho: Floats, row: dict[str, Floats], late: int | None
+    ) -> str | None:
+        """How conjunct i fails on a future, and what becomes of the others; None where `late` and the
+        robustness say it all. rho [parts], row: as in `shows`.
         """
-        words, missed = in_words(conjunct, row, self.prefix.t, late), abs(rho.min())
-        if words is None and len(rho) > 1:
-            words = f"it misses by {missed:.3g}" if late is None else f"it comes {steps(late)} too late"
-        elif words is not None and late is None:
-            words = f"{words}; it misses by {missed:.3g}"
-        if words is None or len(rho) == 1:
-            return words
-        alone = int((rho <= SATISFIED_ABOVE).sum()) == 1
-        return f"{words}, {'while the rest of the rule is kept' if alone else 'and other parts fail too'}"
+        conjunct, task = parts[i].conjunct, self.prefix.task
+        words = in_words(conjunct, row, self.prefix.t, late)
+        others = [str(part.conjunct) for n, part in enumerate(parts) if n != i and rho[n] <= SATISFIED_ABOVE]
+        unit = " m" if set(conjunct.names) <= {"x", "y", *task.areas} else ""
+        missed = f"it misses by {abs(rho[i]):.3g}{unit}"
+        if words is None:
+            if len(parts) == 1:
+                return None
+            words = missed if late is None else f"it comes {steps(late)} too late"
+        elif late is None and not others:
+            words = f"{words}; {missed}"
+        if others:
+            return f"{words}; {' and '.join(others)} {'are' if len(others) > 1 else 'is'} not kept either"
+        return f"{words}, while the rest of the rule is kept" if len(parts) > 1 else words
 
     def holds_back(self, part: _Part, late: int | None) -> str | None:
         """What is asked of a conjunct that could be kept, and is not met as soon as that."""
