@@ -167,6 +167,17 @@ def test_a_decision_that_was_never_heard_is_passed_over_by_a_robot_that_stood():
     assert [(body["t"], len(body["poses"])) for body in bodies] == [(0, 1), (1, 1)]
 
 
+@pytest.mark.parametrize("taken", [False, True])
+def test_the_main_task_that_ends_at_a_step_that_says_to_stop_has_ended(taken):
+    """Whether the service took that step or not: of the first, nobody heard the answer."""
+    state = robust("stop")
+    stopped, _ = step(state, 0.0, *AWAY, main_task_done=True)
+    assert (stopped.source, state.main_task_done) == ("stop", True)
+    outcomes = [problem(409, "step-conflict", expected_t=1), decided(1, M)] if taken else [decided(0, M)]
+    _, bodies = step(state, 0.0, *outcomes)
+    assert all(body["main_task_done"] for body in bodies)
+
+
 def test_the_main_task_that_ends_while_the_service_is_away_has_ended():
     state = robust()
     step(state, 0.0, decided(0, M, witness=[M, M, M]))

@@ -8,7 +8,7 @@ from client_script import SESSION, answer, drive, lost, problem
 
 from specshield import errors
 from specshield.client import calls, core
-from specshield.client.models import Policy
+from specshield.client.models import Policy, SessionInfo
 from specshield.client.wire import Request, get, post
 
 POLICY = {"id": "p", "status": "training", "progress": 0.5, "horizon": 140, "metrics": {}, "error": None}
@@ -119,10 +119,26 @@ def test_session_exists_at_the_first_try_is_somebody_elses():
     assert len(sent) == 1
 
 
-def test_a_callers_id_that_has_moved_on_is_somebody_elses_even_after_a_lost_answer():
-    busy = answer({**SESSION, "next_t": 4})
-    error, _, _ = drive(create(id="taken"), lost(), problem(409, "session-exists"), busy)
-    assert type(error) is errors.SessionExists
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"next_t": 4},
+        {"policy_ids": ["q"]},
+        {"threshold": 0.1},
+        {"seed": 1},
+        {"map_memory": 9},
+        {"uncertainty": {"translation": 0.02, "rotation": 0.1, "slip": 0.0}},
+        {},
+    ],
+)
+def test_a_callers_id_is_somebody_elses_even_after_a_lost_answer_unless_it_is_what_was_asked_for(other):
+    asked = {"id": "taken", "policy_id": "name", "uncertainty": {"translation": 0.01, "rotation": 0.1}}
+    told = {"seed": 0, "threshold": 1, "map_memory": None, **SESSION, "id": "taken"}
+    told |= {"uncertainty": {**asked["uncertainty"], "slip": 0.0}, **other}
+    named = [answer({**POLICY, "id": "p"})] if other.keys() <= {"policy_ids"} else []
+    result, sent, _ = drive(create(**asked), lost(), problem(409, "session-exists"), answer(told), *named)
+    assert type(result) is (errors.SessionExists if other else SessionInfo)
+    assert [request.path for request in sent[3:]] == ["/v1/policies/name"] * len(named)
 
 
 def test_erasing_what_a_lost_try_erased_succeeds_and_what_never_was_does_not():

@@ -17,6 +17,7 @@ import specshield.client
 from specshield import errors
 from specshield.client import AsyncShieldClient, ShieldClient, aio, sync
 
+NO_NAME = f"http://{'a' * 64}.test:1"  # a part of a name has 63 characters at most
 SPEC = {"formula": "F[0,3] a", "horizon": 3, "names": ["a"]}
 
 
@@ -113,6 +114,12 @@ def test_a_closed_port_is_a_transport_error(use):
         url = f"http://127.0.0.1:{server.getsockname()[1]}"
     with pytest.raises(errors.TransportError, match=url):
         use(url, validate)
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_host_that_no_name_can_be_is_a_transport_error(use):
+    with pytest.raises(errors.TransportError):
+        use(NO_NAME, validate, timeout=60.0)
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8000", "localhost", "http://", "ftp://robot", "http://a:b", ""])

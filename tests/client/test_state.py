@@ -98,6 +98,46 @@ def test_a_gap_is_filled_once_only_and_not_where_poses_are_lacking():
     assert len(bodies) == 1
 
 
+def differs(t, x):
+    """The server has another pose of step t."""
+    return problem(409, "history-conflict", t=t, stored=[x, 0, 0])
+
+
+def test_what_came_with_a_lost_answer_stands_whatever_was_recorded_of_that_step():
+    state = session()
+    step(state, 0, decided(0, M))
+    for x in (1, 2):
+        assert type(step(state, x, *[lost(0.0)] * 5)[0]) is errors.TransportTimeout
+        state.record((x + 0.125, 0, 0))  # the robot has drifted
+    _, bodies = step(state, 3, differs(1, 1), differs(2, 2), decided(3, M))
+    assert [sent_poses(body) for body in bodies] == [(3, [1.125, 2.125, 3]), (3, [1, 2.125, 3]), (3, [2, 3])]
+    assert state._poses[1] == (1.125, 0, 0), "the caller's own history is what it was told"
+    state.record((4, 0, 0))
+    verdict, bodies = close(state, None, differs(4, 5), VERDICT)
+    assert (verdict.spec_status, [sent_poses(body) for body in bodies]) == ("violated", [(4, [4]), (4, [5])])
+
+
+def test_a_conflict_about_the_present_pose_or_one_sent_as_stored_is_raised():
+    state = session()
+    step(state, 0, decided(0, M))
+    error, bodies = step(state, 1, differs(1, 2))
+    assert (type(error), len(bodies), state.t) == (errors.HistoryConflict, 1, 1)
+    state.record((1, 0, 0))
+    error, bodies = step(state, 2, differs(1, 3), differs(1, 3))
+    assert (type(error), len(bodies), state.t) == (errors.HistoryConflict, 2, 2)
+
+
+def test_a_session_that_was_finished_goes_on_under_a_new_rule():
+    state = session()
+    step(state, 0, decided(0, END, "satisfied"))
+    assert state.finished
+    info = answer({**SESSION, "actions": ["m", "b", "end"], "terminal_actions": [END], "next_t": 1})
+    drive(state._switch("p2", clock="restart"), info)
+    assert (state.finished, state.spec_status, state.main_task_done) == (False, "pending", True)
+    decision, (body,) = step(state, 1, decided(1, M, "satisfied", finished=True), logits=None)
+    assert (body["main_task_done"], decision.execute, state.finished) == (True, END, True)
+
+
 def test_a_session_read_back_goes_on_where_the_server_stands():
     state = session(None, next_t=5)
     _, (body,) = step(state, 9, decided(5, M))
@@ -218,7 +258,7 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
     assert close(session(None, next_t=5), None, VERDICT)[1] == [{}]
 
 
-FAILS = "no way was found that keeps the rule; the best one found fails in F[50,100] Region2"
+FAILS = "no way was found that keeps the rule; the best one does not keep 'F[50,100] Region2'"
 
 
 @pytest.mark.parametrize(
@@ -226,7 +266,7 @@ FAILS = "no way was found that keeps the rule; the best one found fails in F[50,
     [
         ([-0.3, 4], f"{FAILS}: it comes 4 steps too late"),
         ([-0.3, 1], f"{FAILS}: it comes 1 step too late"),
-        ([-0.3, None], f"{FAILS}: it misses by 0.3"),
+        ([-0.3, None], f"{FAILS}: it misses it by 0.3"),
         ([None, None], "no way was found that keeps F[50,100] Region2"),
         ([-0.3, None, "'A' is not met"], f"{FAILS}: 'A' is not met"),
         ([0.05, None, "a way is known that keeps the rule"], "a way is known that keeps the rule"),
@@ -245,7 +285,13 @@ def test_a_decision_says_why_an_action_is_forbidden(why, line):
 @pytest.mark.parametrize(
     ("margin", "slack", "late", "line"),
     [
-        (0.04, 20, 2, "but 2 steps later than the session asks for, which keeps 20 steps in hand"),
+        (
+            0.04,
+            20,
+            2,
+            "but not with the 20 steps in reserve that the session asks for: "
+            "it comes 2 steps too late for that",
+        ),
         (0.04, 0, None, "but with less to spare than the session asks for (0.04 m, 0 steps)"),
     ],
 )

@@ -12,6 +12,7 @@ import msgpack
 import pytest
 from client_script import SESSION
 from test_deadline import decided
+from test_shells import NO_NAME
 from websockets.sync.server import serve
 
 from specshield import errors
@@ -23,7 +24,9 @@ INFO = build(SessionInfo, SESSION)
 
 
 class Server:
-    """`faults[n]` is what the n-th message meets: "drop", "stale", "late", "mute", "text" or a problem."""
+    """`faults[n]` is what the n-th message meets: "drop", "stale", "late", "mute", "text", a problem, or an
+    event that the answer waits for. An answer says in `next_poses` which pose it is about.
+    """
 
     def __init__(self, *faults, refuse=None):
         self.faults, self.refuse = list(faults), refuse
@@ -35,11 +38,13 @@ class Server:
                 body = msgpack.unpackb(message)
                 self.messages.append(body)
                 fault = self.faults.pop(0) if self.faults else None
-                answer = decided(body["t"])
+                answer = {**decided(body["t"]), "next_poses": body["poses"][-1:] * 2}
                 if fault == "drop":
                     return
                 if fault == "mute":
                     continue
+                if isinstance(fault, threading.Event):
+                    fault.wait(60.0)
                 if fault == "late":
                     time.sleep(0.5)
                 if fault == "stale":
@@ -59,9 +64,22 @@ class Server:
         return response
 
 
+@contextlib.contextmanager
+def served(handler):
+    """Where it listens."""
+    with serve(handler, "127.0.0.1", 0, process_request=handler.look, compression=None) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.socket.getsockname()[1]}/prefix"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
 @pytest.fixture(params=["sync", "async"])
 def stepping(request):
-    """stepping(server, n, **options): the answers to n steps of one session over one client."""
+    """stepping(server or its address, n, **options): the answers to n steps of a session over one client."""
 
     def run(handler, n=1, timeout=10.0, **options):
         async def awaited(url):
@@ -74,15 +92,8 @@ def stepping(request):
                 session = Session(client._run, INFO, POSE)
                 return [session.step(POSE, LOGITS, **options) for _ in range(n)]
 
-        with serve(handler, "127.0.0.1", 0, process_request=handler.look, compression=None) as server:
-            thread = threading.Thread(target=server.serve_forever, daemon=True)
-            thread.start()
-            url = f"http://127.0.0.1:{server.socket.getsockname()[1]}/prefix"
-            try:
-                return blocking(url) if request.param == "sync" else asyncio.run(awaited(url))
-            finally:
-                server.shutdown()
-                thread.join()
+        with contextlib.nullcontext(handler) if isinstance(handler, str) else served(handler) as url:
+            return blocking(url) if request.param == "sync" else asyncio.run(awaited(url))
 
     return run
 
@@ -114,6 +125,33 @@ def test_a_lost_connection_and_a_wrong_answer_are_asked_again_on_a_new_one(stepp
 def test_an_answer_that_comes_late_is_never_read(stepping):
     server = Server(None, "late")
     assert [decision.t for decision in stepping(server, 3, timeout=0.3)] == [0, 1, 2]
+
+
+def test_the_answer_to_a_step_that_is_cancelled_is_never_read():
+    answering, elsewhere = threading.Event(), (0.0, 0.3, 0.0)
+    server = Server(None, answering)
+
+    async def cancelled(url):
+        async with AsyncShieldClient(url, timeout=60.0, stream=True) as client:
+            session = AsyncSession(client._run, INFO, POSE)
+            await session.step(POSE, LOGITS)
+            step = asyncio.create_task(session.step(POSE, LOGITS))
+            while len(server.messages) < 2:
+                await asyncio.sleep(0.01)
+            step.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await step
+            answering.set()
+            return await session.step(elsewhere, LOGITS)
+
+    with served(server) as url:
+        decision = asyncio.run(cancelled(url))
+    assert (decision.t, decision.next_poses[0], len(server.paths)) == (1, elsewhere, 2)
+
+
+def test_a_host_that_no_name_can_be_is_a_transport_error(stepping):
+    with pytest.raises(errors.TransportError):
+        stepping(NO_NAME)
 
 
 def test_a_server_that_says_nothing_is_left_at_the_deadline(stepping):

@@ -168,6 +168,7 @@ def test_an_id_cannot_leave_its_place_in_the_path():
 
 
 def test_server_timing():
-    timed = reply(200, {}, **{"server-timing": 'total;dur=2.5, rollout;desc="J";dur=1.25, miss'})
-    assert wire.timings(timed) == {"total": 2.5, "rollout": 1.25}
+    header = 'total;dur=2.5, rollout;desc="J";dur=1.25, miss, edge;dur="5", bad;dur=x'
+    timed = reply(200, {}, **{"server-timing": header})
+    assert wire.timings(timed) == {"total": 2.5, "rollout": 1.25, "edge": 5.0}
     assert wire.timings(reply(200, {})) == {}

@@ -7,7 +7,9 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from specshield.client import ShieldClient
 from specshield.errors import HistoryConflict, InfeasibleStart, InfeasibleSwitch, NotFound, SessionFinished
 from specshield.local import LocalShield
 from specshield.world.occupancy import OccupancyGrid
+from tests.service.world import grid_json, policy_files, send_policy
 from tests.serving import RunningServer
 
 START = (4.5, 5.0, 0.0)
@@ -113,6 +116,37 @@ def test_a_server_switches_the_same(server: RunningServer) -> None:
             local.switch(wall, clock="restart")
         assert local.info.rules[-1]["policy_ids"] == local.info.policy_ids
         assert local.close(pose) == remote.close(pose)
+
+
+def test_a_model_that_ends_is_asked_again_under_another_rule(server: RunningServer, tmp_path: Path) -> None:
+    """The rule is kept and `end` drawn: no server has been told so, and another rule is taken."""
+    there, here, begins = list[str](), list[LocalShield](), (1.0, 1.5, 0.0)
+    with httpx.Client(base_url=server.url, timeout=60.0) as client:
+        assert client.post("/v1/maps", json=grid_json()).status_code == 201
+        for formula in ("F[0,5] x > 0.5", "F[0,20] x > 1.5"):
+            spec: dict[str, Any] = {"formula": formula, "regions": {}}
+            there.append(send_policy(client, spec=spec)["id"])
+            parts = policy_files(spec)
+            (tmp_path / "policy.safetensors").write_bytes(parts["weights"])
+            (tmp_path / "card.json").write_bytes(parts["card"])
+            here.append(LocalShield.load(tmp_path, grid_json()))
+    with ShieldClient(server.url, timeout=60.0) as sdk:
+        remote = sdk.sessions.create(policy_id=there[0], initial_pose=begins)
+        local = here[0].session(initial_pose=begins)
+        ending = [None, None, None, None, 0.0]
+        assert local.step(begins, ending) == replace(remote.step(begins, ending), timings={})
+        assert local.finished
+        taken = remote.switch(there[1]), local.switch(here[1])
+        assert {(each.spec_status, each.finished) for each in (*taken, local)} == {("pending", False)}
+        pose = begins
+        while not local.finished:
+            decision = local.step(pose)
+            assert decision == replace(remote.step(pose), timings={})
+            pose = decision.next_poses[decision.execute]
+        assert local.spec_status == "satisfied"
+        for session, last in ((remote, there[0]), (local, here[0])):
+            with pytest.raises(SessionFinished):
+                session.switch(last)
 
 
 def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -> None:

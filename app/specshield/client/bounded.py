@@ -113,7 +113,7 @@ def look_up(host: str, port: int, by: float) -> list[str]:
     def ask() -> None:
         try:
             found.append(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # UnicodeError: no name can be written like this
             found.append(error)
 
     asking = threading.Thread(target=ask, daemon=True, name="specshield-look-up")
@@ -121,7 +121,7 @@ def look_up(host: str, port: int, by: float) -> list[str]:
     asking.join(max(by - time.monotonic(), 0.0))
     if not found:
         raise httpcore.ConnectTimeout(f"the address of {host} could not be looked up in time")
-    if isinstance(found[0], OSError):
+    if isinstance(found[0], Exception):
         raise httpcore.ConnectError(str(found[0])) from found[0]
     return list(dict.fromkeys(str(entry[4][0]) for entry in found[0]))
 

@@ -286,10 +286,28 @@ def create_session(
     except SessionExists:  # after a lost answer of our own it is this very session, which is read back
         if delivery.tries == 1:
             raise
-        info = yield from get_session(key)
-        if id is not None and info.next_t > 0:  # the caller's id was in use before
+        told = yield from call(get("sessions", key))
+        if id is not None and not (yield from _begins(body, told)):  # the caller's id was in use before
             raise
-        return info
+        return build(SessionInfo, told)
+
+
+def _begins(body: Mapping[str, Any], told: Mapping[str, Any]) -> Flow[bool]:
+    """Whether the session `told` of can be the one that `body` asked for: no step is taken yet, and policies
+    and settings are those asked for, as far as it tells of them.
+    """
+    if told.get("next_t") != 0:
+        return False
+    for name in (body.keys() & told.keys()) - {"policy_ids"}:
+        asked, has = body[name], told[name]
+        if isinstance(asked, dict) and isinstance(has, dict):
+            asked = {**has, **asked}  # what was left out has its default
+        if asked != has:
+            return False
+    ids: list[str] = []
+    for named in body.get("policy_ids") or [body["policy_id"]]:
+        ids += [(yield from get_policy(named)).id]  # it may have been asked for by its name
+    return ids == told.get("policy_ids")
 
 
 def policies_asked(policy_id: str | None, policy_ids: Sequence[str] | None) -> dict[str, Any]:

@@ -127,14 +127,14 @@ class Explanation:
         if self.is_kept:
             less = f"{self.conjunct} could still be kept, but with less to spare than the session asks for"
             return self.detail or less
-        told = f"no way was found that keeps the rule; the best one found fails in {self.conjunct}"
+        told = f"no way was found that keeps the rule; the best one does not keep '{self.conjunct}'"
         if self.detail is not None:
             return f"{told}: {self.detail}"
         if self.late_by is not None:
             return f"{told}: it comes {_steps(self.late_by)} too late"
         if self.robustness is None:
             return f"no way was found that keeps {self.conjunct}"
-        return f"{told}: it misses by {abs(self.robustness):.3g}"
+        return f"{told}: it misses it by {abs(self.robustness):.3g}"
 
     @property
     def is_kept(self) -> bool:
@@ -146,8 +146,9 @@ class Explanation:
         if not self.is_kept or self.detail is not None:
             return str(self)
         if slack and self.late_by is not None:
-            later = f"{_steps(self.late_by)} later than the session asks for"
-            return f"{self.conjunct} could still be kept, but {later}, which keeps {_steps(slack)} in hand"
+            reserve = f"but not with the {_steps(slack)} in reserve that the session asks for"
+            late = f"it comes {_steps(self.late_by)} too late for that"
+            return f"{self.conjunct} could still be kept, {reserve}: {late}"
         if margin or slack:
             return f"{self} ({margin:.2g} m, {_steps(slack)})"
         return str(self)
@@ -197,9 +198,9 @@ class Decision:
     source: Literal["service"] = "service"
 
     def why(self, action: int | str) -> str:
-        """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden:
-        no way was found that keeps the rule; the best one found fails in F[50,100] Region2: it is met at step
-        104, 4 steps too late". The step has to have asked: explain=True.
+        """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden: no
+        way was found that keeps the rule; the best one does not keep 'F[50,100] Region2': 'Region2' is met at
+        step 104, 4 steps too late". The step has to have asked: explain=True.
 
         Raises InputError for an action that there is not.
         """

@@ -43,7 +43,7 @@ from specshield.client.wire import (
     signal_values,
     timings,
 )
-from specshield.errors import HistoryGap, SpecshieldError, StepConflict
+from specshield.errors import HistoryConflict, HistoryGap, SpecshieldError, StepConflict
 
 
 class SessionState:
@@ -153,7 +153,7 @@ class SessionState:
                 self._circuit.answered()
                 return decision
         if isinstance(way, str):
-            self._unanswered = self.t
+            self._unanswered, self.main_task_done = self.t, self.main_task_done or body["main_task_done"]
             return LocalDecision(self.t, "stop", None, way, self.spec_status, error=error)
         return self._alone(x_t, way, body["main_task_done"], error)
 
@@ -217,6 +217,7 @@ class SessionState:
         `clock`: "keep" has the new rule's windows count from where those of the present one do, at first the
         session's start; "restart" from the next step. `pose` is x_t where the robot is by now; without it the
         service takes it to be where the last decision's action leads, and the step that follows tells.
+        A main task that is over stays over: what is left to do then is the new rule.
         Raises InfeasibleSwitch where the new rule cannot be kept from there; nothing is changed then.
         """
         yield Within(None)
@@ -228,7 +229,7 @@ class SessionState:
         else:
             reply = yield from self._send("switch", poses, self.t, body, slow=True)
         info = build(SessionInfo, json_object(reply))
-        self.info, self.spec_status = info, info.spec_status
+        self.info, self.spec_status, self.finished = info, info.spec_status, info.finished
         self._poses, self._continuation = poses, Continuation(info.margin)
         self._stored = max(self._stored, self.t + (pose is not None))
         return info
@@ -285,30 +286,35 @@ class SessionState:
         tries: int = TRIES,
         slow: bool = False,
     ) -> Flow[Reply]:
-        """Post the poses the server lacks up to x_t; on a gap once more, from where it says it stands."""
-
-        def since(start: int) -> Flow[Reply]:
-            newest = [poses[i] for i in range(start, t + 1)]
+        """Post the poses the server lacks up to x_t; on a gap once more, from where it says it stands. A pose
+        that it took with a step whose answer was lost stands, whatever was recorded of that step since.
+        """
+        poses, start, gaps, joined = dict(poses), min(self._stored, t), 0, -1
+        while True:
             request = post(
                 "sessions",
                 self.id,
                 action,
-                body={"t": t, "poses": newest, **body},
+                body={"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body},
                 slow=slow,
                 tries=tries,
                 t=t if action == "steps" else None,
             )
             reply = (yield from deliver(request)).reply
-            check(reply)
-            return reply
-
-        try:
-            return (yield from since(min(self._stored, t)))
-        except HistoryGap as gap:
-            start = gap.details.get("expected_t")
-            if not isinstance(start, int) or not all(i in poses for i in range(start, t)):
-                raise  # it lacks poses that this session, once read back, never had
-        return (yield from since(start))
+            try:
+                check(reply)
+            except HistoryGap as gap:
+                start, gaps = gap.details.get("expected_t", -1), gaps + 1
+                if gaps > 1 or not isinstance(start, int) or not all(i in poses for i in range(start, t)):
+                    raise  # it lacks poses that this session, once read back, never had
+            except HistoryConflict as conflict:
+                start = conflict.details.get("t", -1)
+                if not joined < start < self.t:
+                    raise  # it is x_t that differs
+                poses[start], joined = pose_values(conflict.details["stored"]), start
+                self._stored = max(self._stored, start + 1)
+            else:
+                return reply
 
 
 def _decision(

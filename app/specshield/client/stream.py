@@ -115,7 +115,7 @@ class SyncStreams(Streams):
         except TimeoutError:
             leave(connection)
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
-        except (websockets.WebSocketException, OSError) as error:
+        except (websockets.WebSocketException, OSError, UnicodeError) as error:
             leave(connection)
             refusal = _refusal(error)
             if refusal is not None:
@@ -178,37 +178,33 @@ class AsyncStreams(Streams):
                 self._asked(exchange, message), max(exchange.ends - time.monotonic(), 0.0)
             )
         except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
-            outcome: Reply | Failure = exchange.failure(httpx.ReadTimeout("the time of this try is over"))
-        except (websockets.WebSocketException, OSError) as error:
+            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+        except (websockets.WebSocketException, OSError, UnicodeError) as error:
             refusal = _refusal(error)
-            outcome = (
-                exchange.failure(httpx.ReadError(str(error))) if refusal is None else exchange.told(refusal)
-            )
-        else:
-            if reply is not None:
-                return reply
-            outcome = exchange.failure(httpx.ReadError(STALE))
-        self._leave(exchange.request.path)
-        return outcome
+            if refusal is not None:
+                return exchange.told(refusal)
+            return exchange.failure(httpx.ReadError(str(error)))
+        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     async def _asked(self, exchange: Exchange, message: bytes) -> Reply | None:
+        """The connection is kept only where it brought the answer: whoever cancels leaves it too."""
         from websockets.asyncio.client import connect
 
-        path = exchange.request.path
-        connection = self._open.get(path)
+        path, reply = exchange.request.path, None
+        connection = self._open.pop(path, None)
         if connection is None:
             options = self._options(exchange.seconds)
-            connection = self._open[path] = await connect(
-                self._address(exchange.request), **options
-            ).__aenter__()
-        await connection.send(message)
-        return self._read(exchange, await connection.recv())
-
-    def _leave(self, path: str) -> None:
-        connection = self._open.pop(path, None)
-        if connection is not None:
-            connection.transport.abort()
+            connection = await connect(self._address(exchange.request), **options).__aenter__()
+        try:
+            await connection.send(message)
+            reply = self._read(exchange, await connection.recv())
+        finally:
+            if reply is None or path in self._open:
+                connection.transport.abort()
+            else:
+                self._open[path] = connection
+        return reply
 
     def close(self) -> None:
-        for path in list(self._open):
-            self._leave(path)
+        while self._open:
+            self._open.popitem()[1].transport.abort()

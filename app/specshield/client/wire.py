@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -298,12 +299,15 @@ def stale(request: Request, reply: Reply) -> bool:
 
 
 def timings(reply: Reply) -> dict[str, float]:
-    """`total;dur=2.1, rollout;dur=1.5` as {"total": 2.1, "rollout": 1.5}, in ms."""
+    """`total;dur=2.1, rollout;dur="1.5"` as {"total": 2.1, "rollout": 1.5}, in ms; what is no number is left
+    out, as whatever stands in front of the server may add to the header.
+    """
     entries = {}
     for metric in reply.headers.get("server-timing", "").split(","):
         name, *parameters = (part.strip() for part in metric.split(";"))
         for parameter in parameters:
             key, _, value = parameter.partition("=")
             if key == "dur":
-                entries[name] = float(value)
+                with contextlib.suppress(ValueError):
+                    entries[name] = float(value.strip('"'))
     return entries

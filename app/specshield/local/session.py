@@ -61,6 +61,7 @@ class LocalSession:
         self.t = 0
         self.spec_status: SpecStatus = info.spec_status
         self.finished = self.main_task_done = self.closed = False
+        self._over = False  # whether a server would refuse what follows: it is not told of a drawn `end`
         self._shaping, self._initial = shaping, initial_pose
         self._rules = [Rule(policy, shield)]
         self._first = dict(shield.task.signals)
@@ -133,6 +134,7 @@ class LocalSession:
         self.spec_status = answer.spec_status
         ends = main_task_done is None and answer.action in self.info.terminal_actions
         self.main_task_done = over or ends
+        self._over = answer.finished
         self.finished = answer.finished or (ends and answer.spec_status != "pending")
         return answer
 
@@ -168,6 +170,7 @@ class LocalSession:
         self._carry, self._first = carry, first
         self._signals = {name: values[: self.t] for name, values in held.items()}
         self.spec_status, _ = rule.verdict(known, held)
+        self.finished = False
         self.info = replace(
             self.info, **policy.about(), next_t=self.t, feasible=True, spec_status=self.spec_status,
             rules=(*self.info.rules[:-1], ended, rule.told(self.spec_status)),
@@ -191,7 +194,7 @@ class LocalSession:
             self.record(pose)
         poses = self._poses or [self._initial]
         status, bounds = self._rule.verdict(poses, self._held({}, len(poses)))
-        self.closed = self.finished = True
+        self.closed = self.finished = self._over = True
         self.spec_status = status
         low, high = (value if math.isfinite(value) else None for value in bounds)
         return Verdict(status, (low, high))
@@ -206,7 +209,7 @@ class LocalSession:
         )
 
     def _check(self, over: bool) -> None:
-        if self.finished:
+        if self._over:
             raise SessionFinished(
                 "the session is over: no further step is decided",
                 path="t",
