@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from tests.browsing import browsing, needs_chromium
-from tests.service.world import ahead
+from tests.service.world import ahead, grid_json
 from tests.serving import serving
 from tests.world.test_procthor import HOUSES, SIZES, house
 
@@ -145,6 +145,22 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
     assert len(complaints) - len(unasked) <= 2
 
 
+def test_a_map_far_from_its_frames_origin_is_drawn_on_as_any(own):
+    """As maps in UTM are. What a browser keeps of a number in an SVG would be half a metre off there."""
+    sent = grid_json()
+    sent["info"]["origin"]["position"] |= {"x": 448251.25, "y": 5411932.75}
+    id = httpx.post(f"{own.url}/v1/maps", json=sent).json()["id"]
+    with browsing() as (page, complaints):
+        page.goto(f"{own.url}/#/maps/{id}")
+        page.locator(".walls image").wait_for(state="attached")
+        box = page.locator("svg.floor").get_attribute("viewBox")
+        assert [float(value) for value in box.split()] == pytest.approx([251.25, 64.25, 4.0, 3.0])
+        draw(page, Floor(page), "Circle", (253.25, -65.75), (253.75, -65.75), "Dock")
+        numbers = [float(field.input_value()) for field in page.locator(".numbers input").all()]
+    assert numbers == pytest.approx([448253.25, 5411934.25, 0.5], abs=0.02)
+    assert complaints == []
+
+
 @pytest.mark.skipif(not HOUSES.exists(), reason="the folder of real houses is not here")
 def test_a_real_house(own):
     """A ProcTHOR house with its rooms and a place that is drawn: it is seen why the robot may not go straight
@@ -168,7 +184,7 @@ def test_a_real_house(own):
         Floor(page).click(9.75, 7.25)  # in the kitchen, where the house has its agent
         page.get_by_role("heading", name="Step 0").wait_for()
         forbidden = page.locator("tr", has=page.locator(".cannot"), has_text="moves 0.20 m").first
-        why = "the best one found fails in G[0,100] not (Bathroom or touches(Wet))"
+        why = "the best one does not keep 'G[0,100] not (Bathroom or touches(Wet))'"
         assert why in forbidden.inner_text()
         look(page, "real-house-forbidden")
         page.get_by_role("button", name="Push the robot").click()

@@ -1,6 +1,8 @@
 """A floor plan as SVG: walls, a heat map, regions, ways, robots, text. Points are in metres, map frame.
 
-The picture stands alone: no script, no font or image from elsewhere. It is dark where its reader's screen is.
+In the picture they count from the map's lower left corner: what draws an SVG keeps some seven digits of a
+number, and a map may lie millions of metres from its frame's origin. The picture stands alone: no script, no
+font or image from elsewhere. It is dark where its reader's screen is.
 """
 
 from __future__ import annotations
@@ -8,7 +10,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from html import escape
 
 import numpy as np
@@ -33,6 +35,10 @@ text{font-family:system-ui,sans-serif}.formula{font-family:ui-monospace,monospac
 .name{stroke:none;font-weight:600}
 """
 
+# Of a text below the map, in thousandths of the map's longer side: a letter's height and width, a line's.
+SIZE, LETTER, LINE = 24, 0.62 * 24, 36
+FEWEST = 30  # letters a line: below a narrower map the picture is as wide as its text
+
 
 class Plan:
     """Collects the parts of a picture; `svg` gives it. title: for those who cannot see it."""
@@ -40,7 +46,8 @@ class Plan:
     def __init__(self, task: Task, title: str) -> None:
         self._task, self._title = task, title
         self._xmin, self._ymin, self._xmax, self._ymax = task.grid.bounds
-        self._unit = max(self._xmax - self._xmin, self._ymax - self._ymin) / 1000
+        self._wide, self._high = self._xmax - self._xmin, self._ymax - self._ymin
+        self._unit = max(self._wide, self._high) / 1000
         self._parts: list[str] = []
         self._lines: list[tuple[str, str]] = []  # (kind, text)
 
@@ -50,8 +57,9 @@ class Plan:
         pixels = np.zeros((*grid.occupied.shape, 4), np.uint8)
         pixels[grid.occupied[::-1]] = (0x34, 0x38, 0x40, 0xFF)
         x, y, yaw = grid.origin
+        right, down = self._at(x, y)
         wide, high = grid.width * grid.resolution, grid.height * grid.resolution
-        turn = f"translate({x:g} {-y:g}) rotate({-math.degrees(yaw):g})"
+        turn = f"translate({right:g} {down:g}) rotate({-math.degrees(yaw):g})"
         self._image(pixels, (0.0, -high, wide, high), f'class="walls" transform="{turn}"')
 
     def heat(self, share: Floats) -> None:
@@ -62,41 +70,41 @@ class Plan:
         pixels = np.zeros((*share.shape, 4), np.uint8)
         pixels[..., :3] = none + (all_ - none) * value
         pixels[..., 3] = known * 105
-        box = (self._xmin, -self._ymax, self._xmax - self._xmin, self._ymax - self._ymin)
-        self._image(pixels, box, 'preserveAspectRatio="none"')
+        self._image(pixels, (0.0, -self._high, self._wide, self._high), 'preserveAspectRatio="none"')
 
     def regions(self) -> None:
         """Those that the rule names, each with its name."""
         for name, region in self._task.regions.items():
             kind = "avoid" if is_avoided(self._task.formula, name) else "visit"
             self._parts.append(f'<g class="region {kind}" stroke-width="{2 * self._unit:g}">')
-            self._parts += [_shape(member) for member in _members(region)]
-            x, y = _below(region)
+            self._parts += [self._shape(member) for member in _members(region)]
+            x, y = self._at(*_below(region))
             self._parts.append(
-                f"</g>{self._text(x, -y + 26 * self._unit, name, 22, f'name {kind}', 'middle')}"
+                f"</g>{self._text(x, y + 26 * self._unit, name, 22, f'name {kind}', 'middle')}"
             )
 
     def way(self, poses: Floats, kind: str = "way") -> None:
         """kind: `way` for what was driven, `next` for what would follow."""
-        points = " ".join(f"{x:.3f},{-y:.3f}" for x, y in np.asarray(poses)[:, :2].tolist())
+        points = self._points(np.asarray(poses)[:, :2].tolist(), ".3f")
         dashes = f' stroke-dasharray="{6 * self._unit:g} {6 * self._unit:g}"' if kind == "next" else ""
         wide = (6 if kind == "way" else 3) * self._unit
         self._parts.append(f'<polyline class="{kind}" points="{points}" stroke-width="{wide:g}"{dashes}/>')
 
     def robot(self, pose: Sequence[float]) -> None:
         """Its footprint, and a line from its origin to where it looks."""
-        (x, y, theta), robot = pose, self._task.robot
+        theta, robot = pose[2], self._task.robot
         cos, sin, (ahead, left) = math.cos(theta), math.sin(theta), robot.offset
-        cx, cy = x + cos * ahead - sin * left, y + sin * ahead + cos * left
+        x, y = self._at(pose[0], pose[1])
+        cx, cy = x + cos * ahead - sin * left, y - sin * ahead - cos * left
         self._parts.append(
             f'<g class="robot" stroke-width="{3 * self._unit:g}">'
-            f'<circle cx="{cx:.3f}" cy="{-cy:.3f}" r="{robot.radius:g}"/><line x1="{x:.3f}" y1="{-y:.3f}" '
-            f'x2="{x + cos * robot.radius:.3f}" y2="{-y - sin * robot.radius:.3f}"/></g>'
+            f'<circle cx="{cx:.3f}" cy="{cy:.3f}" r="{robot.radius:g}"/><line x1="{x:.3f}" y1="{y:.3f}" '
+            f'x2="{x + cos * robot.radius:.3f}" y2="{y - sin * robot.radius:.3f}"/></g>'
         )
 
     def line(self, said: str, kind: str = "ink") -> None:
         """A line of text below the map; a long one goes on in the next."""
-        most = int((self._xmax - self._xmin) / self._unit / (0.62 * 24))
+        most = max(int(self._wide / self._unit / LETTER), FEWEST)
         while said:
             cut = len(said) if len(said) <= most else said.rfind(" ", 0, most)
             cut = cut if cut > 0 else most
@@ -105,21 +113,34 @@ class Plan:
 
     def svg(self) -> bytes:
         unit, edge = self._unit, 20 * self._unit
-        wide, high = self._xmax - self._xmin + 2 * edge, self._ymax - self._ymin + 2 * edge
-        foot = high + 36 * unit * len(self._lines)
-        box = f"{self._xmin - edge:g} {-self._ymax - edge:g} {wide:g} {foot:g}"
+        text = LETTER * unit * max((len(said) for _, said in self._lines), default=0)
+        wide = max(self._wide, text) + 2 * edge
+        foot = self._high + 2 * edge + LINE * unit * len(self._lines)
+        left, top = -edge, -self._high - edge
+        box = f"{left:g} {top:g} {wide:g} {foot:g}"
         told = []
         for i, (kind, said) in enumerate(self._lines):
-            down = -self._ymin + edge / 2 + 36 * unit * (i + 0.8)
-            told.append(self._text(self._xmin, down, said, 24, kind, "start"))
+            told.append(self._text(0.0, edge / 2 + LINE * unit * (i + 0.8), said, SIZE, kind, "start"))
         size = f'width="800" height="{800 * foot / wide:.0f}"'
         return "\n".join([
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" {size} role="img">',
             f"<title>{escape(self._title)}</title><style>{STYLE}</style>",
-            f'<rect class="paper" x="{self._xmin - edge:g}" y="{-self._ymax - edge:g}" width="{wide:g}" '
-            f'height="{foot:g}"/>',
+            f'<rect class="paper" x="{left:g}" y="{top:g}" width="{wide:g}" height="{foot:g}"/>',
             *self._parts, *told, "</svg>\n",
         ]).encode()  # fmt: skip
+
+    def _at(self, x: float, y: float) -> tuple[float, float]:
+        """A point of the map in the picture, whose y goes down."""
+        return x - self._xmin, self._ymin - y
+
+    def _points(self, points: Iterable[Sequence[float]], digits: str) -> str:
+        return " ".join("{:{d}},{:{d}}".format(*self._at(x, y), d=digits) for x, y in points)
+
+    def _shape(self, region: Region) -> str:
+        if isinstance(region, Circle):
+            x, y = self._at(*region.center)
+            return f'<circle cx="{x:g}" cy="{y:g}" r="{region.radius:g}"/>'
+        return f'<polygon points="{self._points(_corners(region), "g")}"/>'
 
     def _text(self, x: float, y: float, said: str, size: float, kind: str, anchor: str) -> str:
         return (
@@ -140,13 +161,6 @@ class Plan:
 
 def _members(region: Region) -> Sequence[Region]:
     return region.members if isinstance(region, Union) else (region,)
-
-
-def _shape(region: Region) -> str:
-    if isinstance(region, Circle):
-        return f'<circle cx="{region.center[0]:g}" cy="{-region.center[1]:g}" r="{region.radius:g}"/>'
-    points = " ".join(f"{x:g},{-y:g}" for x, y in _corners(region))
-    return f'<polygon points="{points}"/>'
 
 
 def _corners(region: Region) -> list[tuple[float, float]]:

@@ -1,7 +1,6 @@
 // Regions that are drawn on a floor: with the mouse or a finger, or by their numbers.
 
 import { button, el, svg } from "../lib/dom.js";
-import { line, shape } from "../lib/floor.js";
 
 const SMALLEST = 0.05; // [m]; less is a click that slipped
 const TOOLS = { circle: "Circle", rectangle: "Rectangle", polygon: "Polygon" };
@@ -77,7 +76,7 @@ export class Regions {
   }
 
   outline(points) {
-    this.draft.replaceChildren(svg("polyline", { points: line(points) }));
+    this.draft.replaceChildren(svg("polyline", { points: this.floor.line(points) }));
   }
 
   close() {
@@ -88,7 +87,7 @@ export class Regions {
   }
 
   sketch(region) {
-    this.draft.replaceChildren(...(region ? [shape(region)] : []));
+    this.draft.replaceChildren(...(region ? [this.floor.shape(region)] : []));
   }
 
   add(region) {

@@ -5,19 +5,10 @@ import { el, svg } from "./dom.js";
 import { Occupancy } from "./occupancy.js";
 import { Zoom } from "./zoom.js";
 
-const at = ([x, y]) => `${x.toFixed(3)},${(-y).toFixed(3)}`;
-export const line = (points) => points.map(at).join(" ");
-
 /** The members of a region that are no unions. */
 const members = (region) => (region.type === "union" ? region.members : [region]);
 
-export function shape(region) {
-  if (region.type === "circle")
-    return svg("circle", { cx: region.center[0], cy: -region.center[1], r: region.radius });
-  return svg("polygon", { points: line(corners(region)) });
-}
-
-export function corners(region) {
+function corners(region) {
   if (region.type !== "rectangle") return region.vertices;
   const [[x0, y0], [x1, y1]] = [region.min, region.max];
   return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]];
@@ -51,6 +42,8 @@ export class Floor {
   constructor(map, label) {
     const [x0, y0, x1, y1] = map.bounds;
     this.map = map;
+    // The picture counts from whole kilometres near the map: of a number in an SVG browsers keep some seven digits.
+    this.from = [x0, y0].map((value) => 1000 * Math.round(value / 1000));
     this.rooms = Object.entries(map.rooms).filter(([, room]) => room.type !== "union");
     this.drawn = {}; // the regions, by name
     this.layers = Object.fromEntries(
@@ -58,7 +51,7 @@ export class Floor {
     );
     const keys = `${label}. Plus and minus zoom, arrows move what is seen.`;
     this.element = svg("svg", { class: "floor", role: "img", "aria-label": keys }, ...Object.values(this.layers));
-    this.zoom = new Zoom(this.element, [x0, -y1, x1 - x0, y1 - y0]);
+    this.zoom = new Zoom(this.element, [...this.at([x0, y1]), x1 - x0, y1 - y0]);
     this.frame = el("div", { class: "frame" }, this.element, this.zoom.buttons); // what a view puts in its place
     this.frame.style.setProperty("--ratio", String((x1 - x0) / (y1 - y0)));
     this.layers.rooms.append(this.text([(x0 + x1) / 2, (y0 + y1) / 2], "The map is read …", "room"));
@@ -70,7 +63,7 @@ export class Floor {
     const bitmap = await createImageBitmap(await picture(`v1/maps/${id}/image.png`, { signal }));
     this.occupancy = new Occupancy(this.map, bitmap);
     const [w, h] = [width * resolution, height * resolution];
-    const turned = `translate(${origin[0]} ${-origin[1]}) rotate(${(-180 * origin[2]) / Math.PI})`;
+    const turned = `translate(${this.at(origin).join(" ")}) rotate(${(-180 * origin[2]) / Math.PI})`;
     const walls = { href: await this.occupancy.walls(), x: 0, y: -h, width: w, height: h, transform: turned };
     this.layers.walls.replaceChildren(svg("image", walls));
     this.names();
@@ -115,20 +108,36 @@ export class Floor {
     const bad = new Set(avoided.map((name) => name.replace(/^\w+\((.*)\)$/, "$1")));
     const shown = Object.entries(regions).map(([name, region]) => {
       const group = { class: `region ${bad.has(name) ? "avoid" : "visit"}`, "data-name": name };
-      return svg("g", group, ...members(region).map(shape), this.text(foot(region), name, "foot"));
+      return svg("g", group, ...members(region).map((part) => this.shape(part)), this.text(foot(region), name, "foot"));
     });
     this.layers.regions.replaceChildren(...shown);
     this.drawn = { ...regions };
     this.names();
   }
 
-  text([x, y], said, kind = "") {
-    return svg("text", { x, y: -y, class: kind, dy: kind === "foot" ? "1.1em" : null, "text-anchor": "middle" }, said);
+  shape(region) {
+    if (region.type !== "circle") return svg("polygon", { points: this.line(corners(region)) });
+    const [cx, cy] = this.at(region.center);
+    return svg("circle", { cx, cy, r: region.radius });
+  }
+
+  text(point, said, kind = "") {
+    const [x, y] = this.at(point);
+    return svg("text", { x, y, class: kind, dy: kind === "foot" ? "1.1em" : null, "text-anchor": "middle" }, said);
+  }
+
+  /** A point of the map in the picture, whose y goes down. */
+  at([x, y]) {
+    return [x - this.from[0], this.from[1] - y];
+  }
+
+  line(points) {
+    return points.map((point) => this.at(point).map((value) => value.toFixed(3)).join(",")).join(" ");
   }
 
   /** The point of the map under a pointer. */
   point(event) {
     const [x, y] = this.zoom.point(event);
-    return [x, -y];
+    return [x + this.from[0], this.from[1] - y];
   }
 }

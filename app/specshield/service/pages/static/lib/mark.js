@@ -1,7 +1,6 @@
 // A robot on a floor: its body, the way it has driven, and the certified continuation.
 
 import { svg } from "./dom.js";
-import { line } from "./floor.js";
 import { centre, continuation } from "./motion.js";
 
 const COLORS = 8;
@@ -26,18 +25,18 @@ export class Mark {
   show(items, ahead = true) {
     const last = items.at(-1);
     if (!last) return;
-    this.way.setAttribute("points", line(items.map((item) => item.pose)));
-    this.next.setAttribute("points", ahead ? line(continuation(this.robot, last, this.fits)) : "");
+    this.way.setAttribute("points", this.floor.line(items.map((item) => item.pose)));
+    this.next.setAttribute("points", ahead ? this.floor.line(continuation(this.robot, last, this.fits)) : "");
     this.move(last.pose);
   }
 
   move(pose) {
     this.body.removeAttribute("hidden"); // now it is known where the robot is
-    const [x, y] = centre(this.robot, pose);
+    const [x, y] = this.floor.at(centre(this.robot, pose));
     const far = this.robot.footprint.radius * 1.25;
     this.disc.setAttribute("cx", x);
-    this.disc.setAttribute("cy", -y);
-    const ends = { x1: x, y1: -y, x2: x + far * Math.cos(pose[2]), y2: -y - far * Math.sin(pose[2]) };
+    this.disc.setAttribute("cy", y);
+    const ends = { x1: x, y1: y, x2: x + far * Math.cos(pose[2]), y2: y - far * Math.sin(pose[2]) };
     for (const [name, value] of Object.entries(ends)) this.nose.setAttribute(name, value);
   }
 }

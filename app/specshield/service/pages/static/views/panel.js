@@ -34,10 +34,10 @@ export function whyNot(decision, action) {
   if (told && told.robustness > 0) return `${told.conjunct} could still be kept, but not with ${inHand(decision)} in hand`;
   if (told) {
     const late = told.late_by ? `it comes ${told.late_by} ${told.late_by === 1 ? "step" : "steps"} too late` : null;
-    const misses = told.robustness === null ? null : `it misses by ${Math.abs(told.robustness).toFixed(2)}`;
+    const misses = told.robustness === null ? null : `it misses it by ${Math.abs(told.robustness).toFixed(2)}`;
     const found = told.detail ?? [late, misses].filter(Boolean).join(", ");
     if (!found) return `no way was found that keeps ${told.conjunct}`;
-    return `no way was found that keeps the rule; the best one found fails in ${told.conjunct}: ${found}`;
+    return `no way was found that keeps the rule; the best one does not keep '${told.conjunct}': ${found}`;
   }
   if (value === null || value === undefined) return "was not looked at";
   if (value > 0) return `keeps the rule by ${metres(value)}, but not with ${inHand(decision)} in hand`;

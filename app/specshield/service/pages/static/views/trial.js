@@ -127,8 +127,9 @@ class Controls {
     const fits = (at, radius) => occupancy.fits(at, radius);
     const distance = occupancy.distances(point, this.robot.footprint.radius + 0.03);
     this.episode.model = this.kind === "goal" ? goalSeeker(this.robot, fits, distance) : wanderer(this.robot);
-    this.goal.setAttribute("cx", point[0]);
-    this.goal.setAttribute("cy", -point[1]);
+    const [cx, cy] = this.watch.floor.at(point);
+    this.goal.setAttribute("cx", cx);
+    this.goal.setAttribute("cy", cy);
     this.goal.toggleAttribute("hidden", this.kind !== "goal");
   }
 
@@ -149,7 +150,8 @@ class Controls {
 
   drop(point) {
     if (!this.world.drop(point)) return this.tell("The robot stands there.");
-    this.watch.floor.layers.marks.append(svg("circle", { class: "obstacle", cx: point[0], cy: -point[1], r: SIZE }));
+    const [cx, cy] = this.watch.floor.at(point);
+    this.watch.floor.layers.marks.append(svg("circle", { class: "obstacle", cx, cy, r: SIZE }));
     this.tell("An obstacle stands there. The service hears of it when the robot sees it.");
   }
 
