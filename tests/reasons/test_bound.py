@@ -44,6 +44,13 @@ def circle(x, radius=0.3):
     ("formula", "wall", "said"),
     [
         ("F[0,15] Far", False, "F[0,15] Far is out of reach: at least 18 steps away, and due in 15"),
+        ("F[0,2] Soon", False, "F[0,2] Soon is out of reach: at least 3 steps away, and due in 2"),
+        ("F[0,2] Soon and G[1,60] not Far", False, "F[0,2] Soon is out of reach: at least 3 steps away"),
+        (
+            "F[0,1] Soon and G[1,60] not Far",
+            False,
+            "whatever the robot does, it breaks F[0,1] Soon by step 1",
+        ),
         ("F[0,400] Far", True, "no way leads to where F[0,400] Far can be met"),
         (
             "F[0,400] Far and G[0,400] not Strip",
@@ -67,7 +74,8 @@ def circle(x, radius=0.3):
 def test_a_proof_says_what_rules_the_formula_out(formula, wall, said):
     signals = {"call": 0.0} if "call" in formula else {}
     strip = {"type": "rectangle", "min": [4.0, -1.0], "max": [4.8, 3.0]}
-    task = hall(formula, {"Near": circle(2.0), "Far": circle(6.0), "Strip": strip}, wall, signals=signals)
+    places = {"Near": circle(2.0), "Soon": circle(2.85), "Far": circle(6.0), "Strip": strip}
+    task = hall(formula, places, wall, signals=signals)
     why = proof(task, make_body(task.robot, task.grid), np.array([[2.0, 1.0, 0.0]]), {})
     assert (why is None) is (said is None), why
     assert said is None or said in why

@@ -9,35 +9,21 @@ import pytest
 from specshield.reasons.explanation import explanations
 from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
-from tests.oracles.cells import MOTIONS, WAIT, Cells, Exhaustive, Scripted
-from tests.reasons.rules_on_cells import dwells, until
+from tests.oracles.cells import MOTIONS, WAIT, Exhaustive, Scripted
+from tests.reasons.rules_on_cells import dwells, until, visits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (2, 2)}
 EVEN = np.zeros(5)
 
 
-def rule(parts):
-    """parts: (operator, from, to, place). The cells' rule, and its conjuncts as the formula prints them."""
-
-    def keeps(inside):
-        kept = True
-        for op, a, b, place in parts:
-            window = inside[place][..., a : b + 1]
-            kept = kept & (window.any(axis=-1) if op == "F" else ~window.any(axis=-1))
-        return kept
-
-    told = [f"{op}[{a},{b}] {place if op == 'F' else f'not {place}'}" for op, a, b, place in parts]
-    return Cells(" and ".join(told), keeps, {place: PLACES[place] for *_, place in parts}), told
-
-
 def after(parts, history):
     """Whether some future keeps the rule after each motion; beyond its horizon no step counts."""
-    cells, _ = rule(parts)
+    cells, _ = visits(parts, PLACES)
     return cells.feasible(history)
 
 
 def explained(parts, history, slack=0):
-    cells, told = rule(parts)
+    cells, told = visits(parts, PLACES)
     shield = make_shield([Exhaustive(cells)], Config(slack=slack))
     return decide(shield, history, EVEN, explain=explanations), told
 
@@ -47,7 +33,7 @@ def test_what_is_late_would_be_kept_with_a_window_that_ends_so_much_later_and_wi
     for _ in range(120):
         a, b = (int(v) for v in random.integers(2, 6, 2))
         parts = [("F", 0, a, "A"), ("F", 1, b, "B"), ("G", 0, 5, "C")][: random.integers(1, 4)]
-        cells, _ = rule(parts)
+        cells, _ = visits(parts, PLACES)
         history = [cells.pose(*random.integers(0, 2, 2).tolist(), int(random.integers(4)))]
         for _ in range(int(random.integers(0, 3))):
             history.append(cells.pose(*cells.after(cells.state(history[-1]), int(random.integers(3)))))
@@ -78,7 +64,7 @@ def test_what_is_late_would_be_kept_with_a_window_that_ends_so_much_later_and_wi
 
 def test_how_late_a_way_comes_is_counted_from_the_rules_own_window_also_with_slack():
     late = kept = 0
-    cells, _ = rule([("F", 0, 5, "A")])
+    cells, _ = visits([("F", 0, 5, "A")], PLACES)
     for i, j, heading in np.ndindex(3, 3, 4):
         for end in (2, 3, 4):
             history = [cells.pose(i, j, heading)]
@@ -100,7 +86,7 @@ def test_how_late_a_way_comes_is_counted_from_the_rules_own_window_also_with_sla
 
 
 def test_an_action_that_breaks_a_keep_out_is_told_so():
-    cells, told = rule([("G", 0, 3, "C")])
+    cells, told = visits([("G", 0, 3, "C")], PLACES)
     beside = cells.pose(1, 2, 0)  # C lies ahead
     assert cells.after((1, 2, 0), 0) == (2, 2, 0)  # no wall is in the way
     decision, _ = explained([("G", 0, 3, "C")], [beside])
@@ -113,7 +99,7 @@ def test_an_action_that_breaks_a_keep_out_is_told_so():
 
 
 def test_without_being_asked_nothing_is_explained_and_the_decision_is_the_same():
-    cells, _ = rule([("F", 0, 3, "A")])
+    cells, _ = visits([("F", 0, 3, "A")], PLACES)
     shield, history = make_shield([Exhaustive(cells)]), [cells.pose(0, 0, 0)]
     plain = decide(shield, history, EVEN)
     asked = decide(make_shield([Exhaustive(cells)]), history, EVEN, explain=explanations)
@@ -123,7 +109,7 @@ def test_without_being_asked_nothing_is_explained_and_the_decision_is_the_same()
 
 
 def test_when_the_rule_is_over_every_action_is_allowed():
-    cells, _ = rule([("F", 0, 1, "A")])
+    cells, _ = visits([("F", 0, 1, "A")], PLACES)
     decision = decide(make_shield([Exhaustive(cells)]), [cells.pose(2, 0, 0)] * 3, EVEN, explain=explanations)
     assert decision.explanations == (None,) * 5
 
@@ -172,7 +158,7 @@ def test_of_a_place_to_be_in_from_some_step_on_it_is_said_when_it_is_reached():
                     continue
                 seen += 1
                 first = begin + why.late_by
-                assert f"'A' is met at step {first}, {why.late_by} step" in why.detail
+                assert f"'A' holds only from step {first}, {why.late_by} step" in why.detail
                 assert dwells(first).feasible(history)[motion]
                 assert not dwells(first - 1).feasible(history)[motion]
     assert seen > 10
@@ -180,7 +166,7 @@ def test_of_a_place_to_be_in_from_some_step_on_it_is_said_when_it_is_reached():
 
 @pytest.mark.parametrize("motion", [0, 1, 2])
 def test_a_way_that_the_policies_missed_is_not_denied(motion):
-    cells, _ = rule([("F", 0, 5, "A")])
+    cells, _ = visits([("F", 0, 5, "A")], PLACES)
     shield = make_shield([Scripted(cells, lambda t, first: [0, 0] if first == WAIT else [WAIT] * 9)])
     decision = decide(shield, [cells.pose(0, 0, 0)], EVEN, explain=explanations)
     why = decision.explanations[motion]

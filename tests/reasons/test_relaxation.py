@@ -6,24 +6,14 @@ from specshield.handover import begun
 from specshield.reasons.refusal import begin, refusal
 from specshield.reasons.relaxation import relaxations
 from specshield.shield.episode import decide, make_shield
-from tests.oracles.cells import Cells, Scripted, waits
-from tests.reasons.rules_on_cells import dwells, until
+from tests.oracles.cells import Scripted, waits
+from tests.reasons.rules_on_cells import dwells, until, visits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (4, 4), "D": (1, 0)}
 
 
 def cells_of(parts):
-    """parts: (operator, from, to, place): F reaches a place, G keeps out of it."""
-
-    def keeps(inside):
-        kept = True
-        for op, a, b, place in parts:
-            window = inside[place][..., a : b + 1]
-            kept = kept & (window.any(axis=-1) if op == "F" else ~window.any(axis=-1))
-        return kept
-
-    text = " and ".join(f"{op}[{a},{b}] {'' if op == 'F' else 'not '}{place}" for op, a, b, place in parts)
-    return Cells(text, keeps, {place: PLACES[place] for *_, place in parts})
+    return visits(parts, PLACES)[0]
 
 
 def exists(parts, history):

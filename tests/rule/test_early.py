@@ -16,6 +16,7 @@ RULES = [
     "(x > -1) and F[0,8] (x > 0.4 or y > 0.6) and (y < 9 U[0,7] x > 0.3)",
     "not G[0,6] x < 0.5 and not (F[0,9] y > 1.2 or F[0,3] x > 2)",
     "F[2,7] x > 0.6",
+    "x > 0.5 and not y > 0.4",  # nothing is left open of it, and it has conjuncts all the same
 ]
 
 

@@ -67,11 +67,15 @@ def contradiction(task: Task, body: Body) -> str | None:
 
 
 def _refuted(needs: Sequence[Need], known: Known, ground: Ground, body: Body) -> str | None:
-    """Why these needs cannot all be met, None where that is open."""
+    """Why these needs cannot all be met, None where that is open. Where one of them cannot be met even by
+    itself, that is what is said, and no other is named beside it.
+    """
     asked = course(needs, known, ground)
     if isinstance(asked, str):
         return asked
-    return _Ahead(known, ground, body, asked.guards, asked.goals[:MOST_GOALS]).refuted()
+    why, suspects = _Ahead(known, ground, body, asked.guards, asked.goals[:MOST_GOALS]).refuted()
+    alone = (_refuted([need], known, ground, body) for need in suspects if len(needs) > 1)
+    return next((said for said in alone if said is not None), why)
 
 
 @dataclass(frozen=True)
@@ -82,24 +86,26 @@ class _Ahead:
     guards: Sequence[Need]
     goals: Sequence[Goal]
 
-    def refuted(self) -> str | None:
-        now, horizon = self.known.now, max((need.end for need in self.guards), default=0)
-        horizon = max([horizon, *(goal.need.end for goal in self.goals)])
-        poses, met = self.known.history[-1:], np.zeros(1, np.int64)
-        step = now
-        while step < min(now + MOST_STEPS, horizon) and len(poses) * motion_count(self.body) <= MOST_POSES:
-            further, also = self._onward(poses, met, step + 1)
+    def refuted(self) -> tuple[str | None, list[Need]]:
+        """Why the needs cannot all be met, and those of them that this may be due to."""
+        now, poses, met = self.known.now, self.known.history[-1:], np.zeros(1, np.int64)
+        step, limiting, soonest = now, list[Need](), [math.inf] * len(self.goals)
+        while step < now + MOST_STEPS and len(poses) * motion_count(self.body) <= MOST_POSES:
+            further, also = self._onward(poses, met, step + 1, limiting, soonest)
             if not len(further):
-                asked = ", ".join(str(g.formula) for g in self.guards if g.first <= step + 1 <= g.end)
-                return f"whatever the robot does, it breaks {asked} by step {step + 1}"
+                asked = " or ".join(str(guard.formula) for guard in limiting)
+                return f"whatever the robot does, it breaks {asked} by step {step + 1}", limiting
             poses, met, step = further, also, step + 1
         if step == now:
-            return None
-        return self._too_late(poses, met, step)
+            return None, []
+        return self._too_late(poses, met, step, soonest)
 
-    def _onward(self, poses: Floats, met: Ints, step: int) -> tuple[Floats, Ints]:
+    def _onward(
+        self, poses: Floats, met: Ints, step: int, limiting: list[Need], soonest: list[float]
+    ) -> tuple[Floats, Ints]:
         """The poses that one more motion leads to and that keep the guards at that step, each with the goals
-        that were met on the way, one bit a goal.
+        that were met on the way, one bit a goal. Added to `limiting`: guards that some pose breaks; to
+        `soonest` [goals]: the first step at which each goal's place is reached, in its window or not.
         """
         count = motion_count(self.body)
         nexts = np.empty((len(poses), count, 3))
@@ -114,15 +120,23 @@ class _Ahead:
         keeps = np.ones(len(further), np.bool_)
         for guard in self.guards:
             if guard.first <= step <= guard.end:
-                keeps &= self.known.at(guard.predicate, further)
+                kept = self.known.at(guard.predicate, further)
+                keeps &= kept
+                if not kept.all() and guard not in limiting:
+                    limiting.append(guard)
         further, also = further[keeps], also[keeps].copy()
-        for bit, goal in enumerate(self.goals):
-            if goal.need.first <= step <= goal.need.last and len(further):
-                also[self.known.at(goal.need.predicate, further)] |= 1 << bit
+        for bit, goal in enumerate(self.goals if len(further) else ()):
+            there = self.known.at(goal.need.predicate, further)
+            if there.any():
+                soonest[bit] = min(soonest[bit], step)
+            if goal.need.first <= step <= goal.need.last:
+                also[there] |= 1 << bit
         return further, also
 
-    def _too_late(self, poses: Floats, met: Ints, step: int) -> str | None:
-        """Why from none of these poses all goals can be met in time."""
+    def _too_late(
+        self, poses: Floats, met: Ints, step: int, soonest: Sequence[float]
+    ) -> tuple[str | None, list[Need]]:
+        """Why from none of these poses all goals can be met in time, as `refuted` has it."""
         apart = [[self._between(a, b) for b in self.goals] for a in self.goals]
         steps = np.column_stack(
             [np.empty((len(poses), 0)), *(self._nearest(goal, poses) for goal in self.goals)]
@@ -130,22 +144,23 @@ class _Ahead:
         if any(
             self._in_some_order(int(bits), row, apart, step) for bits, row in zip(met, steps, strict=True)
         ):
-            return None
+            return None, []
         for bit, goal in enumerate(self.goals):
-            need, least = goal.need, float(np.where(met >> bit & 1 == 0, steps[:, bit], 0.0).min())
+            if (met >> bit & 1).any():
+                continue
+            need, soon = goal.need, min(soonest[bit], step + float(steps[:, bit].min()))
             beside = [g.formula for g in self.guards if g.formula is not need.formula and g.first <= step]
             kept = " and ".join(map(str, [*beside, *([] if need.before is None else [need.before])]))
             also = f" while {kept} is kept" if kept else ""
-            if least == math.inf:
-                return f"no way leads to where {need.formula} can be met{also}"
-            if step + least > need.last:
-                away = f"at least {step + int(least) - self.known.now} steps away, "
+            if soon == math.inf:
+                return f"no way leads to where {need.formula} can be met{also}", [need]
+            if soon > need.last:
+                away = f"at least {int(soon) - self.known.now} steps away, "
                 left = f"and due in {need.last - self.known.now}"
                 asked = str(need.formula) if need.before is None else f"{need.predicate} by step {need.last}"
-                return f"{asked} is out of reach{also}: {away}{left}"
-        return "not all of these can be reached in time, in whatever order: " + ", ".join(
-            str(goal.need.formula) for goal in self.goals
-        )
+                return f"{asked} is out of reach{also}: {away}{left}", [need]
+        asked = ", ".join(str(goal.need.formula) for goal in self.goals)
+        return f"not all of these can be reached in time, in whatever order: {asked}", []
 
     def _nearest(self, goal: Goal, poses: Floats) -> Floats:
         """The fewest steps to a goal from each pose, inf where no way leads there. A centre on an edge is in

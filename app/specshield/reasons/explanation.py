@@ -26,6 +26,7 @@ from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.proposal import ask
 from specshield.stl import SATISFIED_ABOVE, Eventually, Formula, Until
+from specshield.stl.fragment import is_predicate
 
 # Chosen by hand; an explanation costs some 10 ms.
 DEPTH = 2  # motions after which a witness is met again
@@ -133,9 +134,11 @@ class _Motion:
         """
         conjunct, task = parts[i].conjunct, self.prefix.task
         words = in_words(conjunct, row, self.prefix.t, late)
-        others = [str(part.conjunct) for n, part in enumerate(parts) if n != i and rho[n] <= SATISFIED_ABOVE]
+        others = [
+            f"'{part.conjunct}'" for n, part in enumerate(parts) if n != i and rho[n] <= SATISFIED_ABOVE
+        ]
         unit = " m" if set(conjunct.names) <= {"x", "y", *task.areas} else ""
-        missed = f"it misses by {abs(rho[i]):.3g}{unit}"
+        missed = f"it misses it by {abs(rho[i]):.3g}{unit}"
         if words is None:
             if len(parts) == 1:
                 return None
@@ -143,7 +146,7 @@ class _Motion:
         elif late is None and not others:
             words = f"{words}; {missed}"
         if others:
-            return f"{words}; {' and '.join(others)} {'are' if len(others) > 1 else 'is'} not kept either"
+            return f"{words}, and it does not keep {' and '.join(others)} either"
         return f"{words}, while the rest of the rule is kept" if len(parts) > 1 else words
 
     def holds_back(self, part: _Part, late: int | None) -> str | None:
@@ -151,9 +154,12 @@ class _Motion:
         asked, slack = part.asked, self.judged.slack
         if late is None or not slack or not isinstance(asked, (Eventually, Until)):
             return None
+        begins = isinstance(asked, Eventually) and not is_predicate(asked.child)
+        does, met = ("begins", "begin") if begins else ("is met", "be met")
         return (
-            f"the rule could still be kept, but {part.conjunct} only at step {asked.b + late}; the session "
-            f"keeps {steps(slack)} in hand and asks for it by step {asked.b}"
+            f"the rule could still be kept, but no way was found with the {steps(slack)} in reserve that the "
+            f"session asks for: on the best one '{part.conjunct}' {does} at step {asked.b + late}, and it "
+            f"has to {met} by step {asked.b}"
         )
 
     def known(self) -> str:

@@ -89,7 +89,7 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int |
     match part:
         case Eventually(_, b, child) if late is not None:
             does = "is met" if is_predicate(child) else "begins"
-            return f"it {does} at step {b + late}, {steps(late)} too late"
+            return f"'{child}' {does} at step {b + late}, {steps(late)} too late"
         case Until(a, b, left, right) if is_predicate(left) and is_predicate(right):
             return _of_until(part, _holds(left, samples), _holds(right, samples))
         case Always(a, b, child) if is_predicate(child):
@@ -104,8 +104,7 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int |
             if not len(met) or failing[0] > a or failing[0] + met[0] > b:
                 return f"'{child}' does not hold at step {failing[0]}"
             first = int(failing[0] + met[0])
-            after = f"{steps(first - a)} after its window begins"
-            return f"'{child}' is met at step {first}, {after}"
+            return f"'{child}' holds only from step {first}, {steps(first - a)} too late"
     return None
 
 

@@ -128,8 +128,8 @@ def refusal(
     if bound is not None:
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
     message = (
-        f"none of the {relaxed.tried} ways that the policies and a search tried from here keeps the rule: "
-        f"{_wrong(relaxed.conjuncts)}"
+        f"no way was found from here that keeps the rule, among {relaxed.tried} that the policies and a "
+        f"search tried: {_wrong(relaxed.conjuncts)}"
     )
     return Refusal(message, False, relaxed.conjuncts)
 
@@ -138,7 +138,7 @@ def _wrong(conjuncts: Sequence[Conjunct]) -> str:
     """What the conjuncts say of it, in words."""
     failing = [each for each in conjuncts if not each.feasible_alone]
     if failing:
-        alone = " even alone" if len(conjuncts) > 1 else ""
+        alone = "even with the rest of the rule left out, " if len(conjuncts) > 1 else ""
         return "; ".join(_fails(each, alone) for each in failing)
     late = [each for each in conjuncts if each.late_by is not None]
     if late:
@@ -147,18 +147,19 @@ def _wrong(conjuncts: Sequence[Conjunct]) -> str:
 
 
 def _fails(conjunct: Conjunct, alone: str) -> str:
-    told = f"no way was found to keep {_shown(conjunct)}{alone}"
-    late = conjunct.late_by
-    if late is None:
-        nearest = f"; the best one found misses it by {abs(conjunct.robustness):.3g}"
-        return f"{told}{nearest if math.isfinite(conjunct.robustness) else ''}"
-    return f"{told}; the best one found comes {steps(late)} too late"
+    part = f"'{_shown(conjunct)}'"
+    if conjunct.late_by is not None:
+        enough = f"; the whole rule could be kept if {_ends_later(conjunct)}" if conjunct.only else ""
+        return f"{alone}the soonest of them is {steps(conjunct.late_by)} too late for {part}{enough}"
+    if math.isfinite(conjunct.robustness):
+        return f"{alone}the nearest of them misses {part} by {abs(conjunct.robustness):.3g}"
+    return f"{alone}none of them keeps {part}"
 
 
 def _ends_later(conjunct: Conjunct) -> str:
     part = conjunct.formula
     does = "began" if isinstance(part, Always) and is_predicate(part.child) else "ended"
-    return f"the window of {_shown(conjunct)} {does} {steps(conjunct.late_by or 0)} later"
+    return f"the window of '{_shown(conjunct)}' {does} {steps(conjunct.late_by or 0)} later"
 
 
 def _shown(conjunct: Conjunct) -> str:

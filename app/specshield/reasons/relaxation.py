@@ -38,13 +38,14 @@ class Conjunct:
     highest found beside the others, where these can be kept without it, else of it alone [m]; -inf where
     nothing was tried. late_by: how many steps later its window would have to end (that of a G over a place,
     to begin), for it alone where it is not feasible alone, else for the whole rule; None where none was found
-    to do.
+    to do. only: whether this is all that the whole rule lacks.
     """
 
     formula: Formula
     feasible_alone: bool
     robustness: float
     late_by: int | None
+    only: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,8 @@ def relaxations(shield: Shield, history: Floats, signals: Mapping[str, Floats]) 
 def way(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Ints | None:
     """Motions from x_t to the horizon that satisfy the formula, if a search finds some without policies."""
     known, formula = Known(shield.task, history, signals), shield.task.formula
+    if not formula.names:  # as in `relaxations`
+        return None
     ground = make_ground(shield.task, shield.body, known.held)
     needed = Reader(known.now, known.constant).alternatives(formula)
     for found in _found(shield, known, ground, needed, ()):
@@ -86,9 +89,11 @@ def _told(part: Formula, i: int, rho: Floats, late: Floats, keeps: Bools) -> Con
     """rho, late, keeps [conjuncts, futures]."""
     beside = np.delete(keeps, i, axis=0).all(axis=0)
     alone = bool(keeps[i].any())
-    soonest = float(late[i][beside].min(initial=np.inf) if alone else late[i].min())
+    whole = float(late[i][beside].min(initial=np.inf))
+    soonest = whole if alone else float(late[i].min())
     highest = float(rho[i][beside].max() if beside.any() else rho[i].max())
-    return Conjunct(part, alone, highest, int(soonest) if 0.0 < soonest < np.inf else None)
+    late_by = int(soonest) if 0.0 < soonest < np.inf else None
+    return Conjunct(part, alone, highest, late_by, late_by is not None and soonest == whole)
 
 
 @dataclass

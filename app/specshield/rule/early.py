@@ -16,7 +16,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.rule.values import places
 from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts
-from specshield.stl.tree import Tree, compile_tree, tree_value
+from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_value
 from specshield.task import Task
 
 OTHER, EVENTUALLY, ALWAYS = 0, 1, 2
@@ -46,7 +46,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
 
     It is the very formula where that is one.
     """
-    parts, slots = conjuncts(formula), places(task)
+    parts, slots = conjuncts(formula) if is_temporal(formula) else (formula,), places(task)  # as in the tree
     whole = parts[0] if len(parts) == 1 else And(parts)
     whole = formula if whole == formula else whole
     tree = compile_tree(whole, slots)
