@@ -20,7 +20,7 @@ from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Area, Region, area_distance, region_from_json, region_to_json
 
 POSE_NAMES = ("x", "y", "theta")
-MAX_REGIONS = 256  # of one spec
+MAX_REGIONS = 256  # of one spec, and rooms of one map
 MAX_HORIZON = 1000  # [steps] unless the caller sets another limit
 MAX_NAME = 64  # characters
 LARGEST = 1e100  # magnitude of a signal's value, so that arithmetic on it stays finite
@@ -128,16 +128,15 @@ def names_for(regions: Iterable[str], signals: Iterable[str]) -> list[str]:
     return [*areas, *bodies, *POSE_NAMES, *signals]
 
 
-def parse_regions(regions: Mapping[str, Any]) -> dict[str, Region]:
-    """Regions by name, from JSON or as they are. Raises MapError with the path of the field."""
+def parse_regions(regions: Mapping[str, Any], path: str = "regions") -> dict[str, Region]:
+    """Regions by name, from JSON or as they are. path: of the field that they are. Raises MapError."""
     if len(regions) > MAX_REGIONS:
-        raise MapError(
-            "too many regions", path="regions", got=len(regions), expected=f"at most {MAX_REGIONS}"
-        )
+        raise MapError(f"too many {path}", path=path, got=len(regions), expected=f"at most {MAX_REGIONS}")
     result: dict[str, Region] = {}
     for name, region in regions.items():
-        _check_name(name, f"regions.{name}", MapError)
-        result[name] = region_from_json(region, f"regions.{name}") if isinstance(region, dict) else region
+        where = f"{path}.{name}"
+        _check_name(name, where, MapError)
+        result[name] = region_from_json(region, where) if isinstance(region, dict) else region
     return result
 
 

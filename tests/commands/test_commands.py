@@ -6,6 +6,8 @@ import re
 import socket
 import subprocess
 import sys
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
 
 import yaml
 
@@ -30,6 +32,7 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
     (tmp_path / "places.yaml").write_text(yaml.safe_dump(REGIONS))
     (tmp_path / "cart.yaml").write_text(yaml.safe_dump(ROBOT))
     own = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
+    assert command("keys", "create", "alice", **own).returncode == 0  # from now on its servers ask for one
     files = ("--map", tmp_path / "flat.json", "--regions", tmp_path / "places.yaml")
     asked = (*files, "--robot", tmp_path / "cart.yaml", "--rule", RULE, "--name", "flat", "--out", tmp_path)
     made = command("policy", *asked, **own)
@@ -46,11 +49,20 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
 def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
     (tmp_path / "flat.json").write_text('{"rooms?": []}')
     refused = command(
-        "policy", "--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 1", "--url", "http://127.0.0.1:9"
-    )
+        "policy", "--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 1", "--url", "http://127.0.0.1:9",
+        "--out", tmp_path,
+    )  # fmt: skip
     assert refused.returncode == 1
-    assert "Traceback" not in refused.stderr
-    assert len(refused.stderr.strip().splitlines()) == 1
+    (line,) = refused.stderr.strip().splitlines()
+    assert "flat.json is no map of a known form" in line
+
+
+def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_path):
+    (tmp_path / "file").touch()
+    refused = command("policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--out", tmp_path / "file" / "in")
+    assert refused.returncode == 1
+    (line,) = refused.stderr.strip().splitlines()
+    assert line.startswith("--out cannot be used: Not a directory")
 
 
 def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
@@ -61,6 +73,11 @@ def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
         ill = command(
             "doctor", "--port", port, REDIS_URL="redis://127.0.0.1:1/0", SPECSHIELD_DATA_DIR=str(tmp_path)
         )
+    with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as other:
+        Thread(target=other.serve_forever, daemon=True).start()
+        lost = command("doctor", "--url", f"http://127.0.0.1:{other.server_port}/")
+        other.shutdown()
+    assert re.search(r"^wrong +what answers at \S+ is no specshield server", lost.stdout, re.M), lost.stderr
     assert ill.returncode == 1
     assert f"port {port} is taken" in ill.stdout
     assert re.search(r"^wrong +the store at REDIS_URL does not answer", ill.stdout, re.M)
@@ -68,14 +85,17 @@ def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
 
 
 def test_a_session_is_watched_a_line_a_decision(tmp_path):
-    with serving(tmp_path) as server, ShieldClient(server.url, timeout=60.0) as client:
+    key = {"SPECSHIELD_API_KEY": "a-secret-key"}
+    with serving(tmp_path, **key) as server, ShieldClient(server.url, "a-secret-key", timeout=60.0) as client:
         session = client.sessions.create(policy_id="case1", initial_pose=(5.0, 5.0, 0.0), seed=2)
         pose = (5.0, 5.0, 0.0)
         for _ in range(3):
             decision = session.step(pose, [0.0] * 20)
             pose = decision.next_poses[decision.execute]
         session.close(pose)
-        watched = command("watch", session.id, "--url", server.url)
+        watched = command("watch", session.id, "--url", server.url, **key)
+        asked = ("--map", "nowhere", "--rule", "x > 1", "--out", tmp_path, "--url", server.url)
+        assert "there is no map 'nowhere'" in command("policy", *asked, **key).stderr
     assert watched.returncode == 0, watched.stderr
     lines = [line for line in watched.stdout.splitlines() if re.match(r" +\d+ (prior|shaped)", line)]
     assert [int(line.split()[0]) for line in lines] == [0, 1, 2]

@@ -38,6 +38,8 @@ def test_sums_weigh_models_and_cases_alike():
     both = found({"ours": 4.0}, {"ours": 30}) | {
         ("rover", "case2"): found({"ours": 6.0}, {}, 40)["bot", "case1"]
     }
-    kl, steps, _ = tables(both, 600)
+    kl, steps, _, apart = tables(both, 600)
     assert "| **sum** | **20.0** | **10.0** |" in kl
     assert "| **sum** | **200.0** | **130.0** |" in steps
+    assert "| bot, case1 | 10.0 (10.0 to 10.0) | 4.0 (4.0 to 4.0) |" in kl
+    assert "| bot, case1 | +6.0 (+6.0 to +6.0), n 20 | +70.0 (+70.0 to +70.0), n 20 |" in apart

@@ -63,7 +63,7 @@ def test_several_models_share_a_page(tmp_path):
         assert page.count(f"## case1, {model}\n") == 1
         assert f"| case1, {model} | lookahead |" in page
         assert f"--model {model} --noise none --methods ours,lookahead --out out/results-two/{model}" in page
-    assert "- [Other models](two/models.md)\n" in (tmp_path / "two.md").read_text()
+    assert "[Other models](two/models.md)" in (tmp_path / "two.md").read_text()
 
 
 def test_what_the_summary_says_is_in_the_records(tmp_path):
@@ -86,9 +86,10 @@ def test_what_the_summary_says_is_in_the_records(tmp_path):
         (kept / "runs.jsonl").write_text("".join(lines))
     writeup.write_up(tmp_path / "out", tmp_path / "results.md")
     page = (tmp_path / "results.md").read_text()
-    row = "| case1, learned | rule-first | 8 of 8 (63.1 to 100.0 %) | 8 of 8 (63.1 to 100.0 %) "
-    assert f"{row}| 9.0 (9.0 to 9.0) | +15.0 (+15.0 to +15.0), n 8 |" in page
-    assert "- **rule-first**: extra steps (case1, learned)." in page
+    assert "| method | rule, learned | task, learned | KL, learned | extra steps, learned |" in page
+    assert "| rule-first | 8 (63–100 %) | 8 (63–100 %) | 9 (9–9) | +15 (+15 to +15) |" in page
+    assert "| unmodified | 8 (63–100 %) | 8 (63–100 %) | 0 | 0 |" in page
+    assert "**rule-first**: extra steps (case1, learned)." in page
     assert "| gaussian noise, rule kept | ours | paper | rule-first | ours@default | paper@default |" in page
     kept = "5 of 8 (24.5 to 91.5 %) | 8 of 8 (63.1 to 100.0 %) | 8 of 8 (63.1 to 100.0 %)"
     assert f"| case1, learned | {kept} | not run | not run |" in page
@@ -154,9 +155,9 @@ def test_a_method_is_told_beside_ours_with_few_pairs_too():
     test = {"pairs": 4, "only": 1, "only_other": 0, "p": 1.0}
     found = {"other": "ours", "satisfied": test, "main_done": test, "kl": cost, "extra_steps": {"pairs": 0}}
     assert list(beside_ours({"beside_ours": {"lookahead": found, "hcd": found}})) == [
-        "- lookahead, beside ours: KL a run 5.0 and 4.0, difference +1.0 (-1.0 to +3.0), n 2, ratio 1.25 "
-        "(not bounded); extra steps in no pair of runs; rule 1 runs it alone, 0 the other alone, of 4, p = 1"
-        "; main task 1 runs it alone, 0 the other alone, of 4, p = 1."
+        "- lookahead, beside ours: KL a run 5.0 and 4.0, difference +1.0, n 2, ratio 1.25; extra steps in "
+        "no pair of runs; rule 1 runs it alone, 0 the other alone, of 4, p = 1; main task 1 runs it alone, "
+        "0 the other alone, of 4, p = 1."
     ]
 
 

@@ -1,6 +1,7 @@
 """What is said of a policy that no start, or hardly one, can be kept by."""
 
 import numpy as np
+import pytest
 
 from specshield.policy.notices import notices
 from specshield.reasons.relaxation import way
@@ -48,6 +49,12 @@ def test_a_contradiction_is_said_to_be_one():
 def test_a_robot_that_fits_nowhere_is_said_not_to():
     (said,) = notices(Policy("F[0,9] Dock", radius=2.0))
     assert "fits" in said
+
+
+@pytest.mark.parametrize("formula", ["F[0,9] 1 / 0 > 0", "Dock and not Dock and x > 9"])
+def test_a_rule_that_no_start_keeps_is_said_to_be_none(formula):
+    (said,) = notices(Policy(formula))
+    assert said.startswith("no ")
 
 
 def test_a_rule_that_asks_for_too_much_from_everywhere():

@@ -187,6 +187,12 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
     assert run("export", "record", "--to", "csv", "--out", "b.csv") == "b.csv: 1 steps\n"
     assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
     assert run("export", "record", "--to", "mcap") == f"{session.id}.mcap: 1 steps\n"
+    words = ["export", "record", "--to", "csv", "--out", "nowhere/a.csv"]
+    refused = subprocess.run(
+        [sys.executable, "-m", "specshield.cli", *words], cwd=tmp_path, capture_output=True, text=True
+    )
+    (line,) = refused.stderr.splitlines()
+    assert "nowhere/a.csv cannot be written: No such file or directory" in line
     bag_of(tmp_path / "bag", [START] * 70, 1.0)
     words = ["check-drive", "bag", "--policy", "case1", "--step-seconds", "1"]
     refused = subprocess.run(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from specshield import shipped
 from specshield.policy.planner import policy as planner
 from specshield.robot import robot_from_json
 from specshield.service.schemas.base import Problem
@@ -17,6 +18,7 @@ from specshield.world.occupancy import OccupancyGrid
 from tests.service.world import LOGITS, RESOLUTION, ROBOT, SPEC, START, ahead, cells, grid_json, policy_files
 
 YAML = b"resolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
+FLOOR, PARTS = shipped.MAPS / "case2", {"metadata": ".yaml", "image": ".pgm"}
 PGM = b"P5\n4 3\n255\n" + bytes([254] * 12)
 
 
@@ -209,6 +211,43 @@ HOUSE = {
 def test_a_house_with_an_unknown_asset(client, unchanged):
     body = {"format": "procthor", "house": HOUSE, "asset_sizes": {}}
     assert "Sofa_1" in json.dumps(problem(client.post("/v1/maps", json=body), 422, "invalid-map"))
+
+
+@pytest.mark.parametrize(
+    ("types", "path"),
+    [
+        (["Hall", "F"], "rooms.F"),
+        (["x"], "rooms.x"),
+        (["A" * 64] * 2, f"rooms.{'A' * 64}_1"),
+        (["Bedroom"] * 256, "rooms"),
+    ],
+)
+def test_a_house_with_rooms_that_no_formula_could_name(client, unchanged, types, path):
+    rooms = [{**HOUSE["rooms"][0], "roomType": type} for type in types]
+    body = {"format": "procthor", "house": {**HOUSE, "rooms": rooms, "objects": []}, "asset_sizes": {}}
+    problem(client.post("/v1/maps", json=body), 422, "invalid-map", path)
+
+
+def test_a_floor_that_came_with_the_server_keeps_its_name(client, unchanged):
+    """Sent without its named areas, which the server knows."""
+    files = {part: (FLOOR.with_suffix(end)).read_bytes() for part, end in PARTS.items()}
+    problem(client.post("/v1/maps", files=files, data={"name": "flat"}), 422, "invalid-input", "name")
+    assert client.post("/v1/maps", files=files, data={"name": "case2"}).json()["name"] == "case2"
+
+
+def test_regions_as_large_as_the_schema_says_are_taken_and_no_larger_ones(client):
+    shapes = client.get("/openapi.json").json()["components"]["schemas"]
+    corners, circles = (
+        shapes[kind]["properties"][field]["maxItems"]
+        for kind, field in (("Polygon", "vertices"), ("Union", "members"))
+    )
+    for more, status in ((0, 200), (1, 422)):
+        turn = np.linspace(0.0, 2 * math.pi, corners + more, endpoint=False)
+        round = {"type": "polygon", "vertices": np.stack([np.cos(turn), np.sin(turn)], axis=1).tolist()}
+        dots = [{"type": "circle", "center": [i, 0], "radius": 1} for i in range(circles + more)]
+        for region in (round, {"type": "union", "members": dots}):
+            body = {"formula": "F[0,9] R", "regions": {"R": region}}
+            assert client.post("/v1/specs/validate", json=body).status_code == status
 
 
 def test_maps_and_policies_that_are_not_there(client, unchanged):

@@ -61,6 +61,18 @@ def own_world(client):
     return send_policy(client)["id"]
 
 
+def test_a_command_acts_as_the_owner_of_the_key_that_it_starts_a_server_with(keyed):
+    async def act(keys):
+        secret = await keys.create("dora")
+        servers = Keys(keys._store, secret)
+        await servers.refresh()
+        found = await servers.check(f"Bearer {secret}".encode())
+        await keys.revoke("dora")
+        return found.name
+
+    assert on_keys(keyed, act) == "dora"
+
+
 def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
     def keys(*arguments):
         return subprocess.run(

@@ -4,6 +4,7 @@ import io
 import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import httpx
 import numpy as np
@@ -11,16 +12,20 @@ import pytest
 from PIL import Image
 from safetensors.numpy import load, save
 
+from specshield.errors import NotFound
+from specshield.policy.card import policy_id
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
+from specshield.service.library.policies import Policies, describe
 from specshield.service.settings import Settings
 from specshield.service.training.jobs import Jobs
 from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
+from specshield.world.regions import Rectangle
 from tests.service.test_bad_input import YAML, problem
 from tests.service.test_keys import caller, keyed
-from tests.service.world import START, grid_json, policy_files, send_policy
+from tests.service.world import RESOLUTION, START, cells, grid_json, policy_files, send_policy
 
 __all__ = ["keyed"]  # a fixture
 
@@ -192,6 +197,112 @@ def test_what_cannot_be_written_is_not_claimed(claims):
     assert claims.ids("maps", "") == []
     after = claims._store.hgetall("specshield:{library}:sums")
     assert {k: v for k, v in after.items() if v != b"0"} == {k: v for k, v in before.items() if v != b"0"}
+
+
+@pytest.fixture
+def library(claims, tmp_path):
+    """An empty one of a server's own."""
+    settings = Settings(data_dir=tmp_path)
+    maps = Maps(settings, claims)
+    return Policies(settings, maps, claims), maps
+
+
+ANN, BEN = Key("ann", ""), Key("ben", "")
+
+
+def rooms(**named):
+    return {name: Rectangle((0.0, 0.0), (side, side)) for name, side in named.items()}
+
+
+def asked(policies, map_id):
+    about = replace(describe(json.loads(policy_files()["card"])), map_id=map_id)
+    return policies.described(about, policies.task(about))
+
+
+def erase(policies, claims, record, owner):
+    assert claims.mark("policies", record.id, owner, "token") is None
+    policies.delete(record, owner, "token")
+    claims.unmark("policies", record.id, "token")
+
+
+def sums(claims):
+    found = claims._store.hgetall("specshield:{library}:sums")
+    return {name: bytes for name, bytes in found.items() if bytes != b"0"}
+
+
+def test_a_policy_is_for_its_owners_map_though_anothers_has_the_same_cells(library, claims):
+    policies, maps = library
+    small = OccupancyGrid(cells(), RESOLUTION)
+    theirs = maps.add(small, rooms(Kitchen=1.0), ANN).id
+    own = maps.add(small, rooms(Den=1.0), BEN).id
+    made = policy_files()
+    for map_id, key in ((theirs, ANN), (own, BEN)):
+        card = json.loads(made["card"])
+        policies.add(asked(policies, map_id), key)
+        sent = policies.add_card(describe(card), card, made["weights"], key)
+        assert sent.about.map_id == map_id
+    for record in policies.page("ann", None, 99)[0]:
+        if record.name is None:
+            erase(policies, claims, record, "ann")
+    maps.delete(theirs, "ann")
+    left = [record for record in policies.page("ben", None, 99)[0] if record.name is None]
+    assert len(left) == 2
+    for record in left:
+        assert maps.find(record.about.map_id, "ben").id == own
+        assert policies.task(record.about).grid == small
+        erase(policies, claims, record, "ben")
+    maps.delete(own, "ben")
+
+
+def test_policies_that_an_older_version_kept_go_on(library, claims):
+    """Their ids did not cover the map, so that one was noted as used on two."""
+    policies, maps = library
+    small = OccupancyGrid(cells(), RESOLUTION)
+    theirs, own = (
+        maps.add(small, rooms(**{name: 2.0}), key).id for name, key in (("Kitchen", ANN), ("Den", BEN))
+    )
+    record = asked(policies, theirs)
+    task, about = policies.task(record.about), record.about
+    old = replace(record, id=policy_id(task.content_hash, about.method, about.options, about.seed))
+    assert policies.add(old, ANN) == policies.record(old.id)
+    assert asked(policies, theirs).id == old.id, "it is asked for again"
+    assert asked(policies, own).id != old.id
+    with claims.adding("policies", old.id, BEN, 10, own):
+        pass
+    for owner, map_id in (("ben", own), ("ann", theirs)):
+        erase(policies, claims, old, owner)
+        maps.delete(map_id, owner)
+
+
+def test_what_owners_share_leaves_the_sum_as_it_came(library, claims):
+    policies, maps = library
+    before = sums(claims)
+    map_id = maps.add(OccupancyGrid(cells(), RESOLUTION), {}, ANN).id
+    maps.add(OccupancyGrid(cells(), RESOLUTION), {}, BEN)
+    record = policies.add(asked(policies, map_id), ANN)
+    policies.finish(record.id, bytes(9000), {})
+    policies.add(record, BEN)
+    assert sums(claims)[b"o:ben"] == sums(claims)[b"o:ann"], "both are charged what it takes"
+    with claims.adding("policies", "2" * 64, ANN, 10), claims.adding("policies", "2" * 64, BEN, 3):
+        pass
+    for owner in ("ann", "ben"):
+        erase(policies, claims, record, owner)
+        erase(policies, claims, replace(record, id="2" * 64), owner)
+        maps.delete(map_id, owner)
+    assert sums(claims) == before
+
+
+def test_what_goes_while_it_is_listed_is_left_out(library):
+    policies, maps = library
+    made = maps.add(OccupancyGrid(cells(), RESOLUTION), rooms(Den=3.0), ANN)
+    record = policies.add(asked(policies, made.id), ANN)
+    (maps._folder / made.id / "map.json").unlink()  # as it is between two looks of the server
+    (policies._folder / record.id / "policy.json").unlink()
+    assert made.id not in [item["id"] for item in maps.page("ann", None, 99)[0]]
+    assert record.id not in [found.id for found in policies.page("ann", None, 99)[0]]
+    for look, key in ((maps.show, made.id), (maps.find, made.grid.content_hash), (policies.find, record.id)):
+        with pytest.raises(NotFound):
+            look(key, "ann")
 
 
 def test_maps_are_compressed_and_old_folders_are_read(claims, tmp_path):

@@ -1,4 +1,6 @@
-"""Rules that only the planner takes, over HTTP: asked for, made by a worker, kept."""
+"""Rules that only the planner takes, and those that look at the first state alone, over HTTP: asked for, made
+by a worker, kept.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +30,9 @@ def client(server):
         yield client
 
 
-def make(server, client, formula, regions, signals=None):
-    map_id = httpx.post(f"{server.url}/v1/maps", json=grid_json()).json()["id"]
-    policy = client.policies.create(map_id, formula, regions, signals=signals, robot=ROBOT, method="planner")
+def make(server, client, formula, regions=None, signals=None, method="planner"):
+    map_id = httpx.post(f"{server.url}/v1/maps", json=grid_json(), timeout=120.0).json()["id"]
+    policy = client.policies.create(map_id, formula, regions, signals=signals, robot=ROBOT, method=method)
     return client.policies.wait(policy.id, timeout=300.0, interval=0.1)
 
 
@@ -75,3 +77,31 @@ def test_where_no_way_can_be_found_the_start_is_refused(server, client):
     policy = make(server, client, "Safe U[0,9] Far or F[0,2] G[0,3] Far", regions)
     with pytest.raises(InfeasibleStart):
         client.sessions.create(policy_id=policy.id, initial_pose=START)
+
+
+@pytest.mark.parametrize("formula", ["Safe and not x < 0.5", "G[0,0] y > 0.1"])
+def test_a_rule_that_looks_at_the_first_state_alone(server, client, formula):
+    """Its policy has nothing to propose; what keeps it at the start keeps it for ever."""
+    policy = make(server, client, formula, {"Safe": SAFE} if "Safe" in formula else {}, method="reachability")
+    assert policy.status == "ready", policy.error
+    longer = make(server, client, "F[0,9] Safe", {"Safe": SAFE}, method="reachability")
+    inside, logits = (2.0, 1.5, 0.0), [1.0, 0.0, 0.5, -1.0, None]
+    with client.sessions.create(policy_id=policy.id, initial_pose=inside) as session:
+        decision = session.step(inside, logits, explain=True)
+        assert (decision.mode, decision.spec_status) == ("prior", "satisfied")
+        assert b"<svg" in httpx.get(f"{server.url}/v1/sessions/{session.id}/image.svg", timeout=120.0).content
+        pose = decision.next_poses[decision.execute]
+        session.switch(policy_id=longer.id, clock="restart")
+        pose = session.step(pose, logits).next_poses[0]
+        session.switch(policy_id=policy.id, clock="restart")
+        assert session.step(pose, logits).spec_status == "satisfied"
+    picture = httpx.get(f"{server.url}/v1/policies/{policy.id}/image.svg", timeout=120.0)
+    assert picture.status_code == 200
+    if "Safe" in formula:
+        with pytest.raises(InfeasibleStart):
+            client.sessions.create(policy_id=policy.id, initial_pose=START)
+        with client.sessions.create(
+            policy_id=policy.id, initial_pose=START, allow_infeasible=True
+        ) as session:
+            decision = session.step(tuple(START), logits, explain=True)
+            assert (decision.mode, decision.spec_status) == ("prior", "violated")

@@ -11,6 +11,7 @@ import pytest
 from specshield import compiled
 from specshield.client import ShieldClient
 from specshield.errors import Starting
+from specshield.service.startup import mark_of_kernels
 from tests.serving import serving, wait_for
 
 
@@ -19,10 +20,25 @@ def held(tmp_path):
     """A folder of kernels with none in it, and the lock that a server needs to compile them."""
     kernels = tmp_path / "kernels"
     kernels.mkdir()
-    lock = os.open(kernels / f"{compiled.mark('ready').name}.lock", os.O_RDWR | os.O_CREAT)
+    lock = os.open(kernels / f"{mark_of_kernels().name}.lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_EX)
     yield kernels, lock
     os.close(lock)
+
+
+def test_what_numba_would_compile_again_is_not_marked_as_compiled(tmp_path, monkeypatch):
+    """It knows a kernel by the path and the time of its file, whatever is in it."""
+    monkeypatch.setattr(compiled, "BASE", tmp_path / "kernels")
+    marks = []
+    for folder, seconds in (("here", 1), ("here", 1), ("here", 2), ("there", 2)):
+        file = tmp_path / folder / "kernel.py"
+        file.parent.mkdir(exist_ok=True)
+        file.touch()
+        os.utime(file, (seconds, seconds))
+        monkeypatch.setattr(compiled, "PACKAGE", file.parent)
+        marks.append(mark_of_kernels())
+    assert marks[0] == marks[1]
+    assert len(set(marks)) == 3
 
 
 def alive(url):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import shutil
@@ -15,8 +16,10 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import redis
 from redis.crc import key_slot
 
+from specshield.service.storage.connect import connect
 from tests.service.test_events import END, read
 from tests.service.world import ROBOT, SPEC, grid_json, send_policy
 from tests.serving import RunningServer, serving, wait_for
@@ -170,6 +173,33 @@ def test_a_life_under_sentinels_that_name_another_server(tmp_path):
 def test_a_life_behind_tls(tmp_path):
     with behind_tls(tmp_path / "store") as url, on_store(tmp_path, url) as server:
         a_whole_life(server, tmp_path, url)
+
+
+def test_a_connection_that_is_closed_while_it_is_in_use_is_a_store_that_cannot_be_reached(tmp_path):
+    """As redis-py closes all connections of a cluster when it looks for its nodes anew."""
+
+    async def scenario(url: str) -> None:
+        client = connect(url)
+        await client.set("there", 1)
+        node = client.get_node_from_key("there")
+        held = node.acquire_connection()
+        await held.disconnect()
+        usual = held.connect_check_health
+
+        async def closed_beside(check_health: bool = True) -> None:
+            await usual(check_health=check_health)
+            held._writer = None
+
+        held.connect_check_health = closed_beside
+        node._free.appendleft(held)
+        with pytest.raises(redis.ConnectionError, match="closed while it was in use"):
+            await client.get("there")
+        held.connect_check_health = usual
+        assert await client.get("there") == b"1"
+        await client.aclose()
+
+    with cluster(tmp_path / "store") as nodes:
+        asyncio.run(scenario(nodes.url))
 
 
 def test_a_cluster_that_is_away_is_said_to_be(tmp_path):

@@ -43,6 +43,13 @@ def switch(client):
     return switch
 
 
+def signalled(prefix):
+    """LATER with 40 signals."""
+    names = [f"{prefix}{i}" for i in range(40)]
+    formula = f"F[0,12] End and G[0,12] ({' and '.join(f'{name} < 1' for name in names)})"
+    return {"formula": formula, "regions": {"End": END}, "signals": dict.fromkeys(names, 0.0)}
+
+
 CONJUNCT = {"formula", "feasible_alone", "robustness", "late_by"}
 
 
@@ -117,6 +124,38 @@ def test_what_cannot_be_kept_changes_nothing(client, begin, step, switch):
     assert state(client, session) == before
     assert record_of(client, session) == record
     driven(step, session, poses[3:], since=3)
+
+
+@pytest.mark.parametrize("action", [1, 3], ids=["left", "wait"])
+def test_a_second_switch_at_a_step_begins_where_the_first_robot_goes(client, begin, step, switch, action):
+    """Four steps of the crawler reach the goal from where `forward` leads, not from where the robot goes. Its
+    action 1 ends the task, and it has no action 3.
+    """
+    goal = {"Goal": {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}}
+    far, near = ({"formula": f"F[0,{last}] Goal", "regions": goal} for last in (40, 4))
+    session = begin(policy_id=send_policy(client, spec=far)["id"])
+    decided = step(session, 0, [START], logits=[0.0 if i == action else None for i in range(5)]).json()
+    assert decided["action"] == action
+    assert switch(session, 1, far, CRAWLER).status_code == 200
+    assert b"<svg" in client.get(f"/v1/sessions/{session['id']}/image.svg").content
+    before = state(client, session)
+    problem(switch(session, 1, near, CRAWLER, clock="restart"), 422, "infeasible-switch")
+    assert state(client, session) == before
+    assert switch(session, 1, far, clock="restart").status_code == 200
+    assert step(session, 1, [decided["next_poses"][action]]).json()["mode"] == "shaped"
+
+
+def test_what_no_session_can_hold_is_refused_and_changes_nothing(client, begin, step, switch):
+    session, poses = begin(max_steps=40), ahead(5)
+    driven(step, session, poses[:1])
+    assert switch(session, 1, signalled("a")).status_code == 200
+    before = state(client, session)
+    assert problem(switch(session, 1, signalled("b")), 422, "invalid-input")["got"] == 81
+    driven_on = [*poses[1:], *[poses[-1]] * 45]
+    far = {**LATER, "formula": "F[0,40] End"}
+    refused = problem(switch(session, 50, far, poses=driven_on), 422, "invalid-input")
+    assert (refused["path"], refused["expected"]) == ("t", "at most 41")
+    assert state(client, session) == before
 
 
 def test_a_way_that_a_search_found_and_no_policy_did_is_taken(

@@ -154,13 +154,21 @@ def test_a_hostile_step_is_told_of_and_breaks_nothing(case1, changed, capsys, tm
 
 
 def test_a_decision_by_tables_made_beside_is_decided_again_by_the_same_tables(server, capsys, tmp_path):
-    """Something stands where the map has nothing. The robot waits until the tables for that are there."""
+    """Something stands where the map has nothing. The robot waits until the tables for that are there. A
+    session that begins anew by the same id, on which something else stands, has none of them.
+    """
     pose = (4.5, 5.0, 0.0)
     box = [(0.05 * i + 0.025, 0.05 * j + 0.025) for i in range(70, 76) for j in range(96, 103)]
     file, logits = tmp_path / "learned.record", np.zeros(20)
     logits[4] = -np.inf  # `end`: the session goes on until they are
     with ShieldClient(server.url, timeout=60.0) as client:
-        with client.sessions.create(policy_id="case1", initial_pose=pose, learn_map=False) as session:
+        asked: dict[str, Any] = {
+            "policy_id": "case1",
+            "initial_pose": pose,
+            "learn_map": False,
+            "id": "again",
+        }
+        with client.sessions.create(**asked) as session:
             kept: list[Any] = []
             while not any(kept):
                 decision = session.step(pose, logits, occupied=box)
@@ -169,6 +177,12 @@ def test_a_decision_by_tables_made_beside_is_decided_again_by_the_same_tables(se
                 kept = [made.tables for _, _, made in chain.read(file.read_bytes()).decided()]
                 time.sleep(0.5)
         session.save_record(file)
-    status, said = told(capsys, tmp_path, file.read_bytes())
-    assert status == 0, said
-    assert "every step is decided again" in said
+        client.sessions.delete("again")
+        with client.sessions.create(**asked) as session:
+            for _ in range(2):
+                session.step(pose, logits, occupied=box[::2])
+        session.save_record(tmp_path / "anew.record")
+    for each in (file, tmp_path / "anew.record"):
+        status, said = told(capsys, tmp_path, each.read_bytes())
+        assert status == 0, said
+        assert "every step is decided again" in said

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
 
-from specshield.shield.shaping import divergence, feasible_mass, log_softmax, restrict, soften, tilt
+from specshield.shield.shaping import divergence, feasible_mass, going_on, log_softmax, restrict, soften, tilt
 
 INF = math.inf
 
@@ -149,6 +149,15 @@ def test_the_threshold_at_and_about_the_highest_value():
     assert tilt(log_prior, equal, 0.2) == pytest.approx(np.exp(log_prior))
     assert tilt(log_prior, equal, 0.4) is None
     assert tilt(log_prior, np.array([0.0, 1e-300, 0.0]), 5e-301)[1] >= 0.5 - 1e-9
+
+
+def test_a_model_that_all_but_ends_leaves_no_negative_share():
+    """Its four ways to end have shares that add up to 1 + 4e-16."""
+    ends = [1.3987996703411758, -5.623324580550751, -4.192031839700517, -1.406456427197903]
+    log_prior = log_softmax(np.array([-45.0, -50.0, *ends]))
+    conditional, ending = going_on(log_prior, np.array([False, False, True, True, True, True]))
+    assert ending == 1.0
+    assert np.exp(conditional).sum() == pytest.approx(1.0)
 
 
 def test_divergence():

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,17 @@ def test_the_way_leads_to_the_target_from_every_free_cell(case):
         points = following[cells[:, 1], cells[:, 0]]
         assert not grid.occupied[cells[:, 1], cells[:, 0]].any()
     assert np.hypot(*(points - case.target).T).max() < 0.05
+
+
+def test_a_target_beside_a_wall_is_led_to_as_well(case):
+    grid = case.task.grid
+    i, j = np.argwhere(~grid.occupied & (grid.clearance < 0.08))[0]
+    target = grid.centres[i, j]
+    points, following = grid.centres[~grid.occupied], waypoints(replace(case, target=tuple(target)))
+    for _ in range(80):
+        cells = np.floor(grid.to_grid(points) / grid.resolution).astype(int)
+        points = following[cells[:, 1], cells[:, 0]]
+    assert np.hypot(*(points - target).T).max() < 0.05
 
 
 def test_at_the_target_is_a_metre_along_free_space(case):

@@ -13,10 +13,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from specshield import __version__
 from specshield.errors import SpecshieldError
+
+if TYPE_CHECKING:
+    import httpx
 
 CLOCK = 2.0  # [s] by which this machine and a server may differ before it is said
 State = Literal["ok", "note", "wrong"]
@@ -84,9 +87,9 @@ def _parts(parts: Sequence[str]) -> Iterator[Finding]:
 
 def _kernels() -> Iterator[Finding]:
     from specshield import compiled
-    from specshield.service.startup import TAKES
+    from specshield.service.startup import TAKES, mark_of_kernels
 
-    mark = compiled.mark("ready")
+    mark = mark_of_kernels()
     if mark is None:
         yield Finding(
             "note", f"no compiled kernel can be kept in {compiled.BASE}: every start compiles them all",
@@ -165,22 +168,28 @@ def _port(port: int) -> Iterator[Finding]:
 def _server(url: str) -> Iterator[Finding]:
     import httpx
 
-    began = time.time()
+    from specshield.client.transport import address
+
+    began, at = time.time(), str(address(url)).rstrip("/")
     try:
-        ready = httpx.get(f"{url}/readyz", timeout=10.0)
-        told = httpx.get(f"{url}/openapi.json", timeout=10.0)
+        ready = httpx.get(f"{at}/readyz", timeout=10.0)
+        told = httpx.get(f"{at}/openapi.json", timeout=10.0)
     except httpx.HTTPError as error:
         yield Finding("wrong", f"no server answers at {url}: {error}", "specshield serve, or another --url")
+        return
+    said = _object(ready)
+    if said.get("status") != "ok" and "type" not in said:  # what /readyz answers, or a problem (RFC 9457)
+        yield Finding(
+            "wrong", f"what answers at {url} is no specshield server", "specshield serve, or another --url"
+        )
         return
     if ready.status_code == 200:
         yield Finding("ok", f"the server at {url} is ready")
     else:
         yield Finding(
-            "wrong",
-            f"the server at {url} is not ready: {ready.json().get('detail')}",
-            "wait, or read its log",
+            "wrong", f"the server at {url} is not ready: {said.get('detail')}", "wait, or read its log"
         )
-    theirs = told.json().get("info", {}).get("version") if told.status_code == 200 else None
+    theirs = _object(told).get("info", {}).get("version")
     if theirs not in (None, __version__):
         yield Finding(
             "note",
@@ -194,3 +203,12 @@ def _server(url: str) -> Iterator[Finding]:
             yield Finding(
                 "note", f"the server's clock is {apart:+.0f} s from this one", "ntp on both machines"
             )
+
+
+def _object(answer: httpx.Response) -> dict[str, Any]:
+    """What an answer holds; nothing where that is no JSON object."""
+    try:
+        found = answer.json()
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -62,6 +62,13 @@ def export(
         else:
             from specshield.recordings.tables import write_csv as write
         write(recording, path)
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be written: {error.strerror or error}",
+            path="--out",
+            got=str(path),
+            expected="a file in a folder that is there",
+        ) from None
     except ModuleNotFoundError as error:
         raise InputError(
             f"{to} needs {error.name}, which is not installed",

@@ -12,6 +12,7 @@ import yaml
 from specshield.client import Map, Policy, ShieldClient
 from specshield.commands.serving import client_of
 from specshield.errors import InputError, PolicyError
+from specshield.service.library.files import check_writable
 from specshield.sim.progress import StatusLine, duration
 
 LARGEST = 64 << 20  # [bytes] of a file; a server's own limit for a map
@@ -32,6 +33,7 @@ def policy(
 
     Returns the exit status: 1 where the policy is ready but can keep the rule from nowhere.
     """
+    check_writable(out, "--out")
     status = StatusLine()
     places = {} if regions is None else _mapping(_read(regions, "--regions"), regions, "--regions")
     machine = _robot(robot)
@@ -55,7 +57,6 @@ def policy(
             print(f"        {metric}: {value}")
         for warning in made.warnings:
             print(f"        warning: {warning}")
-        out.mkdir(parents=True, exist_ok=True)
         picture = out / f"{called}.svg"
         picture.write_bytes(client.policies.image(made.id))
     print(f"picture {picture}")

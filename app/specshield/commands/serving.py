@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,17 +18,16 @@ PATIENCE = 30.0  # [s] for one answer: other work may share the machine
 def client_of(url: str | None, status: StatusLine, worker: bool = False) -> Iterator[ShieldClient]:
     """A client of the server at `url`. Without one a server is started, which keeps what it makes.
 
-    worker: whether policies are to be made there.
+    The client shows the key of SPECSHIELD_API_KEY. worker: whether policies are to be made there.
     """
+    key = os.environ.get("SPECSHIELD_API_KEY") or None
     if url is not None:
-        with ShieldClient(url, timeout=PATIENCE) as client:
+        with ShieldClient(url, key, timeout=PATIENCE) as client:
             yield client
         return
     from specshield.service.settings import read_settings
 
+    data, key = read_settings().data_dir, key or secrets.token_urlsafe()  # the folder may hold keys
     status.say("starting the service ...")
-    with (
-        own_server(worker, status.say, read_settings().data_dir) as own,
-        ShieldClient(own, timeout=PATIENCE) as client,
-    ):
+    with own_server(worker, status.say, data, key) as own, ShieldClient(own, key, timeout=PATIENCE) as client:
         yield client

@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import MapError
+from specshield.errors import InfeasibleStart, MapError, SampleError
 from specshield.policy.dqn.environment import free_poses
 from specshield.reasons.bound import contradiction
-from specshield.reasons.lateness import samples_of, values_of
 from specshield.reasons.relaxation import way
 from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Config, Shield, make_shield
+from specshield.shield.episode import start
 from specshield.shield.proposal import Proposer
 from specshield.shield.signals import any_signal
-from specshield.stl import SATISFIED_ABOVE
 
 STARTS = 16  # poses that a new policy is tried from. Chosen by hand: as with all of it, a second or two
 MOST_SEARCHED = 4  # of those that it has no future from
@@ -32,7 +31,7 @@ def notices(policy: Proposer) -> tuple[str, ...]:
         poses = free_poses(task, shield.body, STARTS, np.random.default_rng(0))
     except MapError:
         return (f"the robot fits nowhere on this map: its footprint has a radius of {task.robot.radius:g} m",)
-    refused = [pose for pose in poses if not _kept(policy, pose)]
+    refused = [pose for pose in poses if not _kept(shield, pose)]
     missed = sum(way(shield, pose[None], {}) is not None for pose in refused[:MOST_SEARCHED])
     if missed:
         tried = min(len(refused), MOST_SEARCHED)
@@ -66,9 +65,10 @@ def _of_signals(shield: Shield, poses: Floats, silent: int) -> tuple[str, ...]:
     )
 
 
-def _kept(policy: Proposer, pose: np.ndarray) -> bool:
-    """Whether some future that the policy proposes from a pose satisfies the formula."""
-    shield = make_shield([policy])
-    proposed = policy.propose(pose[None].copy(), {}, 0.0)
-    samples = samples_of(shield, pose[None], {}, proposed.motions)
-    return bool(not samples or (values_of(policy.task.formula, samples) > SATISFIED_ABOVE).any())
+def _kept(shield: Shield, pose: Floats) -> bool:
+    """Whether a session may begin at a free pose."""
+    try:
+        start(shield, pose.tolist())
+    except (InfeasibleStart, SampleError):
+        return False
+    return True

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
+import hashlib
 import logging
 import os
 import sys
@@ -68,13 +69,22 @@ class Startup:
         return min(compiled.on_disk() - (self.before or 0), KERNELS)
 
 
+def mark_of_kernels() -> Path | None:
+    """The file that says that every kernel of a start is on the disk. numba recognises a cached kernel by the
+    path and the modification time of its source file, so the name of this file depends on both.
+    """
+    files = sorted(compiled.PACKAGE.rglob("*.py"))
+    stamps = repr([(str(file), file.stat().st_mtime_ns) for file in files])
+    return compiled.mark(f"ready-{hashlib.sha256(stamps.encode()).hexdigest()[:16]}")
+
+
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
     """Returns when the server is ready, or cannot become it.
 
     check: blocks, and raises what keeps the server from serving; StoreError where that cannot be known yet.
     """
     try:
-        mark = compiled.mark("ready")
+        mark = mark_of_kernels()
         if mark is not None and not mark.exists():
             await _compile(startup, mark)
         for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here

@@ -80,7 +80,7 @@ def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats, float]:
     ending, kept = 0.0, log_prior.copy()
     for a in range(len(kept)):
         if terminal[a]:
-            ending += np.exp(kept[a])
+            ending = min(ending + np.exp(kept[a]), 1.0)  # a sum may be rounded up
             kept[a] = -np.inf
     if np.max(kept) == -np.inf:
         return kept, ending

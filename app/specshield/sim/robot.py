@@ -96,7 +96,7 @@ def waypoints(case: Case) -> Floats:
     free, comfortable = ~grid.occupied, grid.clearance > COMFORT
     goal = np.zeros_like(free)
     goal[case.cell(case.target)] = True
-    onward = geodesic_distance(comfortable, goal, grid.resolution)
+    onward = geodesic_distance(comfortable | goal, goal, grid.resolution)  # it may stand beside a wall
     reached = np.isfinite(onward)
     off_the_wall = geodesic_distance(free, reached, grid.resolution)
     to_go = np.where(reached, onward, onward[reached].max() + grid.resolution + off_the_wall)

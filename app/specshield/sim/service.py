@@ -19,13 +19,17 @@ import httpx
 
 @contextmanager
 def own_server(
-    worker: bool = False, say: Callable[[str], object] = lambda text: None, data: Path | None = None
+    worker: bool = False,
+    say: Callable[[str], object] = lambda text: None,
+    data: Path | None = None,
+    key: str | None = None,
 ) -> Iterator[str]:
     """Starts `specshield serve` on a free port, its data in `data`, else in a temporary folder; yields its
     address.
 
-    worker: whether it makes policies too. say: is told how far the server is while it starts. Raises
-    RuntimeError with the server's log where it does not come up.
+    worker: whether it makes policies too. say: is told how far the server is while it starts. key: one that
+    it takes beside those that `data` holds. Raises RuntimeError with the server's log where it does not come
+    up.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
         log = Path(folder) / "server.log"
@@ -33,7 +37,7 @@ def own_server(
         with open(log, "wb") as output:
             server = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "serve", "--port", url.rpartition(":")[2]],
-                env=_environment(data or Path(folder) / "data", worker),
+                env=_environment(data or Path(folder) / "data", worker, key),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -57,7 +61,7 @@ def follow_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
-def _environment(data: Path, worker: bool) -> dict[str, str]:
+def _environment(data: Path, worker: bool, key: str | None) -> dict[str, str]:
     """This process's, without what would join the server to another's store or lock it."""
     shipped = ("SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR")
     kept = {
@@ -66,7 +70,7 @@ def _environment(data: Path, worker: bool) -> dict[str, str]:
         if name in shipped or (not name.startswith("SPECSHIELD_") and name != "REDIS_URL")
     }
     own = {"SPECSHIELD_DATA_DIR": str(data), "SPECSHIELD_WORKER": "true" if worker else "false"}
-    return {**kept, **own}
+    return {**kept, **own, **({} if key is None else {"SPECSHIELD_API_KEY": key})}
 
 
 def _wait_until_ready(

@@ -123,6 +123,8 @@ class PlannerPolicy:
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A plan from x_t, and one after each other first motion."""
+        if len(history) > self.task.horizon:  # no step is left
+            return Proposal(np.empty((1, 0), np.int64), 0)
         return self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)[0]
 
     def _plan(

@@ -49,7 +49,9 @@ class Key:
 
 
 class Keys:
-    """own: the key of SPECSHIELD_API_KEY, which has the empty name and no limits. store: redis.asyncio."""
+    """own: the key of SPECSHIELD_API_KEY, which has the empty name and no limits; unless the store has it
+    too, as it may where a command starts a server of its own. store: redis.asyncio.
+    """
 
     def __init__(self, store: Any, own: str | None = None) -> None:
         self._store, self._lock = store, asyncio.Lock()
@@ -91,7 +93,7 @@ class Keys:
                 version = await _reached(self._store.hget(KEYS, ""))
                 if version is not None and version != self._version:
                     listed = {key.digest: key for key in await self.listed()}
-                    self._known, self._version = {**listed, **self._own}, version
+                    self._known, self._version = {**self._own, **listed}, version
                 self._read = True
             except StoreError as error:
                 log.debug("the keys could not be read: %s", error)

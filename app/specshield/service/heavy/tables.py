@@ -48,6 +48,8 @@ class Tables:
     def of(self, session: str, shield: Shield, known: LearnedMap) -> tuple[Shield, bytes | None]:
         """The shield with the newest tables that there are for the session, and their digest, None where
         there are none. Those for `known` are begun, unless others of the session are being made.
+
+        session: its nonce. Its id may be another owner's as well, and may be begun again.
         """
         if not len(known) or not any(isinstance(each, ReachabilityPolicy) for each in shield.proposers):
             return shield, None

@@ -2,13 +2,19 @@
 -- KEYS: 1 what the owner claims of this kind {id: bytes}; 2 the owners of this id; 3 sums {o:owner | all: bytes,
 -- kind: how many}; 4 the mark of an id that is being deleted; 5 the owner's policies on the map concerned
 -- (this id, if it is a map); for a policy also 6 what the owner claims of maps; 7 the mark of its map;
--- 8 the owner's names of this kind {name: id}; 9 the same the other way round {id: name}.
+-- 8 the owner's names of this kind {name: id}; 9 the same the other way round {id: name}; 10 what the owner
+-- claims of policies; 11 what `all` counts for each id of this kind {id: bytes}, however many claim it.
 -- ARGV: 1 what to do, 2 kind, 3 id, 4 owner, 5 token of a deletion, and for a claim 6 bytes, 7 most ids,
 -- 8 most bytes of an owner, 9 most bytes of all, 10 the map's id ('' where it is everybody's); for a name 6 the name.
 local what, kind, id, owner, token = ARGV[1], ARGV[2], ARGV[3], ARGV[4], ARGV[5]
 local mine, held = 'o:' .. owner, tonumber(redis.call('HGET', KEYS[1], id))
 
 local function sum(name) return tonumber(redis.call('HGET', KEYS[3], name)) or 0 end
+
+local function count(bytes) -- in `all`, in place of what it counts for this id; an older version noted only claims
+  redis.call('HINCRBY', KEYS[3], 'all', bytes - (tonumber(redis.call('HGET', KEYS[11], id)) or held or 0))
+  redis.call('HSET', KEYS[11], id, bytes)
+end
 
 if what == 'claim' then
   local bytes, map = tonumber(ARGV[6]), ARGV[10]
@@ -27,7 +33,7 @@ if what == 'claim' then
   redis.call('HINCRBY', KEYS[3], mine, bytes)
   if map ~= '' then redis.call('SADD', KEYS[5], id) end
   if first then
-    redis.call('HINCRBY', KEYS[3], 'all', bytes)
+    count(bytes)
     redis.call('HINCRBY', KEYS[3], kind, 1)
   end
   return 'made'
@@ -46,8 +52,10 @@ end
 if what == 'mark' then
   if not held then return 'none' end
   if kind == 'maps' then
-    local user = redis.call('SRANDMEMBER', KEYS[5])
-    if user then return user end
+    for _, user in ipairs(redis.call('SMEMBERS', KEYS[5])) do
+      if redis.call('HEXISTS', KEYS[10], user) == 1 then return user end
+      redis.call('SREM', KEYS[5], user) -- deleted; an older version noted some policies on two maps
+    end
   end
   return redis.call('SET', KEYS[4], token, 'NX', 'PX', 60000) and 'marked' or 'busy'
 end
@@ -67,17 +75,18 @@ if what == 'free' then -- the mark of a last claim stays until the files are gon
     redis.call('DEL', KEYS[4])
     return 'shared'
   end
-  redis.call('HINCRBY', KEYS[3], 'all', -held)
+  count(0)
+  redis.call('HDEL', KEYS[11], id)
   redis.call('HINCRBY', KEYS[3], kind, -1)
   return 'last'
 end
 
-if what == 'weigh' then -- what the files take is known now; 'all' counts them for the owner that is weighed first
+if what == 'weigh' then -- what the files take is known now
   if held then
     local bytes = tonumber(ARGV[6])
     redis.call('HSET', KEYS[1], id, bytes)
     redis.call('HINCRBY', KEYS[3], mine, bytes - held)
-    if ARGV[7] == '1' then redis.call('HINCRBY', KEYS[3], 'all', bytes - held) end
+    count(bytes)
   end
   return 'done'
 end

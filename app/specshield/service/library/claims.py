@@ -53,15 +53,15 @@ class Claims:
         return self._store.register_script(SCRIPT)
 
     def ids(self, kind: str, owner: str) -> list[str]:
-        return sorted(id.decode() for id in _reached(lambda: self._store.hkeys(_owned(kind, owner))))
+        return sorted(id.decode() for id in _reached(lambda: self._store.hkeys(_key(kind, owner))))
 
     def holds(self, kind: str, id: str, owner: str) -> bool:
-        return bool(_reached(lambda: self._store.hexists(_owned(kind, owner), id)))
+        return bool(_reached(lambda: self._store.hexists(_key(kind, owner), id)))
 
     def settled(self, kind: str, id: str, owner: str) -> bool:
         """Whether the owner holds it, once no deletion of it is under way."""
         deadline = time.monotonic() + PATIENCE
-        while _reached(lambda: self._store.exists(_mark(kind, id))):
+        while _reached(lambda: self._store.exists(_key("mark", kind, id))):
             if time.monotonic() > deadline:
                 return False
             time.sleep(WAIT)
@@ -69,16 +69,16 @@ class Claims:
 
     def named(self, kind: str, name: str, owner: str) -> str | None:
         """The id of what this owner calls by that name."""
-        found = _reached(lambda: self._store.hget(_names(kind, owner), name))
+        found = _reached(lambda: self._store.hget(_key("names", kind, owner), name))
         return None if found is None else str(found.decode())
 
     def name_of(self, kind: str, id: str, owner: str) -> str | None:
-        found = _reached(lambda: self._store.hget(_named(kind, owner), id))
+        found = _reached(lambda: self._store.hget(_key("named", kind, owner), id))
         return None if found is None else str(found.decode())
 
     def names(self, kind: str, owner: str) -> dict[str, str]:
         """{id: name} of everything that this owner has named."""
-        found = _reached(lambda: self._store.hgetall(_named(kind, owner)))
+        found = _reached(lambda: self._store.hgetall(_key("named", kind, owner)))
         return {id.decode(): name.decode() for id, name in found.items()}
 
     def check_name(self, kind: str, name: str, id: str, owner: str, shipped: Mapping[str, str]) -> None:
@@ -157,16 +157,15 @@ class Claims:
 
     def weigh(self, kind: str, id: str, size: int) -> None:
         """Notes what was written after the claim was made."""
-        owners = sorted(_reached(lambda: self._store.smembers(_owners(kind, id))))
-        for i, owner in enumerate(owners):
-            self._run("weigh", kind, id, owner.decode(), "", size, int(i == 0))
+        for owner in _reached(lambda: self._store.smembers(_key("owners", kind, id))):
+            self._run("weigh", kind, id, owner.decode(), "", size)
 
     def shared(self, kind: str, id: str) -> bool:
         """Whether several owners hold it."""
-        return bool(_reached(lambda: self._store.scard(_owners(kind, id))) > 1)
+        return bool(_reached(lambda: self._store.scard(_key("owners", kind, id))) > 1)
 
     def unowned(self, kind: str, id: str) -> bool:
-        return not _reached(lambda: self._store.exists(_owners(kind, id)))
+        return not _reached(lambda: self._store.exists(_key("owners", kind, id)))
 
     def _give_back(self, kind: str, id: str, owner: str, map_id: str) -> None:
         token = secrets.token_hex(8)
@@ -189,37 +188,26 @@ class Claims:
         self, what: str, kind: str, id: str, owner: str, token: str, *more: Any, map_id: str = ""
     ) -> str:
         about = id if kind == "maps" else (more[-1] if what == "claim" else map_id)
-        keys = [_owned(kind, owner), _owners(kind, id), SUMS, _mark(kind, id), _uses(about, owner)]
-        keys += [_owned("maps", owner), _mark("maps", about), _names(kind, owner), _named(kind, owner)]
+        keys = [
+            _key(kind, owner),
+            _key("owners", kind, id),
+            _key("sums"),
+            _key("mark", kind, id),
+            _key("uses", about, owner),
+        ]
+        keys += [
+            _key("maps", owner),
+            _key("mark", "maps", about),
+            _key("names", kind, owner),
+            _key("named", kind, owner),
+        ]
+        keys += [_key("policies", owner), _key("sizes", kind)]
         said = _reached(lambda: self._script(keys=keys, args=[what, kind, id, owner, token, *more]))
         return str(said.decode())
 
 
-SUMS = "specshield:{library}:sums"
-
-
-def _owned(kind: str, owner: str) -> str:
-    return f"specshield:{{library}}:{kind}:{owner}"
-
-
-def _owners(kind: str, id: str) -> str:
-    return f"specshield:{{library}}:owners:{kind}:{id}"
-
-
-def _mark(kind: str, id: str) -> str:
-    return f"specshield:{{library}}:mark:{kind}:{id}"
-
-
-def _uses(map_id: str, owner: str) -> str:
-    return f"specshield:{{library}}:uses:{map_id}:{owner}"
-
-
-def _names(kind: str, owner: str) -> str:
-    return f"specshield:{{library}}:names:{kind}:{owner}"
-
-
-def _named(kind: str, owner: str) -> str:
-    return f"specshield:{{library}}:named:{kind}:{owner}"
+def _key(*parts: str) -> str:
+    return ":".join(("specshield:{library}", *parts))
 
 
 def taken(name: str, id: str) -> NameTaken:

@@ -78,6 +78,14 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_bytes())
 
 
+def find_json(path: Path) -> Any:
+    """None where there is no such file, or no more: another process may delete what this one looks at."""
+    try:
+        return read_json(path)
+    except FileNotFoundError:
+        return None
+
+
 def to_json(value: Any) -> bytes:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
 
@@ -109,8 +117,11 @@ def weight(content: Mapping[str, bytes]) -> int:
 
 
 def weight_of(folder: Path) -> int:
-    """Bytes that the files of a folder take."""
-    return sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+    """Bytes that the files of a folder take; 0 where it is gone."""
+    try:
+        return sum(size(path) for path in folder.iterdir() if path.is_file())
+    except FileNotFoundError:
+        return 0
 
 
 def write_file(path: Path, content: bytes) -> None:

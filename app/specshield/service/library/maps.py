@@ -11,6 +11,7 @@ import io
 import logging
 import secrets
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -95,9 +96,9 @@ class Maps:
             if self._claims.holds("maps", key, owner):
                 return self.get(key)
             for id in self._own(owner):
-                folder = self._folder / id
-                if files.there(folder) and files.read_json(folder / "map.json")["grid"] == key:
-                    return self.get(id)
+                with suppress(NotFound):  # deleted at this moment
+                    if self._stored(id)["grid"] == key:
+                        return self.get(id)
         raise _missing(key)
 
     def show(self, key: str, owner: str) -> dict[str, Any]:
@@ -110,16 +111,16 @@ class Maps:
         return {**shown, "name": self._claims.name_of("maps", shown["id"], owner)}
 
     def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region], key: Key, name: str | None = None) -> Map:
-        """Keeps a map for an owner, its content once, under a name if one is given. Raises
-        LimitReached, InsufficientStorage and NameTaken.
+        """Keeps a map for an owner, its content once, under a name if one is given. Raises MapError for rooms
+        that no formula could name, LimitReached, InsufficientStorage and NameTaken.
         """
         assert self._claims is not None
+        parse_regions(rooms, "rooms")
         id = _id(grid, rooms)
         found = self.shipped(id)
         if name is not None:
-            self._claims.check_name(
-                "maps", name, id, key.name, {each: m.id for each, m in self._named.items()}
-            )
+            shipped = {each: known.id for each, known in self._named.items()}
+            self._claims.check_name("maps", name, id if found is None else found.id, key.name, shipped)
         if found is not None:
             return found
         if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
@@ -168,7 +169,11 @@ class Maps:
             lambda key: files.size(self._folder / key / "map.json"),
         )  # fmt: skip
         names = self._claims.names("maps", owner) if self._claims is not None else {}
-        return [self._shown(key) | ({"name": names[key]} if key in names else {}) for key in keys], following
+        shown = []
+        for key in keys:
+            with suppress(NotFound):  # deleted at this moment
+                shown.append(self._shown(key) | ({"name": names[key]} if key in names else {}))
+        return shown, following
 
     def adopt(self) -> None:
         """Gives the maps that nobody has, of a time before owners, to the owner without a name."""
@@ -191,15 +196,25 @@ class Maps:
     def _shown(self, key: str) -> dict[str, Any]:
         if key in self._named:
             return self._named[key].to_json()
-        files.there(self._folder / key)
-        shown: dict[str, Any] = files.read_json(self._folder / key / "map.json")["shown"]
+        shown: dict[str, Any] = self._stored(key)["shown"]
         return shown
+
+    def _stored(self, id: str) -> dict[str, Any]:
+        """What a map's map.json holds. Raises NotFound where it is gone."""
+        folder = self._folder / id
+        found: dict[str, Any] | None = files.find_json(folder / "map.json") if files.there(folder) else None
+        if found is None:
+            raise _missing(id)
+        return found
 
     def _read(self, id: str) -> Map:
         folder = self._folder / id
-        image = next(path for kind in ("png", "pgm") if (path := folder / f"map.{kind}").is_file())
-        grid = load_map((folder / "map.yaml").read_text(), image.read_bytes())
-        return Map(id, grid, parse_regions(self._shown(id)["rooms"]))
+        rooms = parse_regions(self._stored(id)["shown"]["rooms"], "rooms")
+        try:
+            image = next(path for kind in ("png", "pgm") if (path := folder / f"map.{kind}").is_file())
+            return Map(id, load_map((folder / "map.yaml").read_text(), image.read_bytes()), rooms)
+        except (FileNotFoundError, StopIteration):
+            raise _missing(id) from None
 
 
 def _missing(key: str) -> NotFound:

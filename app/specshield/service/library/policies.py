@@ -71,10 +71,11 @@ class Policies:
             if key in (found.name, found.id):
                 return found
         folder = self._folder / key
-        if not files.HASH.fullmatch(key) or not files.there(folder):
+        there = files.HASH.fullmatch(key) and files.there(folder)
+        stored = files.find_json(folder / "policy.json") if there else None
+        if stored is None:
             raise _missing(key)
-        stored = files.read_json(folder / "policy.json")
-        card = files.read_json(folder / "card.json") if (folder / "card.json").is_file() else None
+        card = files.find_json(folder / "card.json")
         return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
 
     def find(self, key: str, owner: str) -> Record:
@@ -151,7 +152,8 @@ class Policies:
                 "the spec is too large", path="spec", got=f"{size} bytes as JSON",
                 expected=f"at most {self._max_spec}, regions that the formula does not name left out",
             )  # fmt: skip
-        return Record(_id(about, task), replace(about, spec=spec), task.horizon)
+        id = self._on_map(_id(about, task), about, task)
+        return Record(id, replace(about, spec=spec), task.horizon)
 
     def check_name(self, record: Record, owner: str, name: str) -> None:
         """Raises NameTaken, and InputError for a name that this policy cannot have."""
@@ -202,7 +204,7 @@ class Policies:
             ) from None
         record = self.described(about, task)
         card = {**card, "spec": record.about.spec}
-        id = sent_id(record.id, card, weights)
+        id = self._on_map(sent_id(_id(about, task), card, weights), about, task)
         card["id"] = id  # never the sender's
         load_policy(weights, card, task)
         record = replace(record, id=id, card=card)
@@ -221,15 +223,26 @@ class Policies:
         stored = asdict(replace(record, card=None))
         del stored["card"]
         content, folder = {"policy.json": files.to_json(stored), **trained}, self._folder / record.id
-        with self._claims.adding("policies", record.id, key, files.weight(content), self._own_map(record)):
+        size = max(files.weight(content), files.weight_of(folder))  # all of it, if it is trained already
+        with self._claims.adding("policies", record.id, key, size, self._own_map(record.about)):
             if not folder.is_dir():
                 files.write_folder(folder, content)
         return self.record(record.id)
 
-    def _own_map(self, record: Record) -> str:
+    def _own_map(self, about: Description) -> str:
         """The id of a policy's map; "" where that is everybody's."""
-        map_id = record.about.map_id
-        return "" if self._maps.shipped(map_id) is not None else map_id
+        return "" if self._maps.shipped(about.map_id) is not None else about.map_id
+
+    def _on_map(self, id: str, about: Description, task: Task) -> str:
+        """The id of a policy on this map. `id` is the same for every map of these cells, whatever its rooms:
+        it stays on everybody's map, on one without rooms, and on that for which an older version kept it.
+        """
+        kept = self.made_here(id)
+        if kept is None:
+            stays = self._own_map(about) in ("", task.grid.content_hash)
+        else:
+            stays = kept.about.map_id == about.map_id
+        return id if stays else hashlib.sha256(f"{id} {about.map_id}".encode()).hexdigest()
 
     def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
         """Keeps what a run made. The card comes last: it makes the policy ready. Raises NotFound."""
@@ -250,7 +263,7 @@ class Policies:
         with it. Raises Conflict where the marking is too long ago.
         """
         assert self._claims is not None
-        last = self._claims.free("policies", record.id, owner, token, self._own_map(record))
+        last = self._claims.free("policies", record.id, owner, token, self._own_map(record.about))
         if last:
             self._recent.drop(record.id)
             files.remove_folder(self._folder / record.id)
@@ -264,7 +277,8 @@ class Policies:
             [*self._named, *own], after, limit,
             lambda key: sum(files.size(self._folder / key / name) for name in ("policy.json", "card.json")),
         )  # fmt: skip
-        return [self.record(key) for key in keys], following
+        found = [self.made_here(key) for key in keys]  # None: deleted at this moment
+        return [record for record in found if record is not None], following
 
     def adopt(self) -> None:
         """Gives the policies that nobody has, of a time before owners, to the owner without a name."""
@@ -272,7 +286,7 @@ class Policies:
         for id in files.ids(self._folder):
             if self._claims.unowned("policies", id):
                 size, record = files.weight_of(self._folder / id), self.record(id)
-                with self._claims.adding("policies", id, OPEN, size, self._own_map(record)):
+                with self._claims.adding("policies", id, OPEN, size, self._own_map(record.about)):
                     pass
 
     def _shipped(self) -> Iterator[Record]:

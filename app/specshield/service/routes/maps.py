@@ -33,7 +33,7 @@ def _described() -> dict[str, Any]:
         if name != FILES:
             properties["format"], required = {"const": name}, [*required, "format"]
         properties["name"] = {
-            "type": "string",
+            "type": "string" if format.files else ["string", "null"],
             "description": "A name of your own, accepted wherever an id is.",
         }
         about = {"title": name, "description": format.about, "required": required}
@@ -97,7 +97,7 @@ async def read(map_id: MapId, server: ServerState, owner: Owner) -> Any:
     },
 )
 async def image(map_id: MapId, request: Request, server: ServerState, owner: Owner) -> Response:
-    """White is free, black occupied; up is the map's y."""
+    """White is free, black occupied; up is the grid's second axis: the map's y if its origin has no turn."""
     return Response(await server.heavy.run(request, "draw_map", map_id, owner), media_type="image/png")
 
 

@@ -67,8 +67,8 @@ PolicyId = Annotated[
 async def create(request: Request, server: ServerState, caller: Caller) -> Any:
     """The answer comes at once; making the policy takes seconds to minutes: read it to see how far it is.
 
-    Policies are immutable. One that is made here is known by the hash of task, method, options and seed: the
-    same request again answers the policy there is, and queues it once more if it failed. The hash of one
+    Policies are immutable. One that is made here is known by the hash of map, task, method, options and seed:
+    the same request again answers the policy there is, and queues it once more if it failed. The hash of one
     that is sent covers its weights and its card as well, so that its id is never that of a policy made here.
     """
     body = received(request)

@@ -63,7 +63,7 @@ class Card(BaseModel):
 
 
 class PolicyResponse(Answer):
-    id: str = Field(description="Hash of task, method, options and seed.")
+    id: str = Field(description="Hash of map, task, method, options and seed.")
     name: str | None = Field(description="Its name, if it has one; accepted wherever an id is.")
     status: Literal["queued", "training", "ready", "failed"] = Field(description="Sessions need `ready`.")
     progress: float = Field(description="0 to 1.")

@@ -8,6 +8,8 @@ from pydantic import ConfigDict, Field
 
 from specshield.service import examples
 from specshield.service.schemas.base import Answer, Id, Point, Strict
+from specshield.task import MAX_REGIONS
+from specshield.world.regions import MAX_MEMBERS, MAX_VERTICES
 
 
 class Circle(Strict):
@@ -29,7 +31,7 @@ class Polygon(Strict):
 
     type: Literal["polygon"]
     vertices: list[Point] = Field(
-        min_length=3, max_length=10_000, fail_fast=True, description="In order, [x, y] in metres."
+        min_length=3, max_length=MAX_VERTICES, fail_fast=True, description="In order, [x, y] in metres."
     )
 
 
@@ -41,7 +43,7 @@ class Union(Strict):
 
     type: Literal["union"]
     members: list[Shape] = Field(
-        min_length=1, max_length=256, fail_fast=True, description="Regions that are no unions."
+        min_length=1, max_length=MAX_MEMBERS, fail_fast=True, description="Regions that are no unions."
     )
 
 
@@ -49,7 +51,7 @@ Region = Annotated[Circle | Rectangle | Polygon | Union, Field(discriminator="ty
 Regions = Annotated[
     dict[str, Region],
     Field(
-        max_length=256,
+        max_length=MAX_REGIONS,
         fail_fast=True,
         description="Regions by name; in a formula a name is the signed distance [m], positive inside.",
     ),

@@ -27,6 +27,7 @@ from specshield.service.schemas.answers import Explanation, Residual, StepAnswer
 from specshield.shield.decision import Decision
 
 FORMAT = 2
+MOST_SIGNALS = 64  # columns of a session: MessagePack's integers have 64 bits
 COLUMNS = 5  # of an action's row in the table: J, rho, x, y, theta
 
 

@@ -105,13 +105,10 @@ def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]
 
 def check_step(session: Session, request: StepBody) -> None:
     """Raises what is wrong with asking for a step that was not decided before."""
-    state, t, last = session.state, request.t, session.config["max_steps"]
+    state, t = session.state, request.t
     if state.finished:
         raise over(session, t)
-    if t > last:
-        raise InputError(
-            f"step {t} is past the session's max_steps", path="t", got=t, expected=f"at most {last}"
-        )
+    check_last(t, session.config["max_steps"])
     if t < state.next_t:
         raise StepConflict(
             f"step {t} was passed over and can no longer be decided",
@@ -126,6 +123,14 @@ def check_step(session: Session, request: StepBody) -> None:
             path="main_task_done",
             got=False,
             expected="true",
+        )
+
+
+def check_last(t: int, last: int) -> None:
+    """last: the session's max_steps. Raises InputError for a step that comes after it."""
+    if t > last:
+        raise InputError(
+            f"step {t} is past the session's max_steps", path="t", got=t, expected=f"at most {last}"
         )
 
 

@@ -203,11 +203,14 @@ class Sessions:
         return await self._run(chain.pack, found.config, pack(rows), found.steps)
 
     async def last(self, id: str) -> tuple[dict[str, Any], Floats, bytes]:
-        """The session's config, its rows, and the record of the last one, empty where that has none."""
+        """The session's config, its rows, and the record of the last one, empty where that has none, or was
+        decided by another rule than the one in force.
+        """
         found = await self._dump(id)
         session = Session.of(found)
         t = len(session.rows) - 1
-        return dict(session.config), session.rows, found.steps[t] if t < len(found.steps) else b""
+        decided = rules.begins(session.config) <= t < len(found.steps)
+        return dict(session.config), session.rows, found.steps[t] if decided else b""
 
     async def _dump(self, id: str) -> Dump:
         found = await self._store.dump(id)

@@ -233,7 +233,8 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
     occupied, free = points_of(request.occupied), points_of(request.free)
     tables = None
     if carry is not None and changes_map(carry.learned):
-        shield, tables = shields.tables.of(session.id, shield, Taught.from_bytes(carry.learned).map)
+        known = Taught.from_bytes(carry.learned).map
+        shield, tables = shields.tables.of(session.config["nonce"], shield, known)
     since = session.since
     decision = episode.decide(
         shield,

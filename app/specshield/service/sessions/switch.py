@@ -32,6 +32,7 @@ from specshield.service.sessions.config import asked_by, settings_of
 from specshield.service.sessions.session import (
     RACES,
     Session,
+    check_last,
     columns,
     contended,
     describe,
@@ -178,10 +179,13 @@ def _wanted(
 
 
 def _foreseen(session: Session, step: bytes) -> Sequence[float]:
-    """Where the action leads that the last decision gives to run, as the SDK's `execute` has it."""
-    answer = record.answer(record.decode(step), session.rows[-1], session.config["actions"])
+    """Where the action leads that the last decision gives to run, as the SDK's `execute` has it. An earlier
+    switch at the same step may have brought another robot since that decision.
+    """
+    config = session.rules[rules.at(session.rules, len(session.rows) - 1)]
+    answer = record.answer(record.decode(step), session.rows[-1], config["actions"])
     action: int | None = answer.action
-    if action in session.config["terminal_actions"]:
+    if action in config["terminal_actions"]:
         action = answer.completion_action
     return session.rows[-1, :3].tolist() if action is None else answer.next_poses[action]
 
@@ -198,19 +202,26 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
             "the rule ends after the last step that a session can have", path="policy_id",
             got=f"step {last}", expected=f"at most step {most_steps}",
         )  # fmt: skip
+    most = max(old["max_steps"], last)
+    check_last(t, most)
+    signals = task.signals
+    names = [*session.signal_names, *rules.added(session.signal_names, signals)]
+    if len(names) > record.MOST_SIGNALS:
+        raise InputError(
+            "the session's rules have too many signals together", path="policy_id", got=len(names),
+            expected=f"at most {record.MOST_SIGNALS}; or a new session for this rule",
+        )  # fmt: skip
     before = record.link(session.state.head, session.rows[session.state.next_t : t])
     config = {
         **old,
         **asked_by(wanted.policy_ids, about, task),
-        "max_steps": max(old["max_steps"], last),
+        "max_steps": most,
         "from": t,
         "origin": origin,
         "clock": wanted.clock,
         "before": before.hex(),
         "way": "",
     }
-    signals = config["spec"]["signals"]
-    names = [*session.signal_names, *rules.added(session.signal_names, signals)]
     verdict, _ = shields.verdict(old, session.rows, session.signal_names)
     made = replace(
         session,

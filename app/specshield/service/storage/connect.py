@@ -37,6 +37,19 @@ JOBS = "{specshield}:rq"  # what rq's keys begin with in a cluster, so that one 
 PORTS = {"sentinel": 26379, "cluster": 6379}
 
 
+class _Cluster(redis.asyncio.cluster.RedisCluster):
+    """A cluster's client. When a node is gone, redis-py closes every connection to discover the nodes again,
+    also connections on which other tasks are about to write. Such a write fails with an AttributeError; here
+    it is a ConnectionError, as that of any store that cannot be reached.
+    """
+
+    async def execute_command(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return await super().execute_command(*args, **kwargs)
+        except AttributeError as error:
+            raise redis.ConnectionError("the connection was closed while it was in use") from error
+
+
 def connect(url: str, blocking: bool = False, **options: Any) -> Any:
     """A client for this URL, an asyncio one unless blocking. Only a blocking one of a cluster opens at once.
 
@@ -57,8 +70,8 @@ def connect(url: str, blocking: bool = False, **options: Any) -> Any:
     if kind == "cluster":
         if names:
             raise ValueError("a cluster has no databases and no services")
-        node = kit.cluster.ClusterNode
-        return kit.cluster.RedisCluster(startup_nodes=[node(*host) for host in hosts], **options)
+        node, of = kit.cluster.ClusterNode, kit.cluster.RedisCluster if blocking else _Cluster
+        return of(startup_nodes=[node(*host) for host in hosts], **options)
     if kind != "sentinel" or not 1 <= len(names) <= 2:
         raise ValueError("no such form")
     limits = {name: value for name, value in options.items() if name.startswith(("socket_", "ssl"))}
