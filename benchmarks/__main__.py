@@ -36,12 +36,12 @@ def main() -> None:
     args = parser.parse_args()
     folder = args.out / "benchmarks"
     folder.mkdir(parents=True, exist_ok=True)
-    command = f"make bench{' ARGS=--full' if args.full else ''} (seed {args.seed})"
+    command = f"make bench ARGS='{'--full ' if args.full else ''}--seed {args.seed}'"
 
     if args.sb3:  # a run of its own: the figures of the last one are kept
         say("race of the DQNs")
         race = synthesis.race("case1", args.rate, args.minutes, args.seed)
-        race |= {"machine": timing.machine(), "command": f"make bench ARGS=--sb3 (seed {args.seed})"}
+        race |= {"machine": timing.machine(), "command": f"make bench ARGS='--sb3 --seed {args.seed}'"}
         write(folder / "race.json", race)
     figures = measure(FULL if args.full else QUICK, args.seed) | {"command": command}
     write(folder / "figures.json", figures)

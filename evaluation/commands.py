@@ -16,8 +16,9 @@ def evaluate(
     methods: Annotated[
         str,
         typer.Option(
-            help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps; NAME@default: as a "
-            "session is by default; NAME@episode/D, NAME@default/D: threshold D over the episode; "
+            help="Some of them, as paper,ours; NAME@M/K: margin M metres, slack K steps; NAME@conformal/K: a "
+            "margin that 60 other runs measure; NAME@default: as a session is by default; "
+            "NAME@episode/D, NAME@default/D: threshold D over the episode; "
             "NAME@step/D: at each step; NAME@robustness/D: of D metres, with J = rho."
         ),
     ] = "",

@@ -66,7 +66,7 @@ def write(folder: Path) -> dict[str, Any]:
 def table(figures: dict[str, Any]) -> str:
     """One row a method. Shares with their 95 % Clopper-Pearson intervals."""
     heads = (
-        "method", "rule satisfied", "main task done", "KL a run [nats]", "extra steps, mean (median)",
+        "method", "rule satisfied", "main task done", "KL a run [nats]", "extra steps, mean and median",
         "fallback decisions", "feasible mass", "decision p50 / p99 [ms]",
     )  # fmt: skip
     rows = [
@@ -74,7 +74,7 @@ def table(figures: dict[str, Any]) -> str:
             one["method"],
             share(one["satisfied"]),
             share(one["main_done"]),
-            _number(one["kl"], ".1f"),
+            "{:.1f} ({:.1f} to {:.1f})".format(one["kl"], *one["kl_interval"]),
             _extra(one["extra_steps"]),
             f"{one['modes'].get('fallback', 0)} of {sum(one['modes'].values())}",
             _number(one["feasible_mass"], ".2f"),
@@ -97,7 +97,10 @@ def share(of: dict[str, Any]) -> str:
 
 
 def _extra(steps: dict[str, Any]) -> str:
-    return "-" if steps["mean"] is None else f"{steps['mean']:+.1f} ({steps['median']:+.0f})"
+    if steps["mean"] is None:
+        return "-"
+    mean = "{mean:+.1f} ({low:+.1f} to {high:+.1f})".format(**steps)
+    return f"{mean}, {steps['median']:+.0f}, n {steps['both']}"
 
 
 def _number(value: float | None, form: str) -> str:

@@ -9,13 +9,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from evaluation.experiment import Experiment
 from evaluation.methods import Shielded
 from evaluation.results import markdown
 from evaluation.runs import Record, run_by
-from evaluation.statistics import clopper_pearson
+from evaluation.statistics import clopper_pearson, mean_of
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.policy import Policy, load_dqn
 from specshield.policy.reachability.policy import synthesise
@@ -169,7 +167,7 @@ def _row(one: Found) -> tuple[str, ...]:
         f"{one.metrics['wall_time_s'] / 60:.1f} min",
         _percent(sum(kept), len(kept)),
         _percent(sum(done), len(done)),
-        f"{np.mean([run.kl for run in one.runs]):.0f}",
+        "{mean:.0f} ({low:.0f} to {high:.0f})".format(**mean_of([run.kl for run in one.runs])),
     )
 
 

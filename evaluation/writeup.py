@@ -17,7 +17,7 @@ from evaluation.pages.houses import bodies, houses
 from evaluation.pages.noise import noise
 from evaluation.pages.summary import linked, summary
 from evaluation.pages.tables import Results, commands
-from evaluation.pages.words import INTRODUCTION, MAIN_MODELS, TASKS, legend
+from evaluation.pages.words import INTRODUCTION, MAIN_MODELS, TASKS, TIMES, legend
 from evaluation.results import write
 from specshield.errors import NotFound
 from specshield.sim.cases import Case
@@ -74,7 +74,7 @@ def write_up(folder: Path, page: Path) -> None:
                 beside / f"{name}.md",
                 [
                     f"# {TITLES[name]}",
-                    INTRODUCTION,
+                    INTRODUCTION if name != "cases" else f"{INTRODUCTION} {TIMES}",
                     legend(_methods(parts[name].values())),
                     *text,
                     "## How it was run",

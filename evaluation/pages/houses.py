@@ -48,7 +48,7 @@ def houses(found: Found) -> Iterator[str]:
 def _refused(results: Results) -> str:
     """Of all starts that were drawn, each run's own included."""
     refused, of = results["refused_starts"], results["refused_starts"] + results["runs"]
-    low, high = clopper_pearson(refused, of)
+    low, high = (round(bound, 4) for bound in clopper_pearson(refused, of))  # as statistics.py has it
     return share({"count": refused, "of": of, "low": low, "high": high})
 
 
@@ -58,7 +58,8 @@ def bodies(found: Found) -> Iterator[str]:
         f"A region holds where the robot's origin is in it, as in the paper: `G not {KEPT_OUT}` keeps the "
         f"origin out, and the body may reach in. `G not touches({KEPT_OUT})` keeps all of the body out. The "
         "depth is measured from the recorded poses, by the distance of the footprint's centre from the "
-        "region, at the steps of the rule; `python -m benchmarks.bodies` counts points of the body instead."
+        "region, at the steps of the rule; `python -m benchmarks.bodies` counts points of the body instead. "
+        "Shown are the methods that were run with both rules."
     )
     heads = (
         "rule says", "starts refused", "method", "rule kept", "main task done", "KL a run [nats]",

@@ -13,7 +13,8 @@ from evaluation.results import markdown, share
 
 
 def noise(found: Found) -> Iterator[str]:
-    yield "\n".join(f"- **{name}**: {NOISES[name]}." for name in DISTURBANCES[1:])
+    there = {results["experiment"]["noise"] for results in found.values()}
+    yield "\n".join(f"- **{name}**: {NOISES[name]}." for name in DISTURBANCES if name in there)
     yield WHY_SLACK
     yield from better(found)
     for name in dict.fromkeys(map(title, found.values())):
@@ -29,9 +30,10 @@ def noise(found: Found) -> Iterator[str]:
     lines = list(_calibrations(found))
     if lines:
         yield (
-            "The margins of `conformal` come from calibration campaigns with another seed (split conformal "
-            "prediction, alpha 0.05, a run's largest surprise as its score). One campaign, of `ours`, gives "
-            "all methods of a world the same margin. How often it covered the surprises:"
+            "The margins with three digits are measured: `--methods NAME@conformal/8` first runs a "
+            "calibration campaign of `ours` with another seed, and takes its margin for NAME, rounded up to "
+            "millimetres (split conformal prediction, alpha 0.05, a run's largest surprise as its score). "
+            "One campaign gives all methods of a world the same margin. How often it covered the surprises:"
         )
         yield "\n".join(lines)
 

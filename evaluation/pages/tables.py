@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ Found = Mapping[Path, Results]  # the folder that each experiment's results lie 
 
 HEADS = ("case, model", "method", "rule kept", "main task done", "KL a run [nats]", "extra steps")
 OUTCOMES = {"satisfied": "rule", "main_done": "main task"}
-ENOUGH = 8  # pairs, for a bootstrap's interval to be told as a difference; chosen by hand
+ENOUGH = 8  # runs or pairs, for a bootstrap's interval to be told; chosen by hand
 UNLIKELY = 0.05  # a p below it counts as a difference
 COSTS = {"kl": "KL a run", "extra_steps": "extra steps"}
 
@@ -50,6 +51,8 @@ def steps(later: Mapping[str, Any]) -> str:
     """The mean of the runs in which both did the main task, of which it says how many there are."""
     if later["mean"] is None:
         return "no run"
+    if later["both"] < ENOUGH:
+        return f"{later['mean']:+.1f}, n {later['both']}"
     return f"{later['mean']:+.1f} ({later['low']:+.1f} to {later['high']:+.1f}), n {later['both']}"
 
 
@@ -94,10 +97,13 @@ def better_in_short(found: Found) -> Iterator[str]:
         "Of all methods, in the cases and models of the first table, those that keep the rule as often and "
         "whose 95 % interval of the difference in KL or steps lies below 0, or that do more main tasks "
         "(p < 0.05). Of so many comparisons, a few are so by chance. The figures are on the page of the "
-        "cases; noise, other models and other tasks are on theirs."
+        "cases; noise, other models and other tasks are on theirs. **switching**: the model until a draw is "
+        "not feasible, then the plan to the next visit. **visits-first**: the plan until every F is met, "
+        "then ours. **adaptive@0/25**: ours with up to 25 steps of slack, by how much probability the model "
+        "lately gave to infeasible actions."
     )
-    lines = [f"- **{method}**: {name} ({'; '.join(there)})." for (method, name), there in where.items()]
-    yield "\n".join(lines) or "- None was found."
+    found_better = [f"**{method}**: {name} ({'; '.join(there)})" for (method, name), there in where.items()]
+    yield f"{'. '.join(found_better) or 'None was found'}."
 
 
 def _better(results: Results) -> Iterator[tuple[str, dict[str, str]]]:
@@ -135,12 +141,16 @@ def compared(cost: Mapping[str, Any]) -> str:
     said = f"{cost['mine']:.1f} and {cost['other']:.1f}, difference {difference(cost)}"
     if cost["share"] is None:
         return f"{said}, no ratio to a cost of {cost['other']:.1f}"
+    if cost["pairs"] < ENOUGH:
+        return f"{said}, ratio {cost['share']:.2f}"
     within = "not bounded" if cost["low"] is None else f"{cost['low']:.2f} to {cost['high']:.2f}"
     return f"{said}, ratio {cost['share']:.2f} ({within})"
 
 
 def difference(cost: Mapping[str, Any]) -> str:
     low, high = cost["difference_low"], cost["difference_high"]
+    if cost["pairs"] < ENOUGH:
+        return f"{cost['difference']:+.1f}, n {cost['pairs']}"
     return f"{cost['difference']:+.1f} ({low:+.1f} to {high:+.1f}), n {cost['pairs']}"
 
 
@@ -164,9 +174,20 @@ def commands(folder: Path, found: Found) -> str:
             case = f"house --house {case}{of}"
         out = top / kept.parent.parent.relative_to(folder)
         for runs in dict.fromkeys(one["runs"] for one in results["methods"]):
-            methods = ",".join(one["method"] for one in results["methods"] if one["runs"] == runs)
+            shown = (one["method"] for one in results["methods"] if one["runs"] == runs)
+            methods = ",".join(_as_asked(kept, method) for method in shown)
             lines.append(
                 f"specshield evaluate --case {case} --runs {runs} --seed {asked['seed']} "
                 f"--model {asked['model']} --noise {asked['noise']} --methods {methods} --out {out}"
             )
     return "```sh\n" + "\n".join(lines) + "\n```"
+
+
+def _as_asked(kept: Path, method: str) -> str:
+    """The method as it was asked for: NAME@conformal/K where a calibration in `kept` made its margin."""
+    path = kept / "calibration.json"
+    for name, made in (json.loads(path.read_text()) if path.exists() else {}).items():
+        margin = f"@{made['rounded']:g}{made['asked']}"
+        if method.endswith(margin):
+            return f"{method.removesuffix(margin)}@{name}"
+    return method

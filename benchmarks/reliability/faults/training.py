@@ -27,7 +27,7 @@ def run_killed(scene: Scene) -> dict[str, Any]:
 
 
 def worker_killed(scene: Scene) -> dict[str, Any]:
-    """SIGKILL of the worker: the policy is `failed`, says why, and trains again at another."""
+    """SIGKILL of the worker that trains: the policy is `failed`, says why, and trains again at another."""
     return _killed(scene, _worker)
 
 
@@ -105,15 +105,9 @@ def _run(service: Service) -> int:
 
 
 def _worker(service: Service) -> int:
-    """The worker, which began the learner."""
-    _run(service)
-    (learner,) = (pid for pid in _learners(service) if "--learner" not in plant.command_of(plant.parent(pid)))
-    return plant.parent(learner)
+    """The worker that has the run: the one that the server's own worker began for what takes long."""
+    return plant.parent(_run(service))
 
 
 def _learners(service: Service) -> list[int]:
     return [pid for pid in plant.children(service.pid) if "--learner" in plant.command_of(pid)]
-
-
-def _is_fork(pid: int) -> bool:
-    return "--learner" in plant.command_of(plant.parent(pid))
