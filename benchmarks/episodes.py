@@ -117,9 +117,15 @@ def measure(case_name: str, method: str, checkouts: Sequence[Path], count: int, 
 
 
 def show(name: str, found: dict[str, Any]) -> None:
-    """One line a checkout, for all states and for those near a deadline, then the ratio of the first two."""
-    near = np.array(found["near"])
-    for part, chosen in (("all", np.ones(len(near), bool)), ("near a deadline", near)):
+    """One line a checkout, for all states, the first ones, and those near a deadline, then the ratio of the
+    first two.
+    """
+    near, first = np.array(found["near"]), np.array(found["first"])
+    for part, chosen in (
+        ("all", np.ones(len(near), bool)),
+        ("first steps", first),
+        ("near a deadline", near),
+    ):
         rows = [summary(np.array(each)[chosen]) for each in found["seconds"] if chosen.any()]
         for n, row in enumerate(rows):
             figures = "  ".join(f"{key} {row[key]:.3f}" for key in SHOWN)
@@ -127,7 +133,7 @@ def show(name: str, found: dict[str, Any]) -> None:
             print(f"{name}, {part} ({chosen.sum()} of {len(near)}), {whose}: {figures} ms")
         if len(rows) == 2:
             ratios = "  ".join(f"{key} {rows[0][key] / rows[1][key]:.3f}" for key in SHOWN)
-            total = sum(found["seconds"][0]) / sum(found["seconds"][1])
+            total = sum(np.array(found["seconds"][0])[chosen]) / sum(np.array(found["seconds"][1])[chosen])
             unlike = f"{found['differ']} decided unlike"
             print(f"{name}, {part}, this / other: {ratios}  mean {total:.3f}; {unlike}")
     sys.stdout.flush()

@@ -75,6 +75,11 @@ class Robot:
         """The lowest action index of each motion. Shape (M,)."""
         return np.array([int(np.argmax(self.motion_of == i)) for i in range(len(self.motions))])
 
+    @cached_property
+    def action_table(self) -> bytes:
+        """`representative` as `bytes.translate` takes it, for motions of one byte each."""
+        return bytes(self.representative.tolist()).ljust(256, b"\0")
+
 
 def _stretch() -> Robot:
     turn, nudge = math.radians(30), math.radians(6)

@@ -100,7 +100,7 @@ def read_step(
             continue
         known = t > view.first[r] and (still or (placed and not turns_with_robot(view.regions, r)))
         if not known:
-            fill_region(view.regions, r, x, y, theta, values)
+            fill_region(view.regions, r, values)
     least = np.inf
     for n in range(tree.leaf_at.shape[0]):
         if tree.leaf_start[n] <= t < tree.leaf_stop[n]:

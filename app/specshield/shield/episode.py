@@ -134,7 +134,7 @@ def decide(
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
-    care = replace(wary(shield.config, care), barred=taught.barred)
+    care = wary(shield.config, care, taught)
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
@@ -220,7 +220,7 @@ def decide(
 
 @dataclass(frozen=True)
 class _Answer:
-    """conditional [A]: the model's log-probabilities given that it does not end."""
+    """conditional [A]: the model's log-probabilities given that it does not end, None where it does."""
 
     distribution: Floats
     mode: Mode
@@ -243,12 +243,12 @@ def _answer(
     certified = np.zeros(len(terminal))
     certified[judged.completion] = 1.0
     conditional, ending = (None, 0.0) if log_prior is None else shaping.going_on(log_prior, terminal)
-    if main_task_done or log_prior is None or conditional is None:
+    if main_task_done or log_prior is None:
         mode: Mode = "completion" if any_feasible else "fallback"
         return _Answer(certified, mode, said if any_feasible else "infeasible", conditional)
     prior = np.exp(log_prior)
     mode = "shaped" if any_feasible else "fallback"
-    if conditional.max() == -np.inf:  # the model ends for certain
+    if conditional is None:  # the model ends for certain
         return _Answer(prior, mode, None if any_feasible else "infeasible")
     config, attainable = shield.config, any_feasible
     if config.evaluation == "robustness":
@@ -345,5 +345,6 @@ def _draw(distribution: Floats, seed: int, t: int) -> int:
     drawn = blake2b(b"%d %d" % (seed, t), digest_size=8).digest()
     shares = distribution.tolist()
     edges = list(accumulate(shares))
+    last = next(a for a in range(len(shares) - 1, -1, -1) if shares[a] != 0.0)
     point = int.from_bytes(drawn, "big") / 2.0**64 * edges[-1]
-    return min(bisect_right(edges, point), max(a for a, share in enumerate(shares) if share != 0.0))
+    return min(bisect_right(edges, point), last)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Judged:
     slack: int  # [steps]: how much of what was asked for can be had
     margin_unattainable: bool  # it is less
 
-    @property
+    @cached_property
     def some(self) -> bool:
         """Whether some action is feasible."""
         return True in self.feasible.tolist()
@@ -207,11 +208,7 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
     motion = int(shield.task.robot.motion_of[action])
     found = certified[motion] if motion >= 0 else None
-    return (
-        None
-        if found is None
-        else tuple(shield.task.robot.representative[np.frombuffer(found, np.uint8)].tolist())
-    )
+    return None if found is None else tuple(found.translate(shield.task.robot.action_table))
 
 
 def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:
@@ -221,8 +218,7 @@ def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ..
         return (None,) * len(robot.actions)
     if shield.config.evaluation == "feasibility":
         highest = 1.0 if judged.some else 0.0
-        pairs = zip(robot.terminal.tolist(), judged.feasible.tolist(), strict=True)
-        return tuple([highest if terminal else float(feasible) for terminal, feasible in pairs])
+        return tuple(np.where(robot.terminal, highest, judged.feasible).tolist())
     return _as_numbers(np.where(robot.terminal, judged.values.max(), judged.values))
 
 
@@ -238,7 +234,7 @@ def _as_numbers(values: Floats) -> tuple[float | None, ...]:
 
 
 def feasible_mass_of(conditional: Floats | None, judged: Judged | None) -> float | None:
-    """conditional [A]: log-probabilities given that the model does not end."""
-    if conditional is None or judged is None or conditional.max() == -np.inf:
+    """conditional [A]: as `_Answer` has it."""
+    if conditional is None or judged is None:
         return None
     return shaping.feasible_mass(conditional, judged.feasible)

@@ -72,10 +72,10 @@ def _wrong(logits: Floats) -> int:
 
 
 @kernel
-def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats, float]:
+def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats | None, float]:
     """(log-probabilities given that the model does not end, its probability of ending). Shapes (A,).
 
-    All -inf where it ends for certain.
+    None where it ends for certain.
     """
     ending, kept = 0.0, log_prior.copy()
     for a in range(len(kept)):
@@ -83,7 +83,7 @@ def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats, float]:
             ending = min(ending + np.exp(kept[a]), 1.0)  # a sum may be rounded up
             kept[a] = -np.inf
     if np.max(kept) == -np.inf:
-        return kept, ending
+        return None, ending
     return log_softmax(kept), ending
 
 

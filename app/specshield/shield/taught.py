@@ -156,11 +156,12 @@ def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tupl
     return half, overlap(body, after[0], after[1], after[2]) > UNDER
 
 
-def wary(config: Config, care: Care) -> Care:
-    """What J asks for where the map may be wrong: time for a way around something that is not on it."""
-    if config.uncertainty is None or not config.learn_map:
+def wary(config: Config, care: Care, taught: Taught) -> Care:
+    """What J asks for where the map may be wrong: time for a way around, and not by what led nowhere."""
+    if not config.learn_map:
         return care
-    return replace(care, least=max(care.least, AROUND))
+    least = care.least if config.uncertainty is None else max(care.least, AROUND)
+    return replace(care, least=least, barred=taught.barred)
 
 
 def changes_map(learned: bytes | None) -> bool:
@@ -203,7 +204,8 @@ def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
         for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
             successors(body_on(told, believed), pose, end)
         doubts |= np.any(ends[0] != ends[1], axis=1)
-    doubts[list(taught.barred)] = True
+    if taught.barred:
+        doubts[list(taught.barred)] = True
     return doubts
 
 

@@ -181,18 +181,12 @@ def turns_with_robot(regions: PackedRegions, i: int) -> bool:
 @inlined
 def region_distance(regions: PackedRegions, i: int, x: float, y: float, theta: float) -> float:
     """What a formula reads of packed region i at a pose of the robot (`Area`), in metres."""
-    if regions.plain[i]:  # most are, and this is where a decision spends its time
-        return _point_distance(regions, i, x, y)
-    return _carried_distance(regions, i, x, y, theta)
-
-
-@leaf
-def _carried_distance(regions: PackedRegions, i: int, x: float, y: float, theta: float) -> float:
-    """`region_distance` of a region that is not plain."""
-    ahead, left, grown = regions.carried[i, 0], regions.carried[i, 1], regions.carried[i, 2]
-    if ahead != 0.0 or left != 0.0:
-        cos, sin = math.cos(theta), math.sin(theta)
-        x, y = x + ahead * cos - left * sin, y + ahead * sin + left * cos
+    grown = 0.0
+    if not regions.plain[i]:  # most are, and this is where a decision spends its time
+        ahead, left, grown = regions.carried[i, 0], regions.carried[i, 1], regions.carried[i, 2]
+        if ahead != 0.0 or left != 0.0:
+            cos, sin = math.cos(theta), math.sin(theta)
+            x, y = x + ahead * cos - left * sin, y + ahead * sin + left * cos
     return float(_point_distance(regions, i, x, y) + grown)
 
 

@@ -194,7 +194,7 @@ def _safety_at(scene: Scene, t: int, x: float, y: float, theta: float, state: St
     rules = scene.rules
     fill_pose(x, y, theta, state.values)
     for r in scene.guards:
-        fill_region(rules.regions, r, x, y, theta, state.values)
+        fill_region(rules.regions, r, state.values)
     for k in range(rules.kind.shape[0]):
         if rules.kind[k] == ALWAYS:
             state.after[k] = evaluate_packed(k, rules.programs, state.values, state.stack)

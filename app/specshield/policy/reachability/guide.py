@@ -72,7 +72,7 @@ def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, scratch
         if programs.ops[i] == VALUE:
             place = int(programs.args[i])
             if REGIONS <= place < first_signal:
-                fill_region(rules.regions, place - REGIONS, x, y, theta, values)
+                fill_region(rules.regions, place - REGIONS, values)
             elif place >= first_signal:
                 values[place] = rules.signals[place - first_signal]
     return float(evaluate_packed(k, programs, values, scratch.stack))
