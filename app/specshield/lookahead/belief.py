@@ -18,6 +18,7 @@ from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel
 from specshield.lookahead.goals import Goals, cell_of
 from specshield.lookahead.surrogate import FEATURES, WANDER, bearing_of, features_of, follow
+from specshield.portable import exp, inner, log, solve
 from specshield.robot.dynamics import Body, displacements
 
 # Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
@@ -59,14 +60,14 @@ class Belief:
     @property
     def style(self) -> Floats:
         """The logit of each feature, shape (F,): one number for progress, turning and being blocked."""
-        fitted = np.linalg.solve(self.normal, self.moment)
+        fitted = solve(self.normal, self.moment)
         sharp = min(max(float(fitted[:2].mean()), FLATTEST), STEEPEST)
         return np.array([sharp, sharp, -sharp, fitted[3]])
 
     def probabilities(self) -> Floats:
         """That the model goes to each goal, 0 for those hardly possible, and that it wanders, (G + 1,)."""
         goals, wander = self.cost[:-1], self.cost[-1]
-        odds = np.exp(SHARP * (goals.min() - goals))
+        odds = exp(SHARP * (goals.min() - goals))
         odds[odds < POSSIBLE] = 0.0
         going = 0.5 * (1.0 + math.tanh(0.5 * float(wander - goals.min())))
         return np.append(going * odds / odds.sum(), 1.0 - going)
@@ -108,26 +109,27 @@ def update(
     the model does not end; end: the probability that it does. forced: the KL of projection's answer [nats].
     """
     said = np.maximum(said, LEAST_SAID) / np.maximum(said, LEAST_SAID).sum()
-    log_said = np.log(said)
+    log_said = log(said)
     charges = np.empty(len(belief.cost))
     x, y, theta = (float(v) for v in pose)
     _charge(body, goals, belief.style, x, y, theta, blocked, said, log_said, end, charges)
-    usual = float(said @ (log_said - np.log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
+    usual = float(inner(said, log_said - log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
     sided = _sided(body, said)  # one that wanders turns to either side: to which is no error of the stand-in
-    excess = TRACK * belief.excess + float(belief.probabilities() @ charges) - usual
+    excess = TRACK * belief.excess + float(inner(belief.probabilities(), charges)) - usual
     excess -= float(belief.probabilities()[-1]) * sided
     cost = np.round(KEEP * belief.cost + charges, 6)  # short as JSON
     row, column = cell_of(body, goals, x, y)
     bearing = bearing_of(body, goals, int(np.argmin(cost[:-1])), row, column, theta)
     features = np.array([features_of(body, bearing, m, blocked[m]) for m in range(len(said))])
     weight = 0.5 * said + 0.5 / len(said)
-    features -= weight @ features
+    features -= inner(features.T, weight)
     wanted = np.maximum(log_said, log_said.max() - 10.0)
-    wanted -= weight @ wanted
+    wanted -= inner(weight, wanted)
+    weighed = features.T * weight
     return Belief(
         cost,
-        KEEP * belief.normal + (1.0 - KEEP) * SURE * np.eye(FEATURES) + (features.T * weight) @ features,
-        KEEP * belief.moment + (1.0 - KEEP) * SURE * STYLE + (features.T * weight) @ wanted,
+        KEEP * belief.normal + (1.0 - KEEP) * SURE * np.eye(FEATURES) + inner(weighed[:, None], features.T),
+        KEEP * belief.moment + (1.0 - KEEP) * SURE * STYLE + inner(weighed, wanted),
         (1.0 - HABITS) * belief.habit + HABITS * said,
         excess,
         belief.forced + forced,
@@ -138,8 +140,8 @@ def _sided(body: Body, said: Floats) -> float:
     """The KL of what was said from the same with left and right made alike [nats]."""
     moves, turns = displacements(body)
     mirrored = (moves[:, None] == moves) & (np.abs(turns[:, None] + turns) < 1e-9)
-    even = np.where(mirrored.any(axis=0), 0.5 * (said + mirrored @ said), said)
-    return float(said @ np.log(said / even))
+    even = np.where(mirrored.any(axis=0), 0.5 * (said + inner(mirrored, said)), said)
+    return float(inner(said, log(said / even)))
 
 
 @kernel

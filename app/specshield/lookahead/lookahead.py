@@ -32,6 +32,7 @@ from specshield.lookahead.lattice import Planes, blocked_at, make_planes
 from specshield.lookahead.preferences import PreferenceKind
 from specshield.lookahead.surrogate import WANDER, stand_in_for
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
+from specshield.portable import exp, inner
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
 from specshield.shield.proposal import Proposer
@@ -98,7 +99,7 @@ class LookAhead:
     ) -> tuple[Belief, Floats]:
         """What is believed after the model's log_prior [A] at x_t with S_t [A], and the log-weights [A]."""
         robot, pose = self.task.robot, history[-1]
-        prior = np.exp(log_prior)
+        prior = exp(log_prior)
         going_on = prior[~robot.terminal]
         if going_on.sum() <= 0.0:  # the model ends for certain: it says nothing of where it would go
             return belief, np.zeros(len(prior))
@@ -120,7 +121,7 @@ class LookAhead:
         status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
         replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
         mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
-        weights = belief.probabilities() @ self.shares
+        weights = inner(self.shares.T, belief.probabilities())
         asked = np.argsort(-weights, kind="stable")[:LEADERS]
         asked = asked[weights[asked] >= NEGLIGIBLE]
         costs = np.empty((len(asked), len(self.task.robot.motions)))
@@ -133,7 +134,7 @@ class LookAhead:
             return np.zeros(costs.shape[1])
         # A model twice as sharp costs twice as much to bend, and that is most of D.
         sharp = np.where(self.leads[asked] == WANDER, 1.0, belief.style[0] / STYLE[0])
-        total = (weights[asked] / weights[asked].sum() * sharp) @ np.where(known, costs, 0.0)
+        total = inner(np.where(known, costs, 0.0).T, weights[asked] / weights[asked].sum() * sharp)
         result: Floats = np.where(known, total - total[known].min(), np.ptp(total[known]) + WORST)
         return result
 
@@ -186,6 +187,6 @@ def _leads(goals: Goals, most: int) -> tuple[Ints, Floats]:
                 chosen.append(g)
         if len(chosen) <= most:
             further = between[chosen] - between[chosen].min(axis=0)
-            near = np.exp(-further.T / REACH)
+            near = exp(-further.T / REACH)
             return np.array(chosen), near / near.sum(axis=1, keepdims=True)
         gap *= 1.1

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, PoseError
+from specshield.portable import exp
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
 from specshield.robot.oddity import oddities
 from specshield.shield import shaping
@@ -246,7 +247,7 @@ def _answer(
     if main_task_done or log_prior is None:
         mode: Mode = "completion" if any_feasible else "fallback"
         return _Answer(certified, mode, said if any_feasible else "infeasible", conditional)
-    prior = np.exp(log_prior)
+    prior = exp(log_prior)
     mode = "shaped" if any_feasible else "fallback"
     if conditional is None:  # the model ends for certain
         return _Answer(prior, mode, None if any_feasible else "infeasible")
@@ -272,7 +273,7 @@ def _answer(
 def _unmodified(shield: Shield, log_prior: Floats | None) -> _Answer:
     """The prior; without logits there is nothing left to do: `end`, or else the first action."""
     if log_prior is not None:
-        return _Answer(np.exp(log_prior), "prior", None)
+        return _Answer(exp(log_prior), "prior", None)
     idle = np.zeros(len(shield.task.robot.actions))
     idle[int(np.argmax(shield.task.robot.terminal))] = 1.0
     return _Answer(idle, "prior", None)
@@ -345,6 +346,5 @@ def _draw(distribution: Floats, seed: int, t: int) -> int:
     drawn = blake2b(b"%d %d" % (seed, t), digest_size=8).digest()
     shares = distribution.tolist()
     edges = list(accumulate(shares))
-    last = next(a for a in range(len(shares) - 1, -1, -1) if shares[a] != 0.0)
     point = int.from_bytes(drawn, "big") / 2.0**64 * edges[-1]
-    return min(bisect_right(edges, point), last)
+    return min(bisect_right(edges, point), max(a for a, share in enumerate(shares) if share != 0.0))

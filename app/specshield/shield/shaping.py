@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel, leaf
 from specshield.errors import LogitsError
+from specshield.portable import exp, inner
 from specshield.robot import Robot
 
 
@@ -108,7 +109,7 @@ def soften(log_prior: Floats, feasible: Bools, threshold: float) -> Floats | Non
     Unchanged where the prior has that much already; None where it has no mass on S_t.
     """
     if feasible_mass(log_prior, feasible) >= threshold:
-        return np.exp(log_prior)
+        return exp(log_prior)
     on = restrict(log_prior, feasible)
     off = restrict(log_prior, ~feasible)
     if on is None:
@@ -137,13 +138,13 @@ def tilt(log_prior: Floats, values: Floats, threshold: float) -> Floats | None:
     gains = np.where(support, values - highest, 0.0)  # <= 0: the tilt never overflows
 
     def tilted(multiplier: float) -> Floats:
-        return np.exp(log_softmax(log_prior + multiplier * gains))
+        return exp(log_softmax(log_prior + multiplier * gains))
 
     def short(multiplier: float) -> float:
-        return float(np.dot(tilted(multiplier), gains)) - (threshold - highest)
+        return float(inner(tilted(multiplier), gains)) - (threshold - highest)
 
     if short(0.0) >= 0.0:
-        return np.exp(log_prior)
+        return exp(log_prior)
     low, high = 0.0, 1.0
     while short(high) < 0.0:  # the mean rises to `highest` > threshold, so this ends
         low, high = high, 2.0 * high

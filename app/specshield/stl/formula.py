@@ -184,23 +184,25 @@ class Not(Formula):
 
 
 @dataclass(frozen=True)
-class And(Formula):
+class Joined(Formula):
+    """Base of `and` and `or`, which join at least two formulas."""
+
     children: tuple[Formula, ...]
 
     def __post_init__(self) -> None:
-        _check_children(self)
+        object.__setattr__(self, "children", tuple(self.children))
+        if (count := len(self.children)) < 2:
+            raise FormulaError("'and' and 'or' join at least two formulas", got=count, expected="at least 2")
 
+
+@dataclass(frozen=True)
+class And(Joined):
     def __str__(self) -> str:
         return " and ".join(child._at(AND + 1) for child in self.children)
 
 
 @dataclass(frozen=True)
-class Or(Formula):
-    children: tuple[Formula, ...]
-
-    def __post_init__(self) -> None:
-        _check_children(self)
-
+class Or(Joined):
     def __str__(self) -> str:
         return " or ".join(child._at(OR + 1) for child in self.children)
 
@@ -282,11 +284,3 @@ def _check_name(name: str) -> None:
         expected = "letters, digits and _, not starting with a digit, and not a keyword"
         problem = f"{name!r} cannot be a name in a formula; expected {expected}"
         raise FormulaError(problem, got=name, expected=expected)
-
-
-def _check_children(node: And | Or) -> None:
-    object.__setattr__(node, "children", tuple(node.children))
-    if len(node.children) < 2:
-        raise FormulaError(
-            "'and' and 'or' join at least two formulas", got=len(node.children), expected="at least 2"
-        )

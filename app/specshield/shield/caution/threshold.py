@@ -21,6 +21,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
+from specshield.portable import inner
 from specshield.rule.early import ALWAYS, EVENTUALLY, Conjuncts, conjunction_of, find_open
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Shield
@@ -132,7 +133,7 @@ def shaped(conditional: Floats, values: Floats, left: float) -> Floats | None:
 def next_left(left: float, values: Floats, distribution: Floats, terminal: Bools) -> float:
     """d_{t+1} / V*_{t+1}. values, distribution [A]; after a terminal action the best one is executed."""
     best = float(values.max())
-    expected = float(distribution @ np.where(terminal, best, values))
+    expected = float(inner(distribution, np.where(terminal, best, values)))
     if best <= 0.0 or expected <= 0.0:
         return left
     return min(left * best / expected, 1.0)
