@@ -256,6 +256,10 @@ def main() -> None:
     asked = parser.parse_args()
     counts, number = Counter[str](), 0
     print(f"# {asked.n} forbidden actions and refusals, seed {asked.seed}")
+    print(
+        "\nThe search takes poses that are nearly the same for one. Where it finds a way, there is one; where it"
+    )
+    print("finds none, or names the steps that a window would have to end later, there may be a better one.")
     while counts["forbidden"] + counts["refused"] < asked.n:
         if (counts["forbidden"] + counts["refused"]) % 4 == 3:
             refused(drawn(number, asked.seed, (-8, -1)), counts)

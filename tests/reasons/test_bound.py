@@ -43,9 +43,9 @@ def circle(x, radius=0.3):
 @pytest.mark.parametrize(
     ("formula", "wall", "said"),
     [
-        ("F[0,15] Far", False, "F[0,15] Far is out of reach: at least 18 steps away, and due in 15"),
-        ("F[0,2] Soon", False, "F[0,2] Soon is out of reach: at least 3 steps away, and due in 2"),
-        ("F[0,2] Soon and G[1,60] not Far", False, "F[0,2] Soon is out of reach: at least 3 steps away"),
+        ("F[0,15] Far", False, "before step 18, and 'F[0,15] Far' needs it by step 15"),
+        ("F[0,2] Soon", False, "before step 3, and 'F[0,2] Soon' needs it by step 2"),
+        ("F[0,2] Soon and G[1,60] not Far", False, "'Soon' cannot be met from here before step 3"),
         (
             "F[0,1] Soon and G[1,60] not Far",
             False,
@@ -63,9 +63,9 @@ def circle(x, radius=0.3):
         ("F[0,9] Near and F[10,20] Far", False, None),
         ("F[22,22] Far and F[24,30] Near", False, "not all of these can be reached in time"),
         ("G[2,9] theta > 2", False, "whatever the robot does, it breaks G[2,9] theta > 2 by step 2"),
-        ("G[0,20] F[0,4] Far", False, "F[0,4] Far is out of reach"),
+        ("G[0,20] F[0,4] Far", False, "'Far' cannot be met from here before step 18"),
         ("F[0,10] Far or F[0,15] Far", False, "and its 1 other ways are ruled out likewise"),
-        ("not Near U[0,12] Far", False, "Far by step 12 is out of reach while not Near is kept"),
+        ("not Near U[0,12] Far", False, "before step 18 while not Near is kept, and the rule"),
         ("not Strip U[0,400] Far", False, "no way leads to where F[0,400] Far can be met while not Strip"),
         ("G[0,40] (call > 0.5 -> F[0,12] Far)", False, None),
         ("F[0,9] call > 0.5", False, "the values that the signals hold rule it out"),
@@ -85,7 +85,7 @@ def test_a_signal_that_has_risen_calls_for_what_is_too_far():
     task = hall("G[0,40] (call > 0.5 -> F[0,12] Far)", {"Far": circle(6.0)}, signals={"call": 0.0})
     body, past = make_body(task.robot, task.grid), np.array([[2.0, 1.0, 0.0]] * 3)
     assert proof(task, body, past, {"call": np.array([0.0, 0.0, 0.0])}) is None
-    assert "F[2,14] Far is out of reach" in proof(task, body, past, {"call": np.array([0.0, 0.0, 1.0])})
+    assert "'F[2,14] Far' needs it by step 14" in proof(task, body, past, {"call": np.array([0.0, 0.0, 1.0])})
 
 
 def test_a_wall_with_a_door_proves_nothing_of_a_turn_through_it():

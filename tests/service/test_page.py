@@ -184,7 +184,7 @@ def test_a_real_house(own):
         Floor(page).click(9.75, 7.25)  # in the kitchen, where the house has its agent
         page.get_by_role("heading", name="Step 0").wait_for()
         forbidden = page.locator("tr", has=page.locator(".cannot"), has_text="moves 0.20 m").first
-        why = "the best one does not keep 'G[0,100] not (Bathroom or touches(Wet))'"
+        why = "the best way found does not keep 'G[0,100] not (Bathroom or touches(Wet))'"
         assert why in forbidden.inner_text()
         look(page, "real-house-forbidden")
         page.get_by_role("button", name="Push the robot").click()

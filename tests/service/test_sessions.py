@@ -187,7 +187,7 @@ def test_a_refused_start_says_whether_that_is_proved_and_what_is_wrong_with_each
     body = {"policy_id": policy["id"], "initial_pose": [3.5, 0.5, 0.0]}
     refused = problem(client.post("/v1/sessions", json=body), 422, "infeasible-start")
     assert refused["proved"] is True
-    assert "F[0,6] Goal is out of reach" in refused["detail"]
+    assert "'F[0,6] Goal' needs it by step 6" in refused["detail"]
     goal, battery = refused["conjuncts"]
     assert (goal["formula"], goal["feasible_alone"]) == ("F[0,6] Goal", False)
     assert goal["robustness"] < 0.0 < goal["late_by"]

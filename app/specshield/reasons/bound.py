@@ -155,10 +155,9 @@ class _Ahead:
             if soon == math.inf:
                 return f"no way leads to where {need.formula} can be met{also}", [need]
             if soon > need.last:
-                away = f"at least {int(soon) - self.known.now} steps away, "
-                left = f"and due in {need.last - self.known.now}"
-                asked = str(need.formula) if need.before is None else f"{need.predicate} by step {need.last}"
-                return f"{asked} is out of reach{also}: {away}{left}", [need]
+                by = "the rule" if need.before is not None else f"'{need.formula}'"
+                away = f"'{need.predicate}' cannot be met from here before step {int(soon)}{also}"
+                return f"{away}, and {by} needs it by step {need.last}", [need]
         asked = ", ".join(str(goal.need.formula) for goal in self.goals)
         return f"not all of these can be reached in time, in whatever order: {asked}", []
 

@@ -152,14 +152,15 @@ class _Motion:
     def holds_back(self, part: _Part, late: int | None) -> str | None:
         """What is asked of a conjunct that could be kept, and is not met as soon as that."""
         asked, slack = part.asked, self.judged.slack
-        if late is None or not slack or not isinstance(asked, (Eventually, Until)):
+        whole = (Eventually, Until)
+        if late is None or not slack or not (isinstance(asked, whole) and isinstance(part.conjunct, whole)):
             return None
-        begins = isinstance(asked, Eventually) and not is_predicate(asked.child)
-        does, met = ("begins", "begin") if begins else ("is met", "be met")
+        goal = asked.child if isinstance(asked, Eventually) else asked.right
+        does = "is met" if is_predicate(goal) else "begins"
         return (
             f"the rule could still be kept, but no way was found with the {steps(slack)} in reserve that the "
-            f"session asks for: on the best one '{part.conjunct}' {does} at step {asked.b + late}, and it "
-            f"has to {met} by step {asked.b}"
+            f"session asks for: on the best way found '{goal}' {does} at step {asked.b + late}; the rule "
+            f"needs that by step {part.conjunct.b}, and with the reserve by step {asked.b}"
         )
 
     def known(self) -> str:

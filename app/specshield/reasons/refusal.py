@@ -14,15 +14,13 @@ from specshield.arrays import Floats
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
 from specshield.handover import begun
 from specshield.reasons.bound import proof
-from specshield.reasons.lateness import steps
+from specshield.reasons.lateness import later, steps
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.robot.dynamics import Body
 from specshield.shield import switching
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.episode import Signals, start
 from specshield.shield.taught import on_map, teach
-from specshield.stl import Always
-from specshield.stl.fragment import is_predicate
 from specshield.world.learned import SENT, forget
 
 MOST_SHOWN = 32  # conjuncts; as many characters of each formula as LONGEST
@@ -118,8 +116,8 @@ def refusal(
     relaxed = relaxations(shield, history, signals)
     if relaxed.way is not None:
         return Refusal(
-            f"the policies found no way from here that keeps the rule, though a search found one among "
-            f"{relaxed.tried} that were tried: policies of another method, or finer options, may find it too",
+            f"the policies found no way from here that keeps the rule, though a search found one "
+            f"({relaxed.tried} were tried): policies of another method, or finer options, may find it too",
             False,
             relaxed.conjuncts,
             relaxed.way,
@@ -128,8 +126,8 @@ def refusal(
     if bound is not None:
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
     message = (
-        f"no way was found from here that keeps the rule, among {relaxed.tried} that the policies and a "
-        f"search tried: {_wrong(relaxed.conjuncts)}"
+        f"no way from here was found that keeps the rule ({relaxed.tried} were tried): "
+        f"{_wrong(relaxed.conjuncts)}"
     )
     return Refusal(message, False, relaxed.conjuncts)
 
@@ -142,24 +140,23 @@ def _wrong(conjuncts: Sequence[Conjunct]) -> str:
         return "; ".join(_fails(each, alone) for each in failing)
     late = [each for each in conjuncts if each.late_by is not None]
     if late:
-        return f"each part can be kept alone, and all can if {' or '.join(map(_ends_later, late))}"
+        return f"each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}"
     return "each part can be kept alone, but no way was found to keep all of them"
 
 
 def _fails(conjunct: Conjunct, alone: str) -> str:
     part = f"'{_shown(conjunct)}'"
     if conjunct.late_by is not None:
-        enough = f"; the whole rule could be kept if {_ends_later(conjunct)}" if conjunct.only else ""
-        return f"{alone}the soonest of them is {steps(conjunct.late_by)} too late for {part}{enough}"
+        enough = f"; the whole rule could be kept with {_eased(conjunct)}" if conjunct.only else ""
+        return f"{alone}{part} comes {steps(conjunct.late_by)} too late on the soonest of them{enough}"
     if math.isfinite(conjunct.robustness):
         return f"{alone}the nearest of them misses {part} by {abs(conjunct.robustness):.3g}"
     return f"{alone}none of them keeps {part}"
 
 
-def _ends_later(conjunct: Conjunct) -> str:
-    part = conjunct.formula
-    does = "began" if isinstance(part, Always) and is_predicate(part.child) else "ended"
-    return f"the window of '{_shown(conjunct)}' {does} {steps(conjunct.late_by or 0)} later"
+def _eased(conjunct: Conjunct) -> str:
+    eased = later(conjunct.formula, conjunct.late_by or 0)
+    return f"'{str(eased)[:LONGEST]}' in place of '{_shown(conjunct)}'"
 
 
 def _shown(conjunct: Conjunct) -> str:

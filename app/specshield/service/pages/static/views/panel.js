@@ -31,20 +31,20 @@ export function whyNot(decision, action) {
   const value = decision.robustness[action];
   const told = decision.explanations?.[action];
   if (told?.detail && told.robustness > 0) return told.detail;
-  if (told && told.robustness > 0) return `${told.conjunct} could still be kept, but not with ${inHand(decision)} in hand`;
+  if (told && told.robustness > 0) return `${told.conjunct} could still be kept, but not with ${inHand(decision)} in reserve`;
   if (told) {
     const late = told.late_by ? `it comes ${told.late_by} ${told.late_by === 1 ? "step" : "steps"} too late` : null;
     const misses = told.robustness === null ? null : `it misses it by ${Math.abs(told.robustness).toFixed(2)}`;
     const found = told.detail ?? [late, misses].filter(Boolean).join(", ");
     if (!found) return `no way was found that keeps ${told.conjunct}`;
-    return `no way was found that keeps the rule; the best one does not keep '${told.conjunct}': ${found}`;
+    return `no way was found that keeps the rule; the best way found does not keep '${told.conjunct}': ${found}`;
   }
   if (value === null || value === undefined) return "was not looked at";
-  if (value > 0) return `keeps the rule by ${metres(value)}, but not with ${inHand(decision)} in hand`;
+  if (value > 0) return `keeps the rule by ${metres(value)}, but not with ${inHand(decision)} in reserve`;
   return `no way was found that keeps the rule; the best misses it by ${metres(Math.abs(Math.min(0, value)))}`;
 }
 
-/** What a decision keeps in hand for a robot that does not land exactly where it should. */
+/** What a decision keeps in reserve for a robot that does not land exactly where it should. */
 function inHand({ margin, slack }) {
   return [margin > 0 && metres(margin), slack > 0 && `${slack} steps`].filter(Boolean).join(" and ") || "what is kept";
 }
