@@ -44,6 +44,8 @@ FORWARD = int(STRETCH.action_names.index("m"))
 METHODS = ("reachability", "planner")
 KINDS = ("reach", "until", "stay", "out", "dwell")
 UNCERTAINTIES = ("none", "learned")
+SEARCHED = """The search takes poses that are nearly the same for one. Where it finds a way, there is one;
+where it finds none, or names the steps that a window would have to end later, there may be a better one."""
 KNOWN = "a way is known"  # as the line says it
 
 
@@ -256,10 +258,7 @@ def main() -> None:
     asked = parser.parse_args()
     counts, number = Counter[str](), 0
     print(f"# {asked.n} forbidden actions and refusals, seed {asked.seed}")
-    print(
-        "\nThe search takes poses that are nearly the same for one. Where it finds a way, there is one; where it"
-    )
-    print("finds none, or names the steps that a window would have to end later, there may be a better one.")
+    print(f"\n{SEARCHED}")
     while counts["forbidden"] + counts["refused"] < asked.n:
         if (counts["forbidden"] + counts["refused"]) % 4 == 3:
             refused(drawn(number, asked.seed, (-8, -1)), counts)
