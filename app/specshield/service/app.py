@@ -47,6 +47,7 @@ from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
 log = logging.getLogger("specshield")
+NEARLY = 1.0  # [s] after which a server that is not ready listens, to say so; chosen by hand
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
 set of actions; the service answers the closest distribution that still lets a Signal Temporal Logic
@@ -148,11 +149,12 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     server.streams.close_at_stop()  # which comes when what follows has drained
     drain_at_sigterm(startup, settings.drain)
     running = (
-        tend(embedded, worker, startup), prepare(startup, check), mover.run(), watchers.run(), keys.follow(),
+        prepare(startup, check), tend(embedded, worker, startup), mover.run(), watchers.run(), keys.follow(),
         _adopt(library, known),
     )  # fmt: skip
     tasks = [asyncio.create_task(each) for each in running]
     try:
+        await asyncio.wait(tasks[:1], timeout=NEARLY)  # who asked now would be told to wait a second
         yield
     finally:
         for task in tasks:
