@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import os
 import signal
@@ -10,6 +11,7 @@ import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -103,7 +105,6 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
-    from specshield.service.bounds.protocol import raise_file_limit
     from specshield.service.drain import GRACE
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
@@ -112,14 +113,17 @@ def serve(
     settings = _settings()  # what is wrong with them is said here, in one line
     _check_address(host, port)
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
-    if embedded is not None:
-        embedded.join()  # and so is why it does not start
+    with ThreadPoolExecutor(1) as beside:  # the store starts while the imports take their time
+        joined = beside.submit(embedded.join if embedded is not None else bool)
+        if workers == 1:
+            gc.disable()  # what is imported stays; `startup.prepare` collects again
+            from specshield.service.app import create_app
+    joined.result()  # and so is why it does not start
     if not insecure:
         _check_exposure(host, settings)
     with contextlib.suppress(StoreError):  # a store that is away now may come
         url = embedded.url if embedded is not None else str(settings.redis_url)
         check_files(url, settings.files_at, settings.store_timeout)
-    raise_file_limit()
     options: dict[str, Any] = {
         "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
         "ws_max_size": settings.max_body_bytes, "ws_max_queue": 8, "ws_per_message_deflate": False,
@@ -131,8 +135,6 @@ def serve(
     # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if workers == 1:
-        from specshield.service.app import create_app
-
         uvicorn.run(create_app(settings, embedded), **options)
         return
     with tempfile.TemporaryDirectory(prefix="specshield-metrics-") as folder:
@@ -151,6 +153,7 @@ def worker(
     Other packages may have jobs of their own: each entry point of the group specshield.queues is named like
     the queue that its jobs wait in.
     """
+    os.nice(10)  # below servers on the same machine, and below what decides their steps (heavy/heavy.py)
     from specshield.service.training.worker import serve as work
 
     work(_settings(), until_eof, [queue.name for queue in entry_points(group="specshield.queues")], learner)

@@ -25,6 +25,7 @@ TICKS = os.sysconf("SC_CLK_TCK")
 PAGE = os.sysconf("SC_PAGE_SIZE")
 START = 1800.0  # [s] most that a start may take; kernels that are missing are compiled
 LOOK = 0.02  # [s] between two looks at something that is waited for
+UNSET = ("REDIS_URL", "PYTHONDONTWRITEBYTECODE")  # else each start compiles the sources, as no user's does
 STOP = 60.0  # [s] most that an orderly stop may take
 
 
@@ -100,7 +101,7 @@ class Service(Program):
         self.data, self.port = data, free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self._http = httpx.Client(base_url=self.url, timeout=20.0, trust_env=False, verify=False)
-        kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
+        kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k not in UNSET}
         data.mkdir(parents=True, exist_ok=True)
         super().__init__(
             [sys.executable, "-m", "specshield.cli", "serve", "--port", str(self.port), *options],

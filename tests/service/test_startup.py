@@ -3,6 +3,8 @@
 import fcntl
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import httpx
@@ -39,6 +41,18 @@ def test_what_numba_would_compile_again_is_not_marked_as_compiled(tmp_path, monk
         marks.append(mark_of_kernels())
     assert marks[0] == marks[1]
     assert len(set(marks)) == 3
+
+
+def test_a_server_takes_in_nothing_before_it_is_ready_that_no_first_decision_needs():
+    """And the parent of several servers nothing of what they decide with."""
+    parent = "import specshield.cli, uvicorn, specshield.service.drain, specshield.service.storage.embedded"
+    for imports, unneeded in (
+        ("import specshield.service.app", "torch valkey specshield.lookahead.lookahead"),
+        (parent, "torch valkey specshield.lookahead numba fastapi"),
+    ):
+        told = [sys.executable, "-c", f"{imports}; import sys; print(*sys.modules)"]
+        modules = subprocess.run(told, check=True, capture_output=True, text=True).stdout.split()
+        assert not set(unneeded.split()) & set(modules)
 
 
 def alive(url):

@@ -29,7 +29,7 @@ from specshield.lookahead.desirability import UNKEEPABLE, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import Goals, make_goals
 from specshield.lookahead.lattice import Planes, blocked_at, make_planes
-from specshield.lookahead.preferences import PreferenceKind
+from specshield.lookahead.preferences import AHEADS, PreferenceKind
 from specshield.lookahead.surrogate import WANDER, stand_in_for
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.portable import exp, inner
@@ -38,7 +38,6 @@ from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_
 from specshield.shield.proposal import Proposer
 from specshield.task import Task
 
-AHEADS = 8  # tasks that a process keeps prepared
 # Chosen by hand; what the whole is worth is measured by `specshield evaluate` and benchmarks.told.
 LEAD_GAP = 1.0  # [m] along free space between the places that have a table, where that makes few enough
 WORK = 200_000_000  # entries that are solved for a task, at most, where that leaves FEWEST places

@@ -19,6 +19,7 @@ from specshield.shield.proposal import Proposer
 from specshield.task import Task
 
 PROJECTION = "projection"
+AHEADS = 8  # tasks that a process keeps prepared
 
 
 @dataclass(frozen=True)

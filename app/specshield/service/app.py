@@ -8,7 +8,6 @@ import logging
 import multiprocessing
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from functools import partial
 
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
@@ -20,6 +19,7 @@ from specshield.service import pages, problems
 from specshield.service.access.keys import Keys
 from specshield.service.bounds import body
 from specshield.service.bounds.bodies import Bodies
+from specshield.service.bounds.protocol import raise_file_limit
 from specshield.service.description import TAGS, described
 from specshield.service.drain import drain_at_sigterm
 from specshield.service.heavy.heavy import Heavy
@@ -47,6 +47,7 @@ from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
 log = logging.getLogger("specshield")
+NEARLY = 1.0  # [s] after which a server that is not ready listens, to say so; chosen by hand
 DESCRIPTION = """\
 Keeps robot foundation models inside their operating rules. The model proposes a distribution over a finite
 set of actions; the service answers the closest distribution that still lets a Signal Temporal Logic
@@ -102,6 +103,7 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
 async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None) -> AsyncIterator[None]:
     if multiprocessing.parent_process() is not None:  # one of uvicorn's workers
         follow_parent()
+    raise_file_limit()
     if embedded is None and settings.redis_url is None:
         embedded = EmbeddedStore(settings.data_dir)
     if embedded is not None:
@@ -109,13 +111,19 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     url = embedded.url if embedded is not None else str(settings.redis_url)
     archive = Archive(open_objects(f"{settings.files_at}/archive"))
     store = ArchivingStore(url, settings.store_timeout, settings.session_ttl, archive)
-    check = partial(check_files, url, settings.files_at, settings.store_timeout)
     mover, jobs = Mover(store, settings), Jobs(url, settings)
     claims = Claims(lambda: jobs.redis, settings)
     library = Maps(settings, claims)
     known = Policies(settings, library, claims)
     worker = TrainingWorker(settings) if wants_worker(settings) else None
     heavy, startup = Heavy(settings), Startup()
+
+    def check() -> None:
+        check_files(url, settings.files_at, settings.store_timeout)
+        if worker is not None:  # last of all: it needs a processor for a second
+            with contextlib.suppress(OSError):  # `tend` tells, and tries again
+                worker.ensure()
+
     watchers = Watchers(store, settings.max_watchers, lambda: startup.stopping, lambda: steps.deciding)
     sessions = Sessions(settings, store, known, heavy, watchers.decided)
     steps = sessions.steps
@@ -141,11 +149,12 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     server.streams.close_at_stop()  # which comes when what follows has drained
     drain_at_sigterm(startup, settings.drain)
     running = (
-        tend(embedded, worker), prepare(startup, check), mover.run(), watchers.run(), keys.follow(),
+        prepare(startup, check), tend(embedded, worker, startup), mover.run(), watchers.run(), keys.follow(),
         _adopt(library, known),
     )  # fmt: skip
     tasks = [asyncio.create_task(each) for each in running]
     try:
+        await asyncio.wait(tasks[:1], timeout=NEARLY)  # who asked now would be told to wait a second
         yield
     finally:
         for task in tasks:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import signal
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from specshield.service.startup import Startup
+if TYPE_CHECKING:  # the parent of several servers decides nothing
+    from specshield.service.startup import Startup
 
 GRACE = 10  # [s] that running requests and streams have once the server takes no more; chosen by hand
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import fcntl
+import gc
 import hashlib
 import logging
 import os
@@ -83,6 +84,8 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
 
     check: blocks, and raises what keeps the server from serving; StoreError where that cannot be known yet.
     """
+    gc.freeze()  # 300,000 objects that stay: looking at them makes a collection take 0.2 s
+    gc.enable()
     try:
         mark = mark_of_kernels()
         if mark is not None and not mark.exists():

@@ -13,7 +13,7 @@ from specshield.service.heavy.pool import Pool, Template
 from specshield.service.problems import ClientGone
 from specshield.service.settings import Settings
 
-# Chosen by hand: below what the server itself does (0), above what trains policies (see training/worker.py).
+# Chosen by hand: below what the server itself does (0), above what trains policies (`specshield worker`).
 DECISIONS_NICE, TASKS_NICE = 5, 10
 WAITING = 16  # calls of one owner that may wait
 DECISION_TIMEOUT = 30.0  # [s]; the slowest step known takes 1 s, its first one loads its kernels

@@ -12,8 +12,7 @@ import msgspec
 
 from specshield.arrays import Floats
 from specshield.errors import FragmentError
-from specshield.lookahead.lookahead import AHEADS
-from specshield.lookahead.preferences import PROJECTION, prepare
+from specshield.lookahead.preferences import AHEADS, PROJECTION, prepare
 from specshield.robot.dynamics import make_body
 from specshield.rule.early import conjunction_of
 from specshield.rule.view import view_of

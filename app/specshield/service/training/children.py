@@ -14,6 +14,7 @@ from pathlib import Path
 from specshield.errors import SpecshieldError
 from specshield.policy.methods import available
 from specshield.service.settings import Settings
+from specshield.service.startup import Startup
 from specshield.service.storage.embedded import EmbeddedStore
 
 CHECK_EVERY = 0.25  # seconds
@@ -73,14 +74,14 @@ def wants_worker(settings: Settings) -> bool:
     return settings.redis_url is None
 
 
-async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None) -> None:
-    """Starts the store and the worker again when they have died, until it is cancelled."""
+async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None, startup: Startup) -> None:
+    """Starts again what has died: the store, and once the server is ready the worker. Until cancelled."""
     while True:
         try:
             if embedded is not None and not embedded.joined():
                 log.warning("the embedded store is gone; starting it again")
                 await asyncio.to_thread(embedded.join)
-            if worker is not None:
+            if worker is not None and startup.ready:
                 worker.ensure()
         except (SpecshieldError, OSError) as error:
             log.error("%s", error)

@@ -29,7 +29,6 @@ from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, learns, queue_o
 from specshield.service.watch import logs
 
 CONNECT = 5.0  # [s] for a connection to the store; its answers may take as long as there is no work
-NICE = 10  # below servers on the same machine, and below what decides their steps (heavy/heavy.py)
 log = logging.getLogger("specshield")
 
 
@@ -48,7 +47,6 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
         os.environ["REDIS_URL"] = embedded.url  # for the runs
     url = os.environ.get("REDIS_URL") or str(settings.redis_url)
     os.environ["REDIS_URL"] = url  # for the second process, too
-    os.nice(NICE)
     with suppress(StoreError):  # rq tells of a store that is away
         check_files(url, settings.files_at, settings.store_timeout)
     jobs = Jobs(url, settings)
