@@ -32,7 +32,7 @@ class Session:
     """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held.
 
     rules: the config of each rule that it has had, the one in force last. settings: of that one.
-    signal_names: as in the rows.
+    signal_names: as in the rows. weight: of the rules, as they are stored [bytes].
     """
 
     rules: Sequence[Mapping[str, Any]]
@@ -41,6 +41,7 @@ class Session:
     version: bytes
     rows: Floats
     signal_names: list[str]
+    weight: int
 
     @staticmethod
     def of(stored: Record | Dump) -> Session:
@@ -48,7 +49,8 @@ class Session:
         names = ruled.columns_of(rules)
         width = 3 + len(names)
         rows = np.frombuffer(stored.rows, "<f8", state.length * width).reshape(-1, width)
-        return Session(rules, settings_of(rules[-1]), state, stored.version, rows, names)
+        settings, weight = settings_of(rules[-1]), len(stored.config)
+        return Session(rules, settings, state, stored.version, rows, names, weight)
 
     @property
     def config(self) -> Mapping[str, Any]:

@@ -181,6 +181,7 @@ class Sessions:
                 change = Change(state.packed(), *session.added())
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue
+            self.steps.forget(id)
             finite = [value if math.isfinite(value) else None for value in bounds]
             return {**describe(session.rules, state), "robustness_bounds": finite}
         raise contended(id)

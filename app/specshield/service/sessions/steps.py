@@ -41,7 +41,7 @@ from specshield.shield.decision import Decision
 from specshield.shield.taught import Taught, changes_map
 from specshield.task import check_signals
 
-ROOM = 64 << 20  # bytes of sessions kept in memory, some 5,000 of them. Chosen by hand.
+ROOM = 64 << 20  # bytes of sessions kept in memory, some 4,000 of them. Chosen by hand.
 WATCHED = 32  # decisions in threads after a long one. Chosen by hand.
 SHORT = 0.005  # [s]; so long a decision may hold the event loop, as anything else of a request
 LONG = 0.03  # [s] of a processor for one decision
@@ -169,7 +169,7 @@ class Steps:
         raise contended(id)
 
     def forget(self, id: str) -> None:
-        """Frees what a session that is gone takes of memory."""
+        """Frees what a session that is gone, or over, takes of memory."""
         self._recent.drop(id)
 
     def _change(self, decided: Decided, request: StepBody) -> tuple[Change, State]:
