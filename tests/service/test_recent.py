@@ -3,13 +3,14 @@
 import asyncio
 import gc
 import json
+from operator import attrgetter
 
 import httpx
 import numpy as np
 import pytest
 
 from specshield.service.app import create_app
-from specshield.service.sessions.recent import RecentSessions
+from specshield.service.library.files import Recent
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.state import State, pack_carry
 from specshield.service.settings import Settings
@@ -21,36 +22,33 @@ from tests.service.world import LOGITS, START, grid_json, policy_files
 ROUNDS = 8
 
 
-def session(formula="F[0,6] Goal", motions=4, horizon=8, finished=False):
+def session(formula="F[0,6] Goal", motions=4, horizon=8):
     carry = Carry(0, np.zeros((motions, 3)), (bytes(horizon),) * motions)
-    state = State(1, 1, True, "pending", 0.0, b"", carry=pack_carry(carry), finished=finished)
+    state = State(1, 1, True, "pending", 0.0, b"", carry=pack_carry(carry))
     config = {"spec": {"formula": formula, "regions": {}, "signals": {}}, "seed": 0}
     return Session.of(Record(json.dumps(config).encode(), state.packed(), b"1", bytes(24), None))
 
 
 def test_the_sessions_used_last_are_kept():
-    recent = RecentSessions(30_000)
+    recent = Recent(30_000, attrgetter("size"))
     for i in range(10):
-        recent.put(str(i), session())
-        assert recent.get("0") is not None
-    kept = [i for i in range(10) if recent.get(str(i)) is not None]
+        recent.put(i, session())
+        assert recent.peek(0) is not None
+    kept = [i for i in range(10) if recent.peek(i) is not None]
     assert 2 < len(kept) < 10
     assert kept == [0, *range(11 - len(kept), 10)]
 
 
 @pytest.mark.parametrize("large", [{"formula": "F[0,6] Goal" * 300}, {"motions": 64, "horizon": 1000}])
 def test_a_session_of_a_large_rule_takes_the_place_of_many(large):
-    recent = RecentSessions(30_000)
+    recent = Recent(30_000, attrgetter("size"))
+    recent.put("small", session())
     recent.put("small", session())
     recent.put("large", session(**large))
-    assert recent.get("small") is None
-
-
-def test_a_session_that_has_finished_is_let_go():
-    recent = RecentSessions(30_000)
-    recent.put("a", session())
-    recent.put("a", session(finished=True))
-    assert recent.get("a") is None
+    assert recent.peek("small") is None
+    recent.drop("large")
+    recent.put("small", session())
+    assert recent.peek("small") is not None
 
 
 async def _episodes(folder):
