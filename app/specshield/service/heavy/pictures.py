@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from specshield.arrays import Floats
 from specshield.drawing.svg import Plan
-from specshield.errors import InfeasibleStart, PolicyError, PoseError
+from specshield.errors import InfeasibleStart, PoseError
 from specshield.robot.dynamics import make_body, step
+from specshield.service.heavy.latest import latest
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.library.policies import Description
 from specshield.service.sessions import record
@@ -23,36 +25,40 @@ from specshield.shield.decision import Shield, make_shield
 from specshield.shield.episode import start
 from specshield.task import Task
 
-# Chosen by hand; a start takes some 0.4 ms.
-HEADINGS = 4  # looked at from each place
-FINEST, COARSEST = 0.1, 1.0  # [m] between two places
+# Chosen by hand. A start takes 0.4 ms with tables, and any time with a planner.
+HEADINGS = 4  # looked at from each place where places are no more than NEAR apart, else one
+FINEST, NEAR = 0.1, 1.0  # [m] between two places
 FINER = math.sqrt(2.0)  # from one grid to the next
-SECONDS = 8.0  # for a heat map with all that it needs: what a person waits, below `heavy_timeout`
+# Of `heavy_timeout`, 20 s by default: when no finer grid is begun any more, and when one is given up.
+SOON, LATEST = 0.4, 0.7
 
 
-def draw_policy(settings: Settings, key: str, owner: str) -> bytes:
-    """Map, regions, and from where the rule can still be kept at t = 0. Raises NotFound, PolicyError."""
-    policies, deadline = policies_of(settings), time.monotonic() + SECONDS
+def draw_policy(settings: Settings, key: str, owner: str) -> tuple[bytes, bool]:
+    """Map, regions, and from where the rule can still be kept at t = 0; and whether that is known, so that it
+    need not be drawn again. Raises NotFound, PolicyError.
+    """
+    policies, began, most = policies_of(settings), time.monotonic(), LATEST * settings.heavy_timeout
     found = policies.find(key, owner)
     task = policies.task(found.about)
     plan = Plan(task, f"policy {found.name or found.id[:8]}: from where {task.formula} can be kept")
-    try:
+    heat, said = None, "It is not ready yet: from where the rule can be kept is not known."
+    if found.card is not None:
         shield = make_shield([policies.policy(found)])
-    except PolicyError as error:
-        if found.card is not None:
-            raise error
-        said = "It is not ready yet: from where the rule can be kept is not known."
-    else:
-        share, pitch = kept_from(shield, deadline)
+        heats = kept_from(shield, began + SOON * settings.heavy_timeout)
+        heat = latest(heats, began + most - time.monotonic())
+        said = f"From where the rule can be kept is not known: no start was decided within {most:g} s."
+    if heat is not None:
+        share, pitch, headings = heat
         plan.heat(share)
         known = share[np.isfinite(share)]
         kept = f"{100 * known.mean():.0f} %" if len(known) else "none"
-        said = f"Green: from here the rule can be kept ({kept} of the starts, every {pitch:.2f} m); red: not."
+        looked = f"every {pitch:.2f} m, {headings} heading{'s' * (headings > 1)} each"
+        said = f"Green: from here the rule can be kept ({kept} of the starts, {looked}); red: not."
     plan.walls()
     plan.regions()
     plan.line(str(task.formula), "ink formula")
     plan.line(said, "faint")
-    return plan.svg()
+    return plan.svg(), heat is not None
 
 
 def draw_session(settings: Settings, config: dict[str, Any], rows: Floats, last: bytes) -> bytes:
@@ -71,61 +77,47 @@ def draw_session(settings: Settings, config: dict[str, Any], rows: Floats, last:
     plan.way(rows[:, :3])
     plan.robot(rows[-1, :3].tolist())
     plan.line(str(task.formula), "ink formula")
-    dashed = (
-        "; dashed: the certified continuation" if last and record.decode(last).witness is not None else ""
-    )
-    plan.line(
-        f"{config['id']}, step {len(rows) - 1} of {task.horizon}. The line is the way driven{dashed}.",
-        "faint",
-    )
+    witness = last and record.decode(last).witness is not None
+    dashed = "; dashed: the certified continuation" if witness else ""
+    told = f"{config['id']}, step {len(rows) - 1} of {task.horizon}. The line is the way driven{dashed}."
+    plan.line(told, "faint")
     return plan.svg()
 
 
-def kept_from(shield: Shield, deadline: float) -> tuple[Floats, float]:
-    """The share of headings [rows, columns] from which some first action has a future that keeps the rule;
-    NaN where the robot does not fit. The first row is at the highest y. And the pitch [m] of the places: the
-    finest that can be had by the deadline [s, of time.monotonic].
+def kept_from(shield: Shield, deadline: float) -> Iterator[tuple[Floats, float, int]]:
+    """Of ever finer places, at first one for the whole map: the share of headings [rows, columns] from which
+    some first action has a future that keeps the rule, NaN where the robot does not fit, the first row at the
+    highest y; the places' pitch [m]; and how many headings were looked at from each.
+
+    It ends where the next would likely come after the deadline [s, of time.monotonic].
     """
-    pitch = COARSEST
-    share = _kept_on_grid(shield, pitch, math.inf)
-    assert share is not None
-    while pitch > FINEST:
-        began = time.monotonic()
-        finer = _kept_on_grid(shield, pitch / FINER, deadline)
-        if finer is None:
-            break
-        share, pitch = finer, pitch / FINER
-        if began + 3 * (time.monotonic() - began) > deadline:  # the next has twice as many places
-            break
-    return share, pitch
-
-
-def _kept_on_grid(shield: Shield, pitch: float, deadline: float) -> Floats | None:
-    """None where the deadline comes first."""
     xmin, ymin, xmax, ymax = shield.task.grid.bounds
-    columns, rows = (max(1, round((high - low) / pitch)) for low, high in ((xmin, xmax), (ymin, ymax)))
-    share = np.full((rows, columns), np.nan)
-    for row in range(rows):
-        for column in range(columns):
-            if time.monotonic() > deadline:
-                return None
-            x, y = xmin + (column + 0.5) * (xmax - xmin) / columns, ymax - (row + 0.5) * (ymax - ymin) / rows
-            poses = [np.array([x, y, k * math.tau / HEADINGS]) for k in range(HEADINGS)]
-            fits = [kept for pose in poses if (kept := _can_be_kept(shield, pose)) is not None]
-            if fits:
-                share[row, column] = sum(fits) / len(fits)
-    return share
+    wide, high = xmax - xmin, ymax - ymin
+    pitch, pace = max(wide, high), 0.0  # pace: seconds a start
+    while pitch > FINEST:
+        columns, rows = max(1, round(wide / pitch)), max(1, round(high / pitch))
+        headings = HEADINGS if pitch <= NEAR else 1
+        began, starts = time.monotonic(), rows * columns * headings
+        if pace and began + pace * starts > deadline:
+            return
+        xs = xmin + (np.arange(columns) + 0.5) * wide / columns
+        ys = ymax - (np.arange(rows) + 0.5) * high / rows
+        thetas = np.arange(headings) * math.tau / headings
+        kept = np.array([[[_kept(shield, x, y, theta) for theta in thetas] for x in xs] for y in ys])
+        fits = np.isfinite(kept).sum(axis=2)
+        yield np.where(fits, np.nansum(kept, axis=2) / np.maximum(fits, 1), math.nan), pitch, headings
+        pitch, pace = pitch / FINER, (time.monotonic() - began) / starts
 
 
-def _can_be_kept(shield: Shield, pose: Floats) -> bool | None:
-    """Whether an episode may begin there; None where the robot does not fit."""
+def _kept(shield: Shield, x: float, y: float, theta: float) -> float:
+    """Whether an episode may begin there, as 1 or 0; NaN where the robot does not fit."""
     try:
-        start(shield, pose.tolist())
+        start(shield, (x, y, theta))
     except PoseError:
-        return None
+        return math.nan
     except InfeasibleStart:
-        return False
-    return True
+        return 0.0
+    return 1.0
 
 
 def _continuation(task: Task, row: Floats, decided: record.StepRecord) -> Floats:

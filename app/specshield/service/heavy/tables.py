@@ -56,9 +56,8 @@ class Tables:
         making = self._making.peek(session)
         if making is not None and making.done():
             self._making.drop(session)
-            self._newest.drop(session)
-            made, making = making.result(), None
-            self._newest.get(session, lambda: made)
+            self._newest.put(session, making.result())
+            making = None
         newest = self._newest.peek(session)
         if newest is not None and newest.policies != _ids(shield):  # of a rule that is no longer in force
             newest = None

@@ -208,33 +208,40 @@ def rfc3339(seconds: float) -> str:
 
 
 class Recent(Generic[V]):
-    """Keeps the values that were used last. Threads may share it; two of them may make one value at once."""
+    """Keeps the values that were used last: `room` of them, or with `size` those that come to `room`. Threads
+    may share it; two of them may make one value at once.
+    """
 
-    def __init__(self, room: int) -> None:
-        self._room, self._values, self._lock = room, OrderedDict[Hashable, V](), threading.Lock()
+    def __init__(self, room: int, size: Callable[[V], int] = lambda value: 1) -> None:
+        self._room, self._size, self._used = room, size, 0
+        self._values, self._lock = OrderedDict[Hashable, tuple[V, int]](), threading.Lock()
 
     def get(self, key: Hashable, make: Callable[[], V]) -> V:
-        with self._lock:
-            if key in self._values:
-                self._values.move_to_end(key)
-                return self._values[key]
-        value = make()
-        with self._lock:
-            self._values[key] = value
-            while len(self._values) > self._room:
-                self._values.popitem(last=False)
-        return value
+        found = self.peek(key)
+        if found is None:
+            found = make()
+            self.put(key, found)
+        return found
 
     def peek(self, key: Hashable) -> V | None:
         """The value, if it is kept. Asking counts as a use of it."""
         with self._lock:
-            if key in self._values:
-                self._values.move_to_end(key)
-            return self._values.get(key)
+            if key not in self._values:
+                return None
+            self._values.move_to_end(key)
+            return self._values[key][0]
+
+    def put(self, key: Hashable, value: V) -> None:
+        size = self._size(value)
+        with self._lock:
+            self._used += size - self._values.pop(key, (None, 0))[1]
+            self._values[key] = value, size
+            while self._used > self._room:
+                self._used -= self._values.popitem(last=False)[1][1]
 
     def drop(self, key: Hashable) -> None:
         with self._lock:
-            self._values.pop(key, None)
+            self._used -= self._values.pop(key, (None, 0))[1]
 
 
 def _write(path: Path, content: bytes) -> None:

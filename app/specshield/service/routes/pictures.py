@@ -34,14 +34,15 @@ async def policy(policy_id: PolicyId, request: Request, server: ServerState, own
     """The map, the regions of the rule, and from where the rule can still be kept at t = 0: green where some
     first action has a certified future from every heading, red where none has from any.
 
-    The shield is asked place by place, for some 8 seconds; the server keeps the pictures asked for last.
+    The shield is asked place by place, for some 8 seconds. The longer its decisions take, the further apart
+    the places are, and the picture says how far. The server keeps the pictures asked for last.
     """
     found = await asyncio.to_thread(server.policies.find, policy_id, owner)
     drawn = server.pictures.peek(found.id)
     if drawn is None:
-        drawn = await server.heavy.run(request, "pictures:draw_policy", found.id, owner)
-        if found.card is not None:  # else it will look otherwise
-            server.pictures.get(found.id, lambda: drawn)
+        drawn, known = await server.heavy.run(request, "pictures:draw_policy", found.id, owner)
+        if known:  # else it may look otherwise
+            server.pictures.put(found.id, drawn)
     return _shown(request, drawn)
 
 

@@ -70,7 +70,7 @@ class Sessions:
         self._shields = Shields(policies, settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
-        self.switches = Switches(store, policies, self._shields, self._threads, heavy, settings)
+        self.switches = Switches(store, policies, self._shields, self._run, heavy, settings)
         self._heavy = heavy
 
     async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
@@ -149,7 +149,7 @@ class Sessions:
         return shown, following
 
     async def delete(self, id: str) -> None:
-        self.steps.forget(id)
+        self.steps.recent.drop(id)
         if not await self._store.delete(id):
             raise missing(id)
 
@@ -181,6 +181,7 @@ class Sessions:
                 change = Change(state.packed(), *session.added())
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue
+            self.steps.recent.drop(id)
             finite = [value if math.isfinite(value) else None for value in bounds]
             return {**describe(session.rules, state), "robustness_bounds": finite}
         raise contended(id)

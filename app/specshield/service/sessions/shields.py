@@ -20,7 +20,7 @@ from specshield.service.heavy.background import Background
 from specshield.service.heavy.tables import Tables
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
-from specshield.service.sessions import rules
+from specshield.service.sessions import record, rules
 from specshield.service.sessions.session import Session, columns
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
@@ -37,6 +37,7 @@ class Shields:
 
     def __init__(self, policies: Policies, room: int) -> None:
         self._policies, self._shields = policies, files.Recent[Shield](room)
+        self._judges = files.Recent[Shield](room)  # without policies, by the digests of what was asked
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
         self.tables = Tables()
@@ -57,9 +58,7 @@ class Shields:
 
     def note_slow(self, session: Session) -> None:
         """One of its decisions has taken long."""
-        key = tuple(session.config["policy_ids"])
-        self._slow.drop(key)
-        self._slow.get(key, lambda: True)
+        self._slow.put(tuple(session.config["policy_ids"]), True)
 
     def get(self, policy_ids: Sequence[str], config: Config) -> Shield:
         def make() -> Shield:
@@ -86,13 +85,18 @@ class Shields:
 
         Needs no policy, since those of a rule that is over may have been deleted.
         """
-        task = self._policies.task(Description(config["map_id"], config["robot"], config["spec"], "", 0, {}))
-        body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
         since = rows[rules.origin(config) :]
         if not len(since):
             return "pending", (-math.inf, math.inf)
-        shield = Shield(task, (), Config(), body, view, conjunction_of(task, task.formula))
-        return episode.close(shield, since[:, :3], columns(since, names))
+        asked = [config[name] for name in ("map_id", "robot", "spec")]
+        judge = self._judges.get(record.digest(files.to_json(asked)), lambda: self._judge(*asked))
+        return episode.close(judge, since[:, :3], columns(since, names))
+
+    def _judge(self, map_id: str, robot: str | dict[str, Any], spec: dict[str, Any]) -> Shield:
+        """A task made anew for each verdict would stay for as long as what is prepared of it (`view_of`)."""
+        task = self._policies.task(Description(map_id, robot, spec, "", 0, {}))
+        body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
+        return Shield(task, (), Config(), body, view, conjunction_of(task, task.formula))
 
     def settled(self, session: Session) -> Session:
         """The session, with the verdicts of the rules that its last switch ended once its x_t is known."""

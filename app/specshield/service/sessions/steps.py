@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import msgspec
 import numpy as np
@@ -20,7 +21,6 @@ from specshield.service.library import files
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import record
-from specshield.service.sessions.recent import RecentSessions
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import (
     RACES,
@@ -41,7 +41,7 @@ from specshield.shield.decision import Decision
 from specshield.shield.taught import Taught, changes_map
 from specshield.task import check_signals
 
-ROOM = 64 << 20  # bytes of sessions kept in memory, some 5,000 of them. Chosen by hand.
+ROOM = 64 << 20  # bytes of sessions kept in memory, some 4,000 of them. Chosen by hand.
 WATCHED = 32  # decisions in threads after a long one. Chosen by hand.
 SHORT = 0.005  # [s]; so long a decision may hold the event loop, as anything else of a request
 LONG = 0.03  # [s] of a processor for one decision
@@ -115,7 +115,9 @@ class Steps:
         self._store, self._shields, self._threads, self._ttl = store, shields, threads, ttl
         self._heavy, self._tell = heavy, tell
         self.deciding = 0  # steps that somebody waits for
-        self._recent, self._paces = RecentSessions(ROOM), files.Recent[Pace](1000)
+        # One may be old, since other processes write too: the script that appends compares versions.
+        self.recent = files.Recent[Session](ROOM, attrgetter("size"))
+        self._paces = files.Recent[Pace](1000)
 
     async def decide(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
         """The answer. `timing` collects the seconds of rollout and store."""
@@ -126,7 +128,7 @@ class Steps:
             self.deciding -= 1
 
     async def _answer(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
-        session, step = self._recent.get(id), None
+        session, step = self.recent.peek(id), None
         if session is not None and request.t < session.state.next_t:
             session = None  # a replay, or an error: both are the store's to tell
         current = False  # whether the session is what the store has just shown
@@ -158,19 +160,17 @@ class Steps:
                 answer = record.told(decided.decision, request.witnesses, request.explain)
                 row = decided.session.rows[-1]
                 self._tell(id, session.version, written, state, row, decided.record, answer)
-                session = replace(decided.session, state=state, version=written)
-                self._recent.put(id, session)
+                if state.finished:  # nobody goes on with it
+                    self.recent.drop(id)
+                else:
+                    self.recent.put(id, replace(decided.session, state=state, version=written))
                 metrics.decided(decided.decision, told_later, timing)
                 return answer
-            self._recent.drop(id)
+            self.recent.drop(id)
             if written is None:
                 raise missing(id)
             session, step, current = Session.of(written), written.step, True
         raise contended(id)
-
-    def forget(self, id: str) -> None:
-        """Frees what a session that is gone takes of memory."""
-        self._recent.drop(id)
 
     def _change(self, decided: Decided, request: StepBody) -> tuple[Change, State]:
         session, decision, content = decided.session, decided.decision, record.encode(decided.record)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -48,23 +47,21 @@ from specshield.shield import episode
 from specshield.shield.decision import Config
 from specshield.shield.signals import any_signal
 
-R = TypeVar("R")
-
 
 class Switches:
-    """Nothing is changed by a switch that is refused."""
+    """Nothing is changed by a switch that is refused. run: calls a function in a thread."""
 
     def __init__(
         self,
         store: Store,
         policies: Policies,
         shields: Shields,
-        threads: ThreadPoolExecutor,
+        run: Callable[..., Awaitable[Any]],
         heavy: Heavy,
         settings: Settings,
     ) -> None:
         self._store, self._policies, self._shields = store, policies, shields
-        self._threads, self._heavy = threads, heavy
+        self._run, self._heavy = run, heavy
         self._ttl, self._most = settings.session_ttl, settings.max_steps
 
     async def make(self, id: str, request: SwitchRequest, owner: str) -> dict[str, Any]:
@@ -113,10 +110,8 @@ class Switches:
                 await asyncio.shield(asyncio.wrap_future(preparing))
             except FragmentError as error:
                 raise refused(shaping, error) from None
-        return await self._run(switched, self._policies, self._shields, wanted, self._most)
-
-    async def _run(self, function: Callable[..., R], *args: Any) -> R:
-        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
+        here: Session = await self._run(switched, self._policies, self._shields, wanted, self._most)
+        return here
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,81 @@
+"""The heat map of a policy: as fine as there is time for, however long a start takes."""
+
+import itertools
+import math
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from specshield.robot import robot_from_json
+from specshield.service.heavy.latest import latest
+from specshield.service.heavy.pictures import FINEST, kept_from
+from specshield.shield.decision import make_shield
+from specshield.shield.proposal import Proposal
+from specshield.task import Task, make_task
+from specshield.world.occupancy import OccupancyGrid
+from tests.service.world import ROBOT, cells
+
+TASK = make_task(OccupancyGrid(cells(), 0.1), robot_from_json(ROBOT), "F[0,1] x > 2")
+
+
+@dataclass(frozen=True, eq=False)
+class Waits:
+    """Proposes to wait; its process is killed at a call, as by the alarm at the end of its time."""
+
+    task: Task
+    killed_at: float = math.inf
+    calls: itertools.count = field(default_factory=itertools.count)
+    id: str = "waits"
+
+    def propose(self, history, signals, margin):
+        if next(self.calls) >= self.killed_at:
+            signal.raise_signal(signal.SIGALRM)
+        return Proposal(np.full((1, 1), self.task.robot.wait_motion), 0)
+
+
+def heats(**options):
+    return kept_from(make_shield([Waits(TASK, **options)]), math.inf)
+
+
+def test_the_grids_become_finer_to_the_finest():
+    every = list(heats())
+    assert [share.shape for share, _, _ in every[:3]] == [(1, 1), (1, 1), (2, 2)]
+    share, pitch, headings = every[-1]
+    assert FINEST < pitch < 1.5 * FINEST
+    assert headings == 4
+    width = share.shape[1]
+    assert np.nanmax(share[:, : width // 3]) == 0.0  # nothing within two steps of x > 2
+    assert np.nanmin(share[:, -width // 3 :]) == 1.0
+    assert np.isnan(share[0]).all()  # the wall
+
+
+def test_none_is_begun_that_would_come_too_late():
+    assert [pitch for _, pitch, _ in kept_from(make_shield([Waits(TASK)]), time.monotonic())] == [4.0]
+
+
+@pytest.mark.parametrize(("calls", "known"), [(0, False), (20, True)])
+def test_what_there_is_when_the_time_is_over_is_shown(calls, known):
+    found = latest(heats(killed_at=calls), 3600.0)
+    assert (found is not None) == known
+    if known:
+        _, coarse, _ = found
+        assert FINEST < coarse < 4.0
+
+
+def test_a_value_that_never_comes_is_not_waited_for():
+    def values():
+        yield os.getpid()
+        signal.setitimer(signal.ITIMER_REAL, 1e-3)  # the rest of its time, however slow the machine
+        while True:
+            pass
+
+    assert latest(values(), 3600.0) != os.getpid()
+
+
+def test_what_goes_wrong_there_leaves_what_came_before(capfd):
+    assert latest((1 / n for n in (1, 0)), 3600.0) == 1.0
+    assert "ZeroDivisionError" in capfd.readouterr().err

@@ -1,0 +1,98 @@
+"""What this process keeps of sessions: no more than its room, and nothing of those that are over."""
+
+import asyncio
+import gc
+import json
+from operator import attrgetter
+
+import httpx
+import numpy as np
+import pytest
+
+from specshield.service.app import create_app
+from specshield.service.library.files import Recent
+from specshield.service.sessions.session import Session
+from specshield.service.sessions.state import State, pack_carry
+from specshield.service.settings import Settings
+from specshield.service.storage.store import Record
+from specshield.shield.decision import Carry
+from specshield.task import Task
+from tests.service.world import LOGITS, START, grid_json, policy_files
+
+ROUNDS = 8
+
+
+def session(formula="F[0,6] Goal", motions=4, horizon=8):
+    carry = Carry(0, np.zeros((motions, 3)), (bytes(horizon),) * motions)
+    state = State(1, 1, True, "pending", 0.0, b"", carry=pack_carry(carry))
+    config = {"spec": {"formula": formula, "regions": {}, "signals": {}}, "seed": 0}
+    return Session.of(Record(json.dumps(config).encode(), state.packed(), b"1", bytes(24), None))
+
+
+def test_the_sessions_used_last_are_kept():
+    recent = Recent(30_000, attrgetter("size"))
+    for i in range(10):
+        recent.put(i, session())
+        assert recent.peek(0) is not None
+    kept = [i for i in range(10) if recent.peek(i) is not None]
+    assert 2 < len(kept) < 10
+    assert kept == [0, *range(11 - len(kept), 10)]
+
+
+@pytest.mark.parametrize("large", [{"formula": "F[0,6] Goal" * 300}, {"motions": 64, "horizon": 1000}])
+def test_a_session_of_a_large_rule_takes_the_place_of_many(large):
+    recent = Recent(30_000, attrgetter("size"))
+    recent.put("small", session())
+    recent.put("small", session())
+    recent.put("large", session(**large))
+    assert recent.peek("small") is None
+    recent.drop("large")
+    recent.put("small", session())
+    assert recent.peek("small") is not None
+
+
+async def _episodes(folder):
+    """ROUNDS episodes each that end by a last step, by being closed and by being erased; one that goes on."""
+    app = create_app(Settings(data_dir=folder, worker=False))
+    transport = httpx.ASGITransport(app)
+    async with (
+        app.routes.router.lifespan_context(app.routes),
+        httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8000", timeout=None) as client,
+    ):
+        while (await client.get("/readyz")).status_code != 200:
+            await asyncio.sleep(0.05)
+
+        async def begin(**options):
+            begun = {"policy_id": policy["id"], "initial_pose": START, **options}
+            made = await client.post("/v1/sessions", json=begun)
+            assert made.status_code == 201, made.text
+            path = f"/v1/sessions/{made.json()['id']}"
+            asked = {"t": 0, "poses": [START], "logits": LOGITS}
+            answer = await client.post(f"{path}/steps", json=asked)
+            assert answer.status_code == 200, answer.text
+            return path
+
+        assert (await client.post("/v1/maps", json=grid_json())).status_code == 201
+        sent = {name: (name, content) for name, content in policy_files().items()}
+        policy = (await client.post("/v1/policies", files=sent)).json()
+        tasks = set()
+        for _ in range(ROUNDS):
+            for ended in (client.delete, lambda path: client.post(f"{path}/close", json={})):
+                assert (await ended(await begin())).is_success
+            path = await begin(max_steps=9)
+            for t in range(1, 10):
+                asked = {"t": t, "poses": [START], "logits": LOGITS}
+                answer = await client.post(f"{path}/steps", json=asked)
+                assert answer.status_code == 200, answer.text
+            assert answer.json()["finished"]
+            gc.collect()
+            tasks.add(sum(isinstance(each, Task) for each in gc.get_objects()))
+        running = (await begin()).rpartition("/")[2]
+        gc.collect()
+        return running, [each.id for each in gc.get_objects() if isinstance(each, Session)], tasks
+
+
+def test_nothing_stays_in_memory_of_a_session_that_is_over(tmp_path):
+    running, held, tasks = asyncio.run(_episodes(tmp_path / "data"))
+    assert held == [running]
+    assert len(tasks) == 1  # as many after each round as after the first
