@@ -158,8 +158,8 @@ class _Motion:
         goal = asked.child if isinstance(asked, Eventually) else asked.right
         does = "is met" if is_predicate(goal) else "begins"
         return (
-            f"the rule could still be kept, but no way was found with the {steps(slack)} in reserve that the "
-            f"session asks for: on the best way found '{goal}' {does} at step {asked.b + late}; the rule "
+            f"a way was found that keeps the rule, but none with the {steps(slack)} in reserve that the "
+            f"session asks for: on the best one '{goal}' {does} at step {asked.b + late}; the rule "
             f"needs that by step {part.conjunct.b}, and with the reserve by step {asked.b}"
         )
 

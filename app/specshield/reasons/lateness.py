@@ -87,9 +87,8 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int |
     and where nothing fails. samples {name: [m]}; now: the last step that was driven; late: its `late_by`.
     """
     match part:
-        case Eventually(_, b, child) if late is not None:
-            does = "is met" if is_predicate(child) else "begins"
-            return f"'{child}' {does} at step {b + late}, {steps(late)} too late"
+        case Eventually() if late is not None:
+            return when(part, late)
         case Until(a, b, left, right) if is_predicate(left) and is_predicate(right):
             return _of_until(part, _holds(left, samples), _holds(right, samples))
         case Always(a, b, child) if is_predicate(child):
@@ -106,6 +105,21 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int |
             first = int(failing[0] + met[0])
             return f"'{child}' holds only from step {first}, {steps(first - a)} too late"
     return None
+
+
+def when(part: Formula, late: int) -> str:
+    """When a conjunct is kept, in words, that comes so many steps too late."""
+    match part:
+        case Eventually(_, b, child):
+            does = "is met" if is_predicate(child) else "begins"
+            told = f"'{child}' {does} at step {b + late}"
+        case Until(_, b, left, right):
+            told = f"'{left}' holds all the way there, but '{right}' is met at step {b + late}"
+        case Always(a, _, child) if is_predicate(child):
+            told = f"'{child}' holds only from step {a + late}"
+        case _:
+            told = f"'{part}' is kept later"
+    return f"{told}, {steps(late)} too late"
 
 
 def _of_until(part: Until, left: Bools, right: Bools) -> str | None:

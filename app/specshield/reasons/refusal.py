@@ -14,7 +14,7 @@ from specshield.arrays import Floats
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
 from specshield.handover import begun
 from specshield.reasons.bound import proof
-from specshield.reasons.lateness import later, steps
+from specshield.reasons.lateness import later, when
 from specshield.reasons.relaxation import Conjunct, relaxations
 from specshield.robot.dynamics import Body
 from specshield.shield import switching
@@ -125,33 +125,30 @@ def refusal(
     bound = proof(shield.task, sure or shield.body, history, signals)
     if bound is not None:
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
-    message = (
-        f"no way from here was found that keeps the rule ({relaxed.tried} were tried): "
-        f"{_wrong(relaxed.conjuncts)}"
-    )
+    message = f"no way from here was found that keeps the rule: {_wrong(relaxed.conjuncts, relaxed.tried)}"
     return Refusal(message, False, relaxed.conjuncts)
 
 
-def _wrong(conjuncts: Sequence[Conjunct]) -> str:
-    """What the conjuncts say of it, in words."""
+def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
+    """What the conjuncts say of it, in words; tried: how many ways were."""
     failing = [each for each in conjuncts if not each.feasible_alone]
     if failing:
         alone = "even with the rest of the rule left out, " if len(conjuncts) > 1 else ""
-        return "; ".join(_fails(each, alone) for each in failing)
+        best = f"{alone}on the best of {tried} that were tried"
+        return "; ".join(_fails(each, best) for each in failing)
     late = [each for each in conjuncts if each.late_by is not None]
     if late:
         return f"each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}"
     return "each part can be kept alone, but no way was found to keep all of them"
 
 
-def _fails(conjunct: Conjunct, alone: str) -> str:
-    part = f"'{_shown(conjunct)}'"
+def _fails(conjunct: Conjunct, best: str) -> str:
     if conjunct.late_by is not None:
-        enough = f"; the whole rule could be kept with {_eased(conjunct)}" if conjunct.only else ""
-        return f"{alone}{part} comes {steps(conjunct.late_by)} too late on the soonest of them{enough}"
-    if math.isfinite(conjunct.robustness):
-        return f"{alone}the nearest of them misses {part} by {abs(conjunct.robustness):.3g}"
-    return f"{alone}none of them keeps {part}"
+        instead = f"; the whole rule could be kept with {_eased(conjunct)}, and perhaps with a smaller change"
+        enough = instead if conjunct.only else ""
+        return f"{best} {when(conjunct.formula, conjunct.late_by)[: 3 * LONGEST]}{enough}"
+    missed = f" by {abs(conjunct.robustness):.3g}" if math.isfinite(conjunct.robustness) else ""
+    return f"{best} '{_shown(conjunct)}' is missed{missed}"
 
 
 def _eased(conjunct: Conjunct) -> str:
