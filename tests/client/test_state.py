@@ -258,7 +258,7 @@ def test_closing_without_a_pose_repeats_the_last_and_delivers_what_was_recorded(
     assert close(session(None, next_t=5), None, VERDICT)[1] == [{}]
 
 
-FAILS = "no way was found that keeps the rule; the best way found does not keep 'F[50,100] Region2'"
+FAILS = "no way was found after it that keeps the rule; the best way found does not keep 'F[50,100] Region2'"
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_what_was_not_found_is_not_called_impossible_and_a_later_end_that_would_
     assert [each["feasible_alone"] for each in told.details["conjuncts"]] == [True, True]
     late = [each["late_by"] for each in told.details["conjuncts"]]
     assert any(late), late
-    assert told.proved or "each part can be kept alone, and all can with '" in told.message
+    assert told.proved or "Each part can be kept alone, and all can with '" in told.message
 
 
 def test_a_rule_that_is_over_and_was_not_kept_could_still_be_kept_later():

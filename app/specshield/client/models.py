@@ -127,7 +127,8 @@ class Explanation:
         if self.is_kept:
             less = f"{self.conjunct} could still be kept, but with less to spare than the session asks for"
             return self.detail or less
-        told = f"no way was found that keeps the rule; the best way found does not keep '{self.conjunct}'"
+        none = "no way was found after it that keeps the rule"
+        told = f"{none}; the best way found does not keep '{self.conjunct}'"
         if self.detail is not None:
             return f"{told}: {self.detail}"
         if self.late_by is not None:
@@ -199,8 +200,8 @@ class Decision:
 
     def why(self, action: int | str) -> str:
         """Why an action, by its index or its name, is forbidden, in a line for people: "m is forbidden: no
-        way was found that keeps the rule; the best way found does not keep 'F[50,100] Region2': 'Region2' is
-        met at step 104, 4 steps too late". The step has to have asked: explain=True.
+        way was found after it that keeps the rule; the best way found does not keep 'F[50,100] Region2':
+        'Region2' is met at step 104, 4 steps too late". The step has to have asked: explain=True.
 
         Raises InputError for an action that there is not.
         """

@@ -20,6 +20,7 @@ from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known, spread
 from specshield.reasons.needs import Need, Reader
 from specshield.robot.dynamics import Body, in_collision, motion_count
+from specshield.stl import Always
 from specshield.task import Task
 
 # Chosen by hand: what is looked at stays within a second.
@@ -157,7 +158,8 @@ class _Ahead:
             if soon > need.last:
                 by = "the rule" if need.before is not None else f"'{need.formula}'"
                 away = f"'{need.predicate}' cannot be met from here before step {int(soon)}{also}"
-                return f"{away}, and {by} needs it by step {need.last}", [need]
+                due = "from" if isinstance(need.formula, Always) else "by"
+                return f"{away}, and {by} needs it {due} step {need.last}", [need]
         asked = ", ".join(str(goal.need.formula) for goal in self.goals)
         return f"not all of these can be reached in time, in whatever order: {asked}", []
 

@@ -158,9 +158,9 @@ class _Motion:
         goal = asked.child if isinstance(asked, Eventually) else asked.right
         does = "is met" if is_predicate(goal) else "begins"
         return (
-            f"a way was found that keeps the rule, but none with the {steps(slack)} in reserve that the "
-            f"session asks for: on the best one '{goal}' {does} at step {asked.b + late}; the rule "
-            f"needs that by step {part.conjunct.b}, and with the reserve by step {asked.b}"
+            f"a way was found after it that keeps the rule, but none with the {steps(slack)} in reserve that "
+            f"the session asks for: on the best one '{goal}' {does} at step {asked.b + late}; the rule needs "
+            f"that by step {part.conjunct.b}, and with the reserve by step {asked.b}"
         )
 
     def known(self) -> str:

@@ -125,7 +125,10 @@ def refusal(
     bound = proof(shield.task, sure or shield.body, history, signals)
     if bound is not None:
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
-    message = f"no way from here was found that keeps the rule: {_wrong(relaxed.conjuncts, relaxed.tried)}"
+    message = (
+        "no way from here was found that keeps the rule, which is no proof that there is none. "
+        f"{_wrong(relaxed.conjuncts, relaxed.tried)}"
+    )
     return Refusal(message, False, relaxed.conjuncts)
 
 
@@ -133,22 +136,21 @@ def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
     """What the conjuncts say of it, in words; tried: how many ways were."""
     failing = [each for each in conjuncts if not each.feasible_alone]
     if failing:
-        alone = "even with the rest of the rule left out, " if len(conjuncts) > 1 else ""
-        best = f"{alone}on the best of {tried} that were tried"
-        return "; ".join(_fails(each, best) for each in failing)
+        alone = ", even with the rest of the rule left out" if len(conjuncts) > 1 else ""
+        return " ".join(_fails(each, f"On the best of {tried} ways tried", alone) for each in failing)
     late = [each for each in conjuncts if each.late_by is not None]
     if late:
-        return f"each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}"
-    return "each part can be kept alone, but no way was found to keep all of them"
+        return f"Each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}"
+    return "Each part can be kept alone, but no way was found to keep all of them"
 
 
-def _fails(conjunct: Conjunct, best: str) -> str:
+def _fails(conjunct: Conjunct, best: str, alone: str) -> str:
     if conjunct.late_by is not None:
-        instead = f"; the whole rule could be kept with {_eased(conjunct)}, and perhaps with a smaller change"
-        enough = instead if conjunct.only else ""
-        return f"{best} {when(conjunct.formula, conjunct.late_by)[: 3 * LONGEST]}{enough}"
+        instead = f" With {_eased(conjunct)} a way for the whole rule was found; a smaller change may do."
+        told = f"{best} {when(conjunct.formula, conjunct.late_by)[: 3 * LONGEST]}{alone}."
+        return told + (instead if conjunct.only else "")
     missed = f" by {abs(conjunct.robustness):.3g}" if math.isfinite(conjunct.robustness) else ""
-    return f"{best} '{_shown(conjunct)}' is missed{missed}"
+    return f"{best} '{_shown(conjunct)}' is missed{missed}{alone}."
 
 
 def _eased(conjunct: Conjunct) -> str:

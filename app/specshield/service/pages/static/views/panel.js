@@ -37,11 +37,11 @@ export function whyNot(decision, action) {
     const misses = told.robustness === null ? null : `it misses it by ${Math.abs(told.robustness).toFixed(2)}`;
     const found = told.detail ?? [late, misses].filter(Boolean).join(", ");
     if (!found) return `no way was found that keeps ${told.conjunct}`;
-    return `no way was found that keeps the rule; the best way found does not keep '${told.conjunct}': ${found}`;
+    return `no way was found after it that keeps the rule; the best way found does not keep '${told.conjunct}': ${found}`;
   }
   if (value === null || value === undefined) return "was not looked at";
   if (value > 0) return `keeps the rule by ${metres(value)}, but not with ${inHand(decision)} in reserve`;
-  return `no way was found that keeps the rule; the best misses it by ${metres(Math.abs(Math.min(0, value)))}`;
+  return `no way was found after it that keeps the rule; the best misses it by ${metres(Math.abs(Math.min(0, value)))}`;
 }
 
 /** What a decision keeps in reserve for a robot that does not land exactly where it should. */
