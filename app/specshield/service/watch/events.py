@@ -258,7 +258,8 @@ class Watchers:
         else:
             feed.rules, feed.told, feed.width = ruled(Session.of(dump))
             new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
-            feed.add(State.of(dump.state), *events(feed, feed.end, new))
+            state, (found, _) = State.of(dump.state), events(feed, feed.end, new)
+            feed.add(state, found, state.next_t)
         feed.version = None
 
     async def _older(self, feed: Feed, t: int) -> tuple[list[Told], int]:
