@@ -91,10 +91,10 @@ class Watchers:
         answered: StepAnswer,
     ) -> None:
         """Notes a step that this process has decided and stored, see `steps.Tell`. Where more is new
-        to the watchers, they read it from the store.
+        to the watchers, they read it from the store; so they do of a rule's first step, with its switch.
         """
         feed = self._feeds.get(id)
-        if feed is not None and feed.version == before and made.t >= feed.end:
+        if feed is not None and feed.version == before and made.t >= feed.end > rules.begins(feed.rules[-1]):
             rule = rules.at(feed.rules, made.t)
             each = Told(shown(id), made.t, b"", rule, row[:3].tolist(), made, answered)
             feed.version, feed.here = after, time.monotonic()
