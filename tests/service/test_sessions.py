@@ -330,7 +330,8 @@ def test_a_policy_in_use_stays_until_its_sessions_are_over(client, begin, policy
     assert answer["session_id"]
     problem(client.delete("/v1/policies/case1"), 409, "in-use")
     for item in client.get("/v1/sessions", params={"limit": 1000}).json()["items"]:
-        if policy["id"] in item["policy_ids"] and item["id"] != session["id"]:
+        had = {id for rule in item["rules"] for id in rule["policy_ids"]}
+        if policy["id"] in had and item["id"] != session["id"]:
             client.delete(f"/v1/sessions/{item['id']}")
     client.post(f"/v1/sessions/{session['id']}/close", json={})
     assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
