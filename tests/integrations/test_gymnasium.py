@@ -17,7 +17,7 @@ pytest.importorskip("minigrid")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from examples import minigrid_rooms  # noqa: E402
-from specshield.errors import InfeasibleStart, RobotError  # noqa: E402
+from specshield.errors import InfeasibleStart, InputError, RobotError  # noqa: E402
 from specshield.integrations import minigrid  # noqa: E402
 from specshield.integrations.gymnasium import ShieldWrapper  # noqa: E402
 from specshield.local import LocalShield  # noqa: E402
@@ -121,6 +121,16 @@ def test_an_agent_that_ends_its_task_leaves_the_rule_to_the_shield() -> None:
     assert len(rewards) == 80  # the second visit cannot be before
     assert sum(rewards) == 6.0  # none for what the shield did alone
     assert 4 not in house.executed
+
+
+def test_an_action_that_there_is_not_does_not_reach_the_environment() -> None:
+    house = House()
+    env = ShieldWrapper(house, LocalShield.shipped("case1"), lambda env: START)
+    env.reset()
+    for action in (-1, 20):
+        with pytest.raises(InputError, match="0 to 19"):
+            env.step(action)
+    assert house.executed == []
 
 
 def test_other_actions_than_the_robots_are_refused() -> None:

@@ -60,6 +60,16 @@ def test_a_sample_that_would_break_the_rule_is_not_chosen() -> None:
     assert chosen.decision.reason == "zero_prior_mass"
 
 
+def test_a_sample_that_is_no_motion_is_left_out() -> None:
+    for lost in (np.nan, np.inf):
+        rows = [np.array([lost, 0.0]), np.array([0.0, lost]), AHEAD]
+        chosen = chooser("F[0,40] x > 2").choose(rows, None)
+        assert (chosen.action, chosen.sample) == (1, 2)
+        assert chosen.decision.distribution[1] == 1.0
+    with pytest.raises(InputError, match="finite"):
+        chooser("F[0,40] x > 2").choose([AHEAD * np.nan], None)
+
+
 def test_an_openpi_policy_keeps_the_rule() -> None:
     pytest.importorskip("openpi_client")
     from examples import sampled_base

@@ -33,6 +33,14 @@ def header(**fields):
     return len(text).to_bytes(8, "little") + text + bytes(8)
 
 
+def test_arrays_of_a_kind_that_is_not_read_are_named(tmp_path):
+    content = header(dtype="BF16", shape=[4])
+    (tmp_path / "policy.safetensors").write_bytes(content)
+    for source in (content, tmp_path / "policy.safetensors"):
+        with pytest.raises(PolicyError, match=r"cannot be read: 'BF16'.* arrays of BOOL, .*, F64"):
+            read_tensors(source)
+
+
 @pytest.mark.parametrize(
     "content",
     [

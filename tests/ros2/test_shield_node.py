@@ -1,6 +1,7 @@
 """The ROS 2 node without ROS: its logic, and its messages against the definitions that rosbags brings.
 
-Not run here: node.py and the launch file, which need rclpy. They are compiled, and what they name is there.
+Not run here: the launch file and most of node.py, which need rclpy. They are compiled, and what they name is
+there.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ import ast
 import math
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -126,6 +130,35 @@ def test_a_robot_off_the_way_is_told_to_stand(logic: Logic) -> None:
 def test_without_a_map_it_says_so() -> None:
     with pytest.raises(SpecshieldError, match="no map"):
         Logic("F[0,9] x > 1", "{}", PARAMETERS["robot"]).on_logits(START, [0.0] * 4)
+
+
+@pytest.mark.parametrize(
+    ("regions", "robot", "named"),
+    [("{", "{}", "regions"), ("[]", "{}", "regions"), ("{}", "stretch", "robot"), ("{}", "[1]", "robot")],
+)
+def test_parameters_that_cannot_be_read_are_named(regions: str, robot: str, named: str) -> None:
+    with pytest.raises(SpecshieldError) as refused:
+        Logic("F[0,9] x > 1", regions, robot)
+    assert refused.value.path == named
+
+
+def test_logits_that_cannot_be_read_do_not_count_against_patience(
+    logic: Logic, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The timer of `patience` seconds begins anew with a decision alone, so that the witness runs."""
+    tree = ast.parse((PACKAGE / "specshield_ros" / "node.py").read_text())
+    for name in {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}:
+        for part in (name.split(".")[0], name):
+            if part not in sys.modules:
+                monkeypatch.setitem(sys.modules, part, MagicMock(Node=object))
+    on_logits = import_module("specshield_ros.node").ShieldNode.on_logits
+    node: Any = MagicMock(logic=logic, pose=lambda: START)
+    for data in ([0.0] * 3, [math.nan] * 4, [0.0] * 4):
+        assert not node.timer.reset.called
+        assert not node.tell.called
+        on_logits(node, SimpleNamespace(data=data))
+    node.timer.reset.assert_called_once()
+    assert node.tell.call_args.args[0].source == "shield"
 
 
 def test_its_messages_are_those_of_ros(logic: Logic) -> None:

@@ -86,8 +86,11 @@ def test_a_session_that_has_left_is_read_byte_for_byte_and_goes_on(url, archive)
         assert await store.dump("robot") == before
         assert [(await store.load("robot", t)).step for t in range(5)] == before.steps
         assert (await store.load("robot", 5)).step is None
-        with pytest.raises(SessionExists):
-            await store.create("robot", b"another", Change(b"state", ROW))
+        await begin(store, "alice@mine", 1)
+        await move(store, "alice@mine")
+        with pytest.raises(SessionExists, match="a session 'mine'") as refused:
+            await store.create("alice@mine", b"another", Change(b"state", ROW))
+        assert refused.value.got == "mine"  # the id that the caller knows, not the key
 
         assert not await in_store(store, "robot")  # reading brings nothing back
         version = await store.append("robot", before.version, change(5))

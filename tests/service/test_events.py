@@ -105,6 +105,33 @@ def test_more_steps_than_are_kept_in_memory(server, client, begin, step):
     assert [t for t, _ in read(server.url, session["id"], after=9)] == [*range(10, 150), END]
 
 
+def test_a_stream_ends_though_a_switch_passed_the_last_steps_over(server, client, begin, step):
+    session = begin()
+    reader = Reader(server.url, session["id"], after=-1)
+    assert step(session, 0, ahead(0)).status_code == 200
+    wait_for(lambda: reader.found, 60.0)
+    asked = {"t": 4, "policy_id": session["policy_ids"][0], "clock": "restart", "poses": ahead(0) * 4}
+    assert client.post(f"/v1/sessions/{session['id']}/switch", json=asked).status_code == 200
+    assert client.post(f"/v1/sessions/{session['id']}/close", json={}).status_code == 200
+    reader.join(60.0)
+    assert [t for t, _ in reader.found] == [0, END]
+    assert json.loads(reader.found[-1][1])["next_t"] == 4
+
+
+def test_a_switch_is_told_however_long_before_the_next_step_it_is_made(server, client, begin, step):
+    session = begin()
+    reader = Reader(server.url, session["id"], after=-1)
+    assert step(session, 0, ahead(0)).status_code == 200
+    wait_for(lambda: reader.found, 60.0)
+    asked = {"t": 1, "policy_id": session["policy_ids"][0], "clock": "restart"}
+    assert client.post(f"/v1/sessions/{session['id']}/switch", json=asked).status_code == 200
+    time.sleep(2.0)  # the stream knows of the switch by now; it has to be told if not, too
+    assert step(session, 3, ahead(3)[1:]).status_code == 200
+    client.post(f"/v1/sessions/{session['id']}/close", json={})
+    reader.join(60.0)
+    assert [t for t, _ in reader.found] == [0, "switch", 3, END]
+
+
 def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_its_readers_go(tmp_path):
     with serving(tmp_path) as one, httpx.Client(base_url=one.url, timeout=None) as client:
         body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from tests.service import world
 from tests.service.world import LOGITS, SPEC, START, ahead, send_policy
 
 
@@ -244,6 +245,23 @@ def test_close_gives_the_verdict_and_keeps_the_trajectory(client, begin, step):
     assert len(client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]) == 9
 
 
+def test_closing_again_answers_once_policy_and_map_are_deleted(client, begin, step, monkeypatch):
+    cells = world.cells()
+    cells[25, 5] = True  # a map that no other test uses
+    monkeypatch.setattr(world, "cells", lambda: cells)
+    map_id = client.post("/v1/maps", json=world.grid_json()).json()["id"]
+    policy = send_policy(client)["id"]
+    closed, ended = begin(policy_id=policy), begin(policy_id=policy, max_steps=8)
+    for t in range(9):
+        assert step(ended, t, ahead(t)[-1:]).status_code == 200
+    paths = [f"/v1/sessions/{session['id']}/close" for session in (closed, ended)]
+    before = client.post(paths[0], json={}).json()
+    assert client.delete(f"/v1/policies/{policy}").status_code == 204
+    assert client.delete(f"/v1/maps/{map_id}").status_code == 204
+    assert client.post(paths[0], json={}).json() == {**before, "robustness_bounds": [None, None]}
+    assert client.post(paths[1], json={}).json()["spec_status"] == "satisfied"
+
+
 def test_close_with_nothing_new_is_a_verdict_on_what_there_is(client, begin):
     closed = client.post(f"/v1/sessions/{begin()['id']}/close", json={}).json()
     assert (closed["spec_status"], closed["finished"]) == ("pending", True)
@@ -312,7 +330,8 @@ def test_a_policy_in_use_stays_until_its_sessions_are_over(client, begin, policy
     assert answer["session_id"]
     problem(client.delete("/v1/policies/case1"), 409, "in-use")
     for item in client.get("/v1/sessions", params={"limit": 1000}).json()["items"]:
-        if policy["id"] in item["policy_ids"] and item["id"] != session["id"]:
+        had = {id for rule in item["rules"] for id in rule["policy_ids"]}
+        if policy["id"] in had and item["id"] != session["id"]:
             client.delete(f"/v1/sessions/{item['id']}")
     client.post(f"/v1/sessions/{session['id']}/close", json={})
     assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204

@@ -229,6 +229,18 @@ def test_a_switch_that_was_written_otherwise_is_found(client, begin, step, switc
             chain.read(content.replace(a, b))
 
 
+def test_a_policy_stays_until_the_last_pose_of_its_rule_is_known(client, begin, step, switch):
+    """What the rule says of that pose is worked out on its map, which goes once no policy is on it."""
+    old = send_policy(client, seed=77)["id"]
+    session, poses = begin(policy_id=old), ahead(4)
+    driven(step, session, poses[:3])
+    assert switch(session, 3, LATER, clock="restart").status_code == 200
+    problem(client.delete(f"/v1/policies/{old}"), 409, "in-use")
+    driven(step, session, poses[3:4], since=3)
+    assert client.delete(f"/v1/policies/{old}").status_code == 204
+    driven(step, session, poses[4:], since=4)
+
+
 def test_of_a_step_and_a_switch_at_once_one_is_first(client, begin, step, switch):
     poses = ahead(4)
     for _ in range(4):

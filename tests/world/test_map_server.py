@@ -154,6 +154,7 @@ WHOLE = png(np.random.default_rng(0).integers(0, 255, (40, 40)))
         (b"P2\n2 2\n255\n0 0 0", "image"),
         (WHOLE[:20], "image"),
         (WHOLE[: len(WHOLE) // 2], "image"),
+        (b"Pf\n1 1\n-1.0\n" + bytes(4), "image"),  # PFM: an image of floats
         (b"P5\n4001 1\n255\n" + bytes(4001), "width"),
         (b"P5\n1 4001\n255\n" + bytes(4001), "height"),
         (b"P5\n0 4\n255\n", "width"),

@@ -195,6 +195,9 @@ def broken(path, value):
         (["doors", 0, "wall0"], "nowhere", "doors[0].wall0"),
         (["doors", 0, "holePolygon"], [], "doors[0].holePolygon"),
         (["walls", 0, "polygon", 0, "z"], "0", "walls[0].polygon[0].z"),
+        (["walls", 2, "id"], "left", "walls[2].id"),
+        (["objects", 0, "kinematic"], "true", "objects[0].kinematic"),
+        (["objects", 0, "children", 0, "kinematic"], 1, "objects[0].children[0].kinematic"),
     ],
 )
 def test_wrong_houses_are_refused_by_path(path, value, named):

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from specshield.client.models import Decision, Pose
-from specshield.errors import RobotError
+from specshield.errors import InputError, RobotError
 from specshield.local import LocalSession, LocalShield
 
 Environment = gymnasium.Env[Any, Any]
@@ -41,7 +41,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     the environment is taken to move exactly as the robot of the shield does.
 
     Raises RobotError at `reset` where the actions are not as many as the robot's, InfeasibleStart there where
-    the rule cannot be kept.
+    the rule cannot be kept, and InputError at `step` for an action that there is not.
     """
 
     def __init__(
@@ -83,6 +83,9 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         assert self.decision is not None
         decision, session, over = self.decision, self.session, self.session.main_task_done
         executed, terminal = int(action), session.info.terminal_actions
+        if not 0 <= executed < len(decision.distribution):
+            expected = f"0 to {len(decision.distribution) - 1}"
+            raise InputError("no such action", path="action", got=executed, expected=expected)
         ends = executed in terminal and decision.distribution[executed] > 0.0 and not over
         if ends and decision.completion_action is not None:
             executed = decision.completion_action

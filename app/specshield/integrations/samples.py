@@ -55,16 +55,20 @@ class SampleShield:
     command_of: Callable[[Floats], tuple[float, float]]
 
     def choose(self, rows: Sequence[Floats], observation: Any) -> Chosen:
-        """rows: the first row of each sample. One decision of the session. Raises InputError for none."""
-        if not len(rows):
-            raise InputError("no samples", path="rows", got=0, expected="at least one")
-        meant = np.array([nearest_action(self.robot, *self.command_of(row)) for row in rows])
+        """rows: the first row of each sample; those whose command is not finite are left out. One decision
+        of the session. Raises InputError where none is left.
+        """
+        commands = np.array([self.command_of(row) for row in rows], np.float64).reshape(-1, 2)
+        usable = np.flatnonzero(np.isfinite(commands).all(axis=1))
+        if not len(usable):
+            raise InputError("no finite samples", path="rows", got=len(rows), expected="at least one")
+        meant = np.array([nearest_action(self.robot, *command) for command in commands[usable]])
         shares = np.bincount(meant, minlength=len(self.robot.actions)) / len(meant)
         with np.errstate(divide="ignore"):
             decision = self.session.step(
                 self.pose_of(observation), np.log(shares), main_task_done=self.session.main_task_done
             )
-        own = np.flatnonzero(meant == decision.execute)
+        own = usable[meant == decision.execute]
         return Chosen(decision.execute, int(own[0]) if len(own) else None, decision)
 
 

@@ -33,8 +33,9 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
         got = None if isinstance(weights, Path) else f"{len(weights)} bytes"
         reason = "it cannot be read" if isinstance(error, OSError) else str(error)
         raise PolicyError(
-            f"not a safetensors file: {reason}", path="weights", got=got, expected="safetensors"
-        ) from error
+            f"the weights cannot be read: {reason}", path="weights", got=got,
+            expected=f"a safetensors file with arrays of {', '.join(KINDS)}",
+        ) from error  # fmt: skip
 
 
 def named_arrays(

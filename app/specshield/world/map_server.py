@@ -128,6 +128,8 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
     """(shade, opacity) in [0, 1], each [height, width]. The size is checked before anything is decoded."""
     try:
         picture = Image.open(io.BytesIO(image), formats=["PPM", "PNG"])
+        if picture.mode == "F":
+            raise ValueError("PFM, which Pillow counts as PPM")
     except Image.DecompressionBombError as error:
         raise MapError(
             "the image is too large",
@@ -144,7 +146,7 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
         ) from error
     check_size(*picture.size)
     try:
-        if picture.mode[0] in "IF":  # 16 bits
+        if picture.mode[0] == "I":  # 16 bits
             shade = np.asarray(picture, dtype=np.float64) / 65535
             return shade, np.ones_like(shade)
         if "A" in picture.mode or "transparency" in picture.info:

@@ -87,6 +87,8 @@ def _walls(house: Any) -> Iterator[tuple[Floats, Floats]]:
     for path, wall in _items(house, "walls"):
         ends = [np.array([x, z]) for x, _, z in _points(wall, "polygon", path, 2)]
         identity = checks.text(checks.member(wall, "id", path), f"{path}.id")
+        if identity in walls:
+            raise checks.wrong("name", f"{path}.id", identity, "an id that no other wall of this house has")
         walls[identity] = ends[0], ends[1]
         if wall.get("empty") is True:
             open_plan.add(identity)
@@ -164,7 +166,10 @@ def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Floats, Floats]]:
             half[:, None] * _rotation(_vector(checks.member(thing, "rotation", path), f"{path}.rotation")).T
         )
         lowest = y - np.abs(edges[:, 1]).sum()
-        if checks.member(thing, "kinematic", path) is True and lowest < STANDS_BELOW:
+        fixed = checks.member(thing, "kinematic", path)
+        if not isinstance(fixed, bool):
+            raise checks.wrong("flag", f"{path}.kinematic", fixed, "true or false")
+        if fixed and lowest < STANDS_BELOW:
             yield np.array([x, z]), edges[:, [0, 2]]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from specshield.errors import SpecshieldError
+from specshield.errors import InputError, SpecshieldError
 from specshield.local import LocalSession, LocalShield
 from specshield.robot.dynamics import make_body, step
 from specshield.world.nav_msgs import from_occupancy_grid
@@ -49,7 +49,8 @@ class Logic:
     """
 
     def __init__(self, rule: str, regions: str, robot: str) -> None:
-        self._rule, self._regions, self._robot = rule, json.loads(regions), json.loads(robot)
+        self._rule, self._robot = rule, _read("robot", robot, (dict, str))
+        self._regions = _read("regions", regions, (dict,))
         self.shield: LocalShield | None = None
         self.session: LocalSession | None = None
         self._grid: OccupancyGrid | None = None
@@ -117,6 +118,17 @@ class Logic:
     def _stopped(self, reason: str) -> Told:
         status = "pending" if self.session is None else self.session.spec_status
         return Told(None, "", "stop", status, reason, None, (), np.empty((0, 3)))
+
+
+def _read(name: str, text: str, kinds: tuple[type, ...]) -> Any:
+    """A parameter that is JSON. Raises InputError for what is not, or is none of these kinds."""
+    try:
+        found = json.loads(text)
+    except ValueError as error:
+        raise InputError(f"not JSON: {error}", path=name, got=text, expected="JSON") from None
+    if not isinstance(found, kinds):
+        raise InputError("not a JSON object", path=name, got=found, expected="a JSON object")
+    return found
 
 
 def grid_of(message: Any) -> OccupancyGrid:

@@ -65,17 +65,19 @@ class ShieldNode(Node):  # type: ignore[misc]
             self.get_logger().error(f"the map cannot be used: {error}")
 
     def on_logits(self, message: Float64MultiArray) -> None:
-        self.timer.reset()
         pose = self.pose()
         if pose is None:
             return
         try:
-            self.tell(self.logic.on_logits(pose, list(message.data)))
-        except SpecshieldError as error:
+            told = self.logic.on_logits(pose, list(message.data))
+        except SpecshieldError as error:  # the model has said nothing, as far as patience goes
             self.get_logger().error(str(error))
+            return
+        self.timer.reset()
+        self.tell(told)
 
     def on_silence(self) -> None:
-        """No logits for `patience` seconds."""
+        """No logits that led to a decision for `patience` seconds."""
         pose = self.pose() if self.logic.session is not None else None
         if pose is not None:
             self.tell(self.logic.silent(pose))

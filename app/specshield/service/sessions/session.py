@@ -113,6 +113,15 @@ def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]
     }
 
 
+def needed(rules: Sequence[Mapping[str, Any]], state: State) -> set[str]:
+    """The policies of the rule in force, and of each before it whose last pose is still to come: what it says
+    of that pose is worked out on its map.
+    """
+    ended = zip(rules, rules[1:], state.verdicts, strict=False)
+    waiting = [a for a, b, verdict in ended if verdict == "pending" and ruled.begins(b) >= state.length]
+    return {id for config in [*waiting, rules[-1]] for id in config["policy_ids"]}
+
+
 def check_step(session: Session, request: StepBody) -> None:
     """Raises what is wrong with asking for a step that was not decided before."""
     state, t = session.state, request.t

@@ -17,7 +17,7 @@ import numpy as np
 
 from specshield import handover
 from specshield.arrays import Floats
-from specshield.errors import FragmentError, InputError, LimitReached, SpecshieldError
+from specshield.errors import FragmentError, InputError, LimitReached, NotFound, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
 from specshield.service.access.keys import OPEN, Key
@@ -37,6 +37,7 @@ from specshield.service.sessions.session import (
     describe,
     lines,
     missing,
+    needed,
     over,
     pack,
 )
@@ -154,7 +155,9 @@ class Sessions:
             raise missing(id)
 
     async def close(self, id: str, request: CloseRequest) -> dict[str, Any]:
-        """The session, with `robustness_bounds` beside its fields. Closing again changes nothing."""
+        """The session, with `robustness_bounds` beside its fields; none where its map has been deleted since.
+        Closing again changes nothing.
+        """
         for _ in range(RACES):
             session = Session.of(await self._load(id))
             state = session.state
@@ -188,7 +191,12 @@ class Sessions:
 
     def _closed(self, session: Session) -> tuple[Session, str, tuple[float, float]]:
         session = self._shields.settled(session)
-        return session, *self._shields.verdict(session.config, session.rows, session.signal_names)
+        try:
+            return session, *self._shields.verdict(session.config, session.rows, session.signal_names)
+        except NotFound:  # the map of a session that has ended may have been deleted
+            if not session.state.finished:
+                raise
+            return session, session.state.spec_status, (-math.inf, math.inf)
 
     async def trajectory(self, id: str) -> tuple[Iterator[bytes], bytes]:
         """One JSON object a step, as `lines` has it; and the rules, as one JSON list."""
@@ -225,9 +233,9 @@ class Sessions:
         while True:
             found, after = await self._store.everything(f"{owner}@", after, 1000)
             for config, state in found:
-                latest = rules.read(config)[-1]
-                if policy_id in latest["policy_ids"] and not State.of(state).finished:
-                    return str(latest["id"])
+                had, now = rules.read(config), State.of(state)
+                if not now.finished and policy_id in needed(had, now):
+                    return str(had[-1]["id"])
             if after is None:
                 return None
 

@@ -18,6 +18,7 @@ from typing import ParamSpec, TypeVar
 import anyio
 
 from specshield.errors import SessionExists
+from specshield.service.access.owners import shown
 from specshield.service.storage.archive import Archive
 from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, keys
 
@@ -68,9 +69,8 @@ class ArchivingStore(Store):
 
     async def create(self, id: str, config: bytes, change: Change) -> bytes:
         if await self.in_thread(self.archive.find, id) is not None:
-            raise SessionExists(
-                f"there is a session {id!r} already", path="id", got=id, expected="an id not in use"
-            )
+            told = f"there is a session {shown(id)!r} already"
+            raise SessionExists(told, path="id", got=shown(id), expected="an id not in use")
         return await super().create(id, config, change)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:

@@ -91,10 +91,10 @@ class Watchers:
         answered: StepAnswer,
     ) -> None:
         """Notes a step that this process has decided and stored, see `steps.Tell`. Where more is new
-        to the watchers, they read it from the store.
+        to the watchers, they read it from the store; so they do of a rule's first step, with its switch.
         """
         feed = self._feeds.get(id)
-        if feed is not None and feed.version == before and made.t >= feed.end:
+        if feed is not None and feed.version == before and made.t >= feed.end > rules.begins(feed.rules[-1]):
             rule = rules.at(feed.rules, made.t)
             each = Told(shown(id), made.t, b"", rule, row[:3].tolist(), made, answered)
             feed.version, feed.here = after, time.monotonic()
@@ -258,7 +258,8 @@ class Watchers:
         else:
             feed.rules, feed.told, feed.width = ruled(Session.of(dump))
             new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
-            feed.add(State.of(dump.state), *events(feed, feed.end, new))
+            state, (found, _) = State.of(dump.state), events(feed, feed.end, new)
+            feed.add(state, found, state.next_t)
         feed.version = None
 
     async def _older(self, feed: Feed, t: int) -> tuple[list[Told], int]:

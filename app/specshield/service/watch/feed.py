@@ -118,7 +118,10 @@ def events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
             while switched and switched[0]["from"] <= t + i:
                 switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
             found.append(Told(shown(feed.id), t + i, switch, rule, row[:3].tolist(), kept, answer))
-    return found, t + len(new.steps)
+    end = t + len(new.steps)
+    # The steps that the last switch passed over are not in the list until one is decided after it. The state
+    # does not tell of them: it may be newer than the steps.
+    return found, end if len(new.steps) == KEPT else max(end, rules.begins(feed.rules[-1]))
 
 
 def outdated(feed: Feed, new: News) -> bool:
