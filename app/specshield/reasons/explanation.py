@@ -144,7 +144,7 @@ class _Motion:
                 return None
             words = missed if late is None else f"it comes {steps(late)} too late"
         elif late is None and not others:
-            words = f"{words}; {missed}"
+            words = f"{words}, by {abs(rho[i]):.3g}{unit}"
         if others:
             return f"{words}, and it does not keep {' and '.join(others)} either"
         return f"{words}, while the rest of the rule is kept" if len(parts) > 1 else words
