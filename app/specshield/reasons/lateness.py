@@ -98,7 +98,7 @@ def in_words(part: Formula, samples: Mapping[str, Floats], now: int, late: int |
             if not len(failing):
                 return None
             if not may_be_late(part, samples, now):
-                return f"'{child}' is broken at step {failing[0]}"
+                return f"'{child}' does not hold at step {failing[0]}"
             met = np.flatnonzero(holds[failing[0] :])
             if not len(met) or failing[0] > a or failing[0] + met[0] > b:
                 return f"'{child}' does not hold at step {failing[0]}"
@@ -126,7 +126,7 @@ def _of_until(part: Until, left: Bools, right: Bools) -> str | None:
     """left, right [m]: where each side holds."""
     met = np.flatnonzero(right[part.a :])
     broken = np.flatnonzero(~left[: part.a + met[0]] if len(met) else ~left)
-    breaks = f"'{part.left}' is broken at step {broken[0]}" if len(broken) else ""
+    breaks = f"'{part.left}' does not hold at step {broken[0]}" if len(broken) else ""
     if not len(met):
         return f"'{part.right}' is not met" + (f", and {breaks}" if breaks else "")
     first = part.a + int(met[0])

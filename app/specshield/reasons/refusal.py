@@ -136,21 +136,22 @@ def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
     """What the conjuncts say of it, in words; tried: how many ways were."""
     failing = [each for each in conjuncts if not each.feasible_alone]
     if failing:
-        alone = ", even with the rest of the rule left out" if len(conjuncts) > 1 else ""
-        return " ".join(_fails(each, f"On the best of {tried} ways tried", alone) for each in failing)
+        alone = "Even with the rest of the rule left out, on" if len(conjuncts) > 1 else "On"
+        return " ".join(_fails(each, f"{alone} the best of {tried} ways tried") for each in failing)
     late = [each for each in conjuncts if each.late_by is not None]
     if late:
         return f"Each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}"
     return "Each part can be kept alone, but no way was found to keep all of them"
 
 
-def _fails(conjunct: Conjunct, best: str, alone: str) -> str:
+def _fails(conjunct: Conjunct, best: str) -> str:
     if conjunct.late_by is not None:
-        instead = f" With {_eased(conjunct)} a way for the whole rule was found; a smaller change may do."
-        told = f"{best} {when(conjunct.formula, conjunct.late_by)[: 3 * LONGEST]}{alone}."
+        found = f" With {_eased(conjunct)} a way for the whole rule was found"
+        instead = f"{found}; a change by fewer steps is not ruled out."
+        told = f"{best} {when(conjunct.formula, conjunct.late_by)[: 3 * LONGEST]}."
         return told + (instead if conjunct.only else "")
     missed = f" by {abs(conjunct.robustness):.3g}" if math.isfinite(conjunct.robustness) else ""
-    return f"{best} '{_shown(conjunct)}' is missed{missed}{alone}."
+    return f"{best} '{_shown(conjunct)}' is missed{missed}."
 
 
 def _eased(conjunct: Conjunct) -> str:
