@@ -8,6 +8,7 @@ import pytest
 from specshield.lookahead import lookahead
 from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.policy.dqn.environment import free_poses
+from specshield.portable import exp
 from specshield.service.sessions.state import pack_carry
 from specshield.shield.decision import Config
 from specshield.shield.episode import close, decide, make_shield, start
@@ -59,7 +60,7 @@ def test_the_guarantee_stays_and_the_path_costs_less(world):
     def check(decision, logits):
         if decision.mode != "shaped":
             return
-        prior, terminal = np.exp(log_softmax(logits)), case.task.robot.terminal
+        prior, terminal = exp(log_softmax(logits)), case.task.robot.terminal
         allowed = (np.array(decision.j_values) == 1.0) | terminal
         assert np.all(decision.distribution[~allowed] == 0.0)
         assert np.array_equal(decision.distribution[terminal], prior[terminal])
