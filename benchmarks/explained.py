@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.ways import Disc, Part, earliest, rule
+from benchmarks.ways import CELL, Disc, Part, earliest, rule
 from evaluation.model.floor_plans import random_house
 from specshield.client.models import Decision
 from specshield.errors import InfeasibleStart
@@ -46,6 +46,7 @@ KINDS = ("reach", "until", "stay", "out", "dwell")
 UNCERTAINTIES = ("none", "learned")
 SEARCHED = """The search takes poses that are nearly the same for one. Where it finds a way, there is one;
 where it finds none, or names the steps that a window would have to end later, there may be a better one."""
+FINE = CELL / 2.0  # [m]
 KNOWN = "a way is known"  # as the line says it
 
 
@@ -60,10 +61,10 @@ class Case:
     pose: Floats
     uncertainty: str
 
-    def way(self, history: Floats, parts: Sequence[Part] | None = None) -> bool:
+    def way(self, history: Floats, parts: Sequence[Part] | None = None, cell: float = CELL) -> bool:
         parts = self.parts if parts is None else parts
         until = max([len(history) - 1, *(part.b + part.dwell for part in parts)])
-        return earliest(self.body, STRETCH.wait_motion, history, parts, until) >= 0
+        return earliest(self.body, STRETCH.wait_motion, history, parts, until, cell) >= 0
 
 
 def drawn(number: int, seed: int, spare: tuple[int, int]) -> Case:
@@ -217,8 +218,8 @@ def fewest_later(case: Case, history: Floats, i: int) -> int | None:
     if part.kind == "out":
         return None
 
-    def enough(late: int) -> bool:
-        return case.way(history, [*case.parts[:i], part.later(late), *case.parts[i + 1 :]])
+    def enough(late: int, cell: float = CELL) -> bool:
+        return case.way(history, [*case.parts[:i], part.later(late), *case.parts[i + 1 :]], cell)
 
     low, high = 0, min(AFTER, part.b - part.a) if part.kind == "stay" else AFTER
     if not enough(high):
@@ -226,6 +227,8 @@ def fewest_later(case: Case, history: Floats, i: int) -> int | None:
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if enough(middle) else (middle, high)
+    while high > 1 and enough(high - 1, FINE):  # what the coarse search missed
+        high -= 1
     return high
 
 

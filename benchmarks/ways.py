@@ -70,9 +70,11 @@ def rule(parts: Sequence[Part]) -> tuple[str, dict[str, Any]]:
     return " and ".join(texts), regions
 
 
-def earliest(body: Body, wait: int, history: Floats, parts: Sequence[Part], until: int) -> int:
+def earliest(
+    body: Body, wait: int, history: Floats, parts: Sequence[Part], until: int, cell: float = CELL
+) -> int:
     """The first step by which the search has met all goals and need only stand from then on; -1 where it
-    finds none up to step `until`. history [t + 1, 3].
+    finds none up to step `until`. history [t + 1, 3]; cell [m]: what counts as one place.
     """
     goals = [part for part in parts if part.is_goal]
     rows = np.array([[*p.disc, p.a, p.b, p.dwell] for p in goals]).reshape(-1, 6)
@@ -91,12 +93,12 @@ def earliest(body: Body, wait: int, history: Floats, parts: Sequence[Part], unti
     height, width = body.occupied.shape
     shape = (
         1 << len(goals),
-        int(height * body.resolution / CELL) + 2,
-        int(width * body.resolution / CELL) + 2,
+        int(height * body.resolution / cell) + 2,
+        int(width * body.resolution / cell) + 2,
         HEADINGS,
     )
     seen = np.zeros(shape, np.uint8)
-    return int(_search(body, wait, history[-1], now, met, begun, rows, guards, until, seen))
+    return int(_search(body, wait, history[-1], now, met, begun, rows, guards, until, seen, cell))
 
 
 @njit(cache=True)
@@ -125,7 +127,7 @@ def _stands(x: float, y: float, first: int, last: int, met: int, guards: Floats)
 
 
 @njit(cache=True)
-def _search(body, wait, pose, now, met0, begun, rows, guards, until, seen):  # type: ignore[no-untyped-def]
+def _search(body, wait, pose, now, met0, begun, rows, guards, until, seen, cell):  # type: ignore[no-untyped-def]
     """A state that was reached may wait where it is; it is gone on from once, and again when a guard ends."""
     every, motions, last = seen.shape[0] - 1, body.translate.shape[0], now
     for g in range(guards.shape[0]):
@@ -151,7 +153,7 @@ def _search(body, wait, pose, now, met0, begun, rows, guards, until, seen):  # t
                 x, y, h = step(body, xs[i], ys[i], hs[i], m)
                 if not _allowed(x, y, t, met[i], guards):
                     continue
-                j, k, q = _place(body, x, y, h)
+                j, k, q = _place(body, x, y, h, cell)
                 if j < 0 or k < 0 or j >= seen.shape[1] or k >= seen.shape[2] or seen[met[i], j, k, q]:
                     continue
                 seen[met[i], j, k, q] = 1
@@ -163,7 +165,7 @@ def _search(body, wait, pose, now, met0, begun, rows, guards, until, seen):  # t
         while i < count:
             if alive[i] and ready[i] <= t and not _allowed(xs[i], ys[i], t, met[i], guards):
                 alive[i] = False
-                j, k, q = _place(body, xs[i], ys[i], hs[i])
+                j, k, q = _place(body, xs[i], ys[i], hs[i], cell)
                 seen[met[i], j, k, q] = 0
             elif alive[i] and ready[i] <= t:
                 for g in range(rows.shape[0]):
@@ -188,6 +190,6 @@ def _search(body, wait, pose, now, met0, begun, rows, guards, until, seen):  # t
 
 
 @njit(cache=True)
-def _place(body, x, y, h):  # type: ignore[no-untyped-def]
-    j, k = int((y - body.origin_y) / CELL), int((x - body.origin_x) / CELL)
+def _place(body, x, y, h, cell):  # type: ignore[no-untyped-def]
+    j, k = int((y - body.origin_y) / cell), int((x - body.origin_x) / cell)
     return j, k, round(h * HEADINGS / (2 * math.pi)) % HEADINGS
