@@ -1,8 +1,10 @@
-"""Arithmetic that comes out the same to the last bit on every x86-64 processor.
+"""Arithmetic that comes out the same to the last bit on x86-64 processors with FMA (made since 2013) and the
+same C library, with and without AVX-512.
 
 What was decided on one machine is decided again on another, to the same bytes (`specshield verify`). numpy
-computes `exp` and `log` in another way where the processor has AVX-512, and `@`, `dot` and `linalg` sum in an
-order that OpenBLAS chooses by the processor. Whatever a decision depends on takes these functions instead.
+computes `exp`, `log`, `tan`, `tanh`, `arctan2` and powers in another way where the processor has AVX-512, and
+`@`, `dot` and `linalg` sum in an order that OpenBLAS chooses by the processor. Whatever a decision depends on
+takes these functions instead.
 """
 
 from __future__ import annotations
@@ -23,6 +25,12 @@ def exp(values: Floats) -> Floats:
 def log(values: Floats) -> Floats:
     """The natural logarithm of each of the values, any shape."""
     return np.log(values)
+
+
+@kernel
+def arctan2(y: Floats, x: Floats) -> Floats:
+    """The direction of each (x, y), any shape [rad]."""
+    return np.arctan2(y, x)
 
 
 def inner(first: Floats, second: Floats) -> Floats:

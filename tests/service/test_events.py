@@ -132,6 +132,21 @@ def test_a_switch_is_told_however_long_before_the_next_step_it_is_made(server, c
     assert [t for t, _ in reader.found] == [0, "switch", 3, END]
 
 
+def test_two_switches_with_no_step_between_are_both_told(server, client, begin, step):
+    session = begin()
+    reader = Reader(server.url, session["id"], after=-1)
+    assert step(session, 0, ahead(0)).status_code == 200
+    wait_for(lambda: reader.found, 60.0)
+    for t in (2, 4):
+        asked = {"t": t, "policy_id": session["policy_ids"][0], "clock": "restart", "poses": ahead(0) * 2}
+        assert client.post(f"/v1/sessions/{session['id']}/switch", json=asked).status_code == 200
+        time.sleep(2.0)  # the stream knows of it by now
+    assert step(session, 5, ahead(0) * 2).status_code == 200
+    client.post(f"/v1/sessions/{session['id']}/close", json={})
+    reader.join(60.0)
+    assert [t for t, _ in reader.found] == [0, "switch", "switch", 5, END]
+
+
 def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_its_readers_go(tmp_path):
     with serving(tmp_path) as one, httpx.Client(base_url=one.url, timeout=None) as client:
         body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}

@@ -4,8 +4,11 @@ import itertools
 import math
 import os
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,6 +79,29 @@ def test_a_value_that_never_comes_is_not_waited_for():
     assert latest(values(), 3600.0) != os.getpid()
 
 
-def test_what_goes_wrong_there_leaves_what_came_before(capfd):
-    assert latest((1 / n for n in (1, 0)), 3600.0) == 1.0
+def test_a_fork_that_fails_is_not_taken_for_one_that_had_no_more_time(capfd):
+    with pytest.raises(MemoryError):
+        latest((1 / n for n in (1, 0)), 3600.0)
     assert "ZeroDivisionError" in capfd.readouterr().err
+
+
+def test_a_fork_ends_with_the_process_that_wants_its_values():
+    """Whoever asks for a picture may go away, and then what draws it is killed."""
+    code = (
+        "import os, sys, time\n"
+        "from specshield.service.heavy.latest import latest\n"
+        "def values():\n"
+        "    yield os.getpid()\n"
+        "    print(os.getpid(), flush=True)\n"
+        "    time.sleep(600)\n"
+        "latest(values(), 600.0)\n"
+    )
+    begun = time.monotonic()
+    asking = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert asking.stdout is not None
+    fork = int(asking.stdout.readline())
+    asking.kill()
+    asking.communicate()
+    while Path(f"/proc/{fork}").exists():  # it would be there for ten minutes
+        assert time.monotonic() - begun < 300.0
+        time.sleep(0.05)

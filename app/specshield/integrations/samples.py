@@ -58,7 +58,7 @@ class SampleShield:
         """rows: the first row of each sample; those whose command is not finite are left out. One decision
         of the session. Raises InputError where none is left.
         """
-        commands = np.array([self.command_of(row) for row in rows], np.float64).reshape(-1, 2)
+        commands = np.array([self.command_of(row) for row in rows], np.float64).reshape(len(rows), 2)
         usable = np.flatnonzero(np.isfinite(commands).all(axis=1))
         if not len(usable):
             raise InputError("no finite samples", path="rows", got=len(rows), expected="at least one")

@@ -31,7 +31,7 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
     except Exception as error:  # the parser raises its own types for hostile bytes
         # No path of this machine is told: not as what was got, nor by an error of the system's.
         got = None if isinstance(weights, Path) else f"{len(weights)} bytes"
-        reason = "it cannot be read" if isinstance(error, OSError) else str(error)
+        reason = "the file cannot be opened" if isinstance(error, OSError) else str(error)
         raise PolicyError(
             f"the weights cannot be read: {reason}", path="weights", got=got,
             expected=f"a safetensors file with arrays of {', '.join(KINDS)}",

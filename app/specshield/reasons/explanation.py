@@ -25,7 +25,7 @@ from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.proposal import ask
-from specshield.stl import SATISFIED_ABOVE, Eventually, Formula, Until
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Until
 from specshield.stl.fragment import is_predicate
 
 # Chosen by hand; an explanation costs some 10 ms.
@@ -144,7 +144,8 @@ class _Motion:
                 return None
             words = missed if late is None else f"it comes {steps(late)} too late"
         elif late is None and not others:
-            words = f"{words}, by {abs(rho[i]):.3g}{unit}"
+            by = "by" if isinstance(conjunct, Always) else "and the part is missed by"
+            words = f"{words}, {by} {abs(rho[i]):.3g}{unit}"
         if others:
             return f"{words}, and it does not keep {' and '.join(others)} either"
         return f"{words}, while the rest of the rule is kept" if len(parts) > 1 else words

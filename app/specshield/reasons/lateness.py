@@ -118,7 +118,7 @@ def when(part: Formula, late: int) -> str:
         case Always(a, _, child) if is_predicate(child):
             told = f"'{child}' holds only from step {a + late}"
         case _:
-            told = f"'{part}' is kept later"
+            return f"'{part}' is kept {steps(late)} too late"
     return f"{told}, {steps(late)} too late"
 
 

@@ -140,8 +140,8 @@ def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
         return " ".join(_fails(each, f"{alone} the best of {tried} ways tried") for each in failing)
     late = [each for each in conjuncts if each.late_by is not None]
     if late:
-        return f"Each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}"
-    return "Each part can be kept alone, but no way was found to keep all of them"
+        return f"Each part can be kept alone, and all can with {' or with '.join(map(_eased, late))}."
+    return "Each part can be kept alone, but no way was found to keep all of them."
 
 
 def _fails(conjunct: Conjunct, best: str) -> str:

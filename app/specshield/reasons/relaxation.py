@@ -35,10 +35,10 @@ class Conjunct:
     """One conjunct of a rule that cannot be kept.
 
     feasible_alone: whether a future was found that keeps it, whatever becomes of the others. robustness: the
-    highest found beside the others, where these can be kept without it, else of it alone [m]; -inf where
-    nothing was tried. late_by: how many steps later its window would have to end (that of a G over a place,
-    to begin), for it alone where it is not feasible alone, else for the whole rule; None where none was found
-    to do. only: whether this is all that the whole rule lacks.
+    highest found beside the others, where it can be kept alone and they can without it, else of it alone [m];
+    -inf where nothing was tried. late_by: how many steps later its window would have to end (that of a G over
+    a place, to begin), for it alone where it is not feasible alone, else for the whole rule; None where none
+    was found to do. only: whether this is all that the whole rule lacks.
     """
 
     formula: Formula
@@ -91,7 +91,7 @@ def _told(part: Formula, i: int, rho: Floats, late: Floats, keeps: Bools) -> Con
     alone = bool(keeps[i].any())
     whole = float(late[i][beside].min(initial=np.inf))
     soonest = whole if alone else float(late[i].min())
-    highest = float(rho[i][beside].max() if beside.any() else rho[i].max())
+    highest = float(rho[i][beside].max() if alone and beside.any() else rho[i].max())
     late_by = int(soonest) if 0.0 < soonest < np.inf else None
     return Conjunct(part, alone, highest, late_by, late_by is not None and soonest == whole)
 

@@ -122,12 +122,13 @@ class Logic:
 
 def _read(name: str, text: str, kinds: tuple[type, ...]) -> Any:
     """A parameter that is JSON. Raises InputError for what is not, or is none of these kinds."""
+    expected = "a JSON object" + (", or a preset's name in quotes" if str in kinds else "")
     try:
         found = json.loads(text)
     except ValueError as error:
-        raise InputError(f"not JSON: {error}", path=name, got=text, expected="JSON") from None
+        raise InputError(f"not JSON: {error}", path=name, got=text, expected=expected) from None
     if not isinstance(found, kinds):
-        raise InputError("not a JSON object", path=name, got=found, expected="a JSON object")
+        raise InputError("not what this parameter holds", path=name, got=found, expected=expected)
     return found
 
 

@@ -32,9 +32,9 @@ def _drawn(said: str, **told: str) -> dict[int | str, dict[str, Any]]:
 )
 async def policy(policy_id: PolicyId, request: Request, server: ServerState, owner: Owner) -> Response:
     """The map, the regions of the rule, and from where the rule can still be kept at t = 0: green where some
-    first action has a certified future from every heading, red where none has from any.
+    first action has a certified future from every heading that was looked at, red where none has from any.
 
-    The shield is asked place by place, for some 8 seconds. The longer its decisions take, the further apart
+    The shield is asked place by place, for some seconds. The longer its decisions take, the further apart
     the places are, and the picture says how far. The server keeps the pictures asked for last.
     """
     found = await asyncio.to_thread(server.policies.find, policy_id, owner)

@@ -34,6 +34,7 @@ from specshield.service.watch.feed import (
     last_event,
     last_of_several,
     outdated,
+    reached,
     ruled,
 )
 
@@ -98,7 +99,7 @@ class Watchers:
             rule = rules.at(feed.rules, made.t)
             each = Told(shown(id), made.t, b"", rule, row[:3].tolist(), made, answered)
             feed.version, feed.here = after, time.monotonic()
-            feed.add(state, [each], made.t + 1)
+            feed.add(state, [each], made.t + 1, made.t + 1)
 
     async def open(self, id: str, after: int | None) -> AsyncIterator[bytes] | None:
         """The stream of what follows step `after`, by default the last one decided; None where nothing will.
@@ -237,8 +238,9 @@ class Watchers:
             feed.wake()
             return
         state, (found, end) = State.of(new.state), events(feed, feed.end, new)
-        feed.add(state, found, end)
-        if end >= state.next_t:  # else there is more, for the next look
+        upto = reached(feed, end, new)
+        feed.add(state, found, end, upto)
+        if upto >= state.next_t:  # else there is more, for the next look
             feed.version = version
 
     async def _switched(self, feed: Feed) -> bool:
@@ -259,7 +261,7 @@ class Watchers:
             feed.rules, feed.told, feed.width = ruled(Session.of(dump))
             new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
             state, (found, _) = State.of(dump.state), events(feed, feed.end, new)
-            feed.add(state, found, state.next_t)
+            feed.add(state, found, state.next_t, state.next_t)
         feed.version = None
 
     async def _older(self, feed: Feed, t: int) -> tuple[list[Told], int]:

@@ -80,12 +80,14 @@ class Feed:
     recent: deque[Told] = field(default_factory=lambda: deque(maxlen=KEPT))
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
-    def add(self, state: State, found: Sequence[Told], end: int) -> None:
+    def add(self, state: State, found: Sequence[Told], end: int, reached: int) -> None:
+        """end: the step that follows those read; reached: the same, past those that a switch passed over."""
         for each in found:
             if len(self.recent) == KEPT:
                 self.start = self.recent[0].t + 1
             self.recent.append(each)
-        self.end, self.over, self.status = end, state.finished and end >= state.next_t, state.spec_status
+        self.over, self.status = state.finished and reached >= state.next_t, state.spec_status
+        self.end = reached if self.over else end  # a switch that is not told yet lies from `end` on
         self.wake()
 
     def since(self, t: int) -> list[Told]:
@@ -118,10 +120,15 @@ def events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
             while switched and switched[0]["from"] <= t + i:
                 switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
             found.append(Told(shown(feed.id), t + i, switch, rule, row[:3].tolist(), kept, answer))
-    end = t + len(new.steps)
-    # The steps that the last switch passed over are not in the list until one is decided after it. The state
-    # does not tell of them: it may be newer than the steps.
-    return found, end if len(new.steps) == KEPT else max(end, rules.begins(feed.rules[-1]))
+    return found, t + len(new.steps)
+
+
+def reached(feed: Feed, end: int, new: News) -> int:
+    """The step that follows those that `new` has, which end before `end`, and those that the last switch
+    passed over: these are not in the list until one is decided after them. The state does not tell of them:
+    it may be newer than the steps.
+    """
+    return end if len(new.steps) == KEPT else max(end, rules.begins(feed.rules[-1]))
 
 
 def outdated(feed: Feed, new: News) -> bool:

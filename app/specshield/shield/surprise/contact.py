@@ -15,6 +15,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
+from specshield.portable import arctan2
 from specshield.robot.body import centre
 from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
@@ -147,7 +148,7 @@ def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floa
     row, column = (each.ravel() for each in np.meshgrid(rows, columns, indexing="ij"))
     cells = row * width + column
     yaw = math.atan2(body.sin_yaw, body.cos_yaw)
-    bearing = np.arctan2((row + 0.5) * h - v, (column + 0.5) * h - u) + yaw
+    bearing = arctan2((row + 0.5) * h - v, (column + 0.5) * h - u) + yaw
     return cells, _gaps(body, cells, pose[None]), bearing
 
 
