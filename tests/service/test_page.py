@@ -114,7 +114,7 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
         page.get_by_role("heading", name="Step 0").wait_for()
         forbidden = page.locator("tr", has=page.locator(".cannot"), has_text="moves 0.20 m").first
         assert "forbidden" in forbidden.inner_text()
-        assert re.search(r"misses (it )?by|too late|could not be kept", forbidden.inner_text())
+        assert re.search(r"misses (it )?by|too late|does not hold", forbidden.inner_text())
         assert "got 0.0 %" in forbidden.locator(".bars").get_attribute("aria-label")
         look(page, "forbidden")
 

@@ -151,7 +151,8 @@ class _Ahead:
                 continue
             need, soon = goal.need, min(soonest[bit], step + float(steps[:, bit].min()))
             beside = [g.formula for g in self.guards if g.formula is not need.formula and g.first <= step]
-            kept = " and ".join(map(str, [*beside, *([] if need.before is None else [need.before])]))
+            others = [*beside, *([] if need.before is None else [need.before])]
+            kept = " and ".join(f"'{each}'" for each in others)
             also = f" while {kept} is kept" if kept else ""
             if soon == math.inf:
                 return f"no way leads to where {need.formula} can be met{also}", [need]

@@ -127,7 +127,7 @@ def refusal(
         return Refusal(f"no way from here keeps the rule: {bound}", True, relaxed.conjuncts)
     message = (
         "no way from here was found that keeps the rule, which is no proof that there is none. "
-        f"{_wrong(relaxed.conjuncts, relaxed.tried)}"
+        f"{_wrong(relaxed.conjuncts, relaxed.tried).removesuffix('.')}"
     )
     return Refusal(message, False, relaxed.conjuncts)
 
