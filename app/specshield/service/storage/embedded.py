@@ -86,6 +86,11 @@ class EmbeddedStore:
         poll.register(self._use, 0)
         return not poll.poll(0)  # a pipe without a reader is in error
 
+    @property
+    def held(self) -> tuple[int, ...]:
+        """The descriptor that keeps the store running, once this process has joined it."""
+        return () if self._use is None else (self._use,)
+
     def leave(self) -> None:
         if self._use is not None:
             os.close(self._use)

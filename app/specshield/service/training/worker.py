@@ -41,9 +41,11 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
     failed the worker for good.
     """
     logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
+    held = tuple[int, ...]()
     if settings.redis_url is None:
         embedded = EmbeddedStore(settings.data_dir)
         embedded.join()
+        held = embedded.held
         os.environ["REDIS_URL"] = embedded.url  # for the runs
     url = os.environ.get("REDIS_URL") or str(settings.redis_url)
     os.environ["REDIS_URL"] = url  # for the second process, too
@@ -59,7 +61,7 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
     else:
         _tell(methods)
         methods = [name for name in methods if name not in learning]
-    second = _Second() if (learning or others) and not learner else None
+    second = _Second(held) if (learning or others) and not learner else None
 
     def live() -> None:
         jobs.worker_lives(methods)
@@ -84,16 +86,20 @@ def _tell(methods: Sequence[str]) -> None:
 
 
 class _Second:
-    """The process for what takes hours. It ends when this process does: its standard input is a pipe."""
+    """The process for what takes hours. It ends when this process does: its standard input is a pipe.
 
-    def __init__(self) -> None:
+    held: descriptors that keep the embedded store running, so that it is there when a run is handed back.
+    """
+
+    def __init__(self, held: tuple[int, ...]) -> None:
+        self._held = held
         self._process: subprocess.Popen[bytes] | None = None
 
     def ensure(self) -> None:
         """Starts it, or starts it again."""
         if self._process is None or self._process.poll() is not None:
             command = [sys.executable, "-m", "specshield.cli", "worker", "--until-eof", "--learner"]
-            self._process = subprocess.Popen(command, stdin=subprocess.PIPE)
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=self._held)
 
 
 class _Worker(Worker):
