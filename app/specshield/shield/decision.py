@@ -149,7 +149,8 @@ def make_shield(
     )
 
 
-Stuck = tuple[float, float, float, int]  # a pose, and a motion that led nowhere from it
+# A pose, and a motion that led nowhere from it; ~motion where it did nothing and may only have slipped.
+Stuck = tuple[float, float, float, int]
 
 
 @dataclass(frozen=True)

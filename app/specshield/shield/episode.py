@@ -39,7 +39,8 @@ from specshield.shield.judgement import (
     witnesses_of,
 )
 from specshield.shield.signals import judged_by_signals
-from specshield.shield.taught import doubted, doubtful, handed_on, on_map, teach, wary
+from specshield.shield.surprise.doubt import tried_again
+from specshield.shield.taught import doubtful, handed_on, on_map, teach, wary
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
@@ -128,7 +129,7 @@ def decide(
     log_prior = shaping.log_prior_of(task.robot, logits, main_task_done)
     taught, said = teach(shield, carry, poses, occupied, free)
     said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)), *said)
-    told, shield = shield, on_map(shield, taught.map)
+    told, shield = shield, on_map(shield, taught.map, barred=taught.barred)
     nexts = np.empty((len(robot.motions), 3))
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses, task.horizon - t, len(robot.motions))
@@ -148,13 +149,11 @@ def decide(
         answer = _unmodified(shield, log_prior)
     else:
         shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
-        for doubt in () if judged.some else doubted(taught, t):
-            found = judged_by_signals(on_map(told, doubt.map, True), prefix, tail, spec_status, care)
-            if found[2].some:
-                (shield, prefix, judged, withstands), taught = found, doubt
-                said = (*said, "no way was left, so what was run into is tried again")
-                touches = _look_around(shield.body, poses[-1], nexts)
-                break
+        believed = None if judged.some else tried_again(told, taught, prefix, tail, spec_status, care)
+        if believed is not None:
+            taught, (shield, prefix, judged, withstands) = believed
+            said = (*said, "no way was left, so what was run into is tried again")
+            touches = _look_around(shield.body, poses[-1], nexts)
         judged = without(recovered(shield, judged), shield, doubts := doubtful(told, taught, poses[-1]))
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory

@@ -11,6 +11,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
+from specshield.robot.barred import in_vain
 from specshield.rule.residual import again, joined, left_over
 from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
@@ -37,6 +38,7 @@ class Judged:
     margin: float  # [m] and
     slack: int  # [steps]: how much of what was asked for can be had
     margin_unattainable: bool  # it is less
+    vain: bool  # whether every future that keeps the rule goes by what led nowhere before
 
     @cached_property
     def some(self) -> bool:
@@ -54,15 +56,15 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     motions = len(robot.motions)
     tried = futures(prefix, shield.body, shield.proposers, tail, asked)
     kept, leaves = tried.rho, tried.leaves
-    best, part = best_of(tried, kept, motions), prefix
+    best, part, vain = best_of(tried, kept, motions), prefix, False
     if violated:
         tried, best, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried)
-    if care.barred:
-        leads = np.any(tried.poses != prefix.poses[-1], axis=2)  # away from x_t
-        first_away = tried.motions[np.arange(len(kept)), np.argmax(leads, axis=1)]
-        others = np.where(np.isin(first_away, care.barred), -np.inf, kept)
-        if others.max() > SATISFIED_ABOVE:
+    if care.barred is not None:
+        goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses)
+        others = np.where(goes, -np.inf, kept)
+        vain = others.max() <= SATISFIED_ABOVE
+        if not vain:
             kept, best = others, best_of(tried, others, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
@@ -79,7 +81,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     completion = int(robot.representative[first])
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
     asked_and_had = aimed.margin, aimed.slack, aimed.lowered
-    return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had)
+    return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had, vain)
 
 
 def recovered(shield: Shield, judged: Judged) -> Judged:

@@ -8,34 +8,25 @@ from __future__ import annotations
 
 import struct
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from specshield.arrays import Bools, Floats
+from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import leaf
+from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import Body, make_body, overlap, successors
 from specshield.shield.caution.experience import was_stopped, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
-from specshield.shield.surprise.contact import (
-    NEAR,
-    UNDER,
-    Followed,
-    Near,
-    cells_met,
-    cells_under,
-    contact_of,
-    is_near,
-)
+from specshield.shield.surprise.contact import NEAR, UNDER, Followed, Near, cells_met, cells_under, contact_of
+from specshield.shield.surprise.vain import barred_by, halted, halts_at, led_nowhere
 from specshield.shield.uncertainty import Care
 from specshield.world.learned import (
     BEHIND,
     CONTACT,
-    LEFT,
-    RIGHT,
     SENT,
     LearnedMap,
     applied,
@@ -45,17 +36,15 @@ from specshield.world.learned import (
     learn,
     revised,
 )
+from specshield.world.occupancy import OccupancyGrid
 
-# [steps] what a way around something takes, or someone who stands in it for 20 steps. Chosen by hand: of 60 runs
-# of case 2, `evaluation worlds --world person --sensing scan` kept 57 with 20, 59 with 24 and 58 with 28.
-AROUND = 24
-GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
-DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand
+# [steps] what a way around something takes that only contacts show. Chosen by hand: of 60 runs in cases 1 and
+# 2, `evaluation worlds --world obstacle --sensing contact` kept 58 and 52 with 12, and 59 and 56 with 20.
+AROUND = 20
 NEARBY = 2.0  # [m] poses farther away than this say nothing of a thing that was run into
 KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 
 
-MOST_STUCK = 16  # places that are kept from which a motion led nowhere
 HEAD = struct.Struct("<h?hB")  # what `Followed` holds
 MOST_MET = 255  # contacts at one pose that HEAD can hold
 
@@ -65,15 +54,20 @@ class Taught:
     """What a session has learned: its map, and how its caller follows what is drawn.
 
     contact: whether the last motion ran into something; it is not handed on. stuck: where the robot stood and
-    which motion led nowhere from there, though no mark explains it; handed on beside the bytes. barred: those
-    motions that led nowhere from where the robot is now.
+    which motion led nowhere from there, whatever is marked; handed on beside the bytes. near: how far apart
+    two poses are that may be one.
     """
 
     map: LearnedMap = field(default_factory=LearnedMap)
     followed: Followed = field(default_factory=Followed)
     contact: bool = False
     stuck: tuple[Stuck, ...] = ()
-    barred: tuple[int, ...] = ()
+    near: Near = NEAR
+
+    @cached_property
+    def barred(self) -> Floats:
+        """[n, 6]: what no future goes by where another keeps the rule."""
+        return barred_by(self.stuck, self.near)
 
     def to_bytes(self) -> bytes:
         known = self.followed
@@ -109,9 +103,14 @@ def teach(
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
-        motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near)
-        if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses):
-            motion, followed = -1, replace(followed, met=0)
+        halts = halts_at(stuck, poses[-1], followed.drawn, near)
+        motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, halts > 0)
+        if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses, halts):
+            motion, followed = -1, replace(followed, halted=motion, met=0)
+        if motion >= 0:
+            stuck = led_nowhere(stuck, poses[-1], motion, near)
+        elif followed.halted >= 0 and followed is not before.followed:
+            stuck = halted(stuck, poses[-1], followed.halted)
         half_way = np.empty(3)
         covers = _covers(body, poses[-2], poses[-1], half_way)
         for pose, deep in zip((half_way, poses[-1]), covers, strict=True):
@@ -119,10 +118,10 @@ def teach(
                 known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)
         if motion >= 0:
             driven = poses[np.hypot(*(poses[:, :2] - poses[-1, :2]).T) <= NEARBY]
-            for by, cells in cells_met(body, poses[-1], motion, driven):
-                # A cell along the front was touched, which replaces a guess. A guess replaces nothing.
-                kept = known.cell if by == BEHIND else known.cell[known.by != BEHIND]
-                known = learn(grid, known, t, np.setdiff1d(cells, kept), True, by)
+            marked = _marked(grid, known, t, cells_met(body, poses[-1], motion, driven))
+            if marked is known:  # the footprint is told wrong: it seems to have been where it met something
+                marked = _marked(grid, known, t, cells_met(body, poses[-1], motion, poses[-1:]))
+            known = marked
     beyond = 0
     for name, points in (("free", free), ("occupied", occupied)):  # what is both is taken for occupied
         if points is not None:
@@ -131,18 +130,16 @@ def teach(
             beyond += outside
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
-    if motion >= 0 and is_near(poses[-2:-1], poses[-1], near):
-        leads = np.empty((len(shield.task.robot.motions), 3))
-        successors(body_on(shield, own), poses[-1], leads)
-        if not is_near(leads[motion : motion + 1], poses[-1], near):  # no mark explains it
-            known_before = [each for each in stuck if each[3] != motion or not _is_at(each, poses[-1], near)]
-            stuck = (*known_before, (*poses[-1].tolist(), motion))[-MOST_STUCK:]
-    barred = tuple(each[3] for each in stuck if _is_at(each, poses[-1], near))
-    return Taught(own, followed, motion >= 0, stuck, barred), said
+    return Taught(own, followed, motion >= 0, stuck, near), said
 
 
-def _is_at(stuck: Stuck, pose: Floats, near: Near) -> bool:
-    return bool(is_near(np.array([stuck[:3]]), pose, near))
+def _marked(grid: OccupancyGrid, known: LearnedMap, t: int, met: list[tuple[int, Ints]]) -> LearnedMap:
+    """With what a motion may have met (surprise/contact.py) at step t; the same map where all is marked."""
+    for by, cells in met:
+        # A cell along the front was touched, which replaces a guess. A guess replaces nothing.
+        new = np.setdiff1d(cells, known.cell if by == BEHIND else known.cell[known.by != BEHIND])
+        known = learn(grid, known, t, new, True, by) if len(new) else known
+    return known
 
 
 @leaf
@@ -161,33 +158,12 @@ def wary(config: Config, care: Care, taught: Taught) -> Care:
     if not config.learn_map:
         return care
     least = care.least if config.uncertainty is None else max(care.least, AROUND)
-    return replace(care, least=least, barred=taught.barred)
+    return replace(care, least=least, barred=taught.barred if len(taught.barred) else None)
 
 
 def changes_map(learned: bytes | None) -> bool:
     """Whether a session's map has ever changed. learned: as the carry has it."""
     return learned is not None and len(learned) > HEAD.size
-
-
-def doubted(taught: Taught, t: int) -> Iterator[Taught]:
-    """What may be believed of contacts where no way is left, in the order in which it is to be tried.
-
-    A motion that stopped short met something, but nobody knows where along its front, nor how large it is. So
-    less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
-    lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
-    before was wrong, and the next one is tried first. Last, contacts that were made DOUBTED_AFTER steps ago
-    or earlier are forgotten, since nothing that only runs into things ever sees that one is gone.
-    """
-    known = taught.map
-    young = t - known.step < DOUBTED_AFTER
-    seen = ~known.occupied | (known.by == SENT)
-    first = max(taught.followed.met - 1, 0) % len(GUESSES)
-    for held in GUESSES[first:] + GUESSES[:first]:
-        stays = seen | np.isin(known.by, held)
-        if not stays.all() and (~seen & stays).any():
-            yield replace(taught, map=revised(known, forget(known, ~stays)))
-    if not (seen | young).all():
-        yield replace(taught, map=revised(known, forget(known, ~(seen | young))))
 
 
 def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
@@ -204,18 +180,24 @@ def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
         for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
             successors(body_on(told, believed), pose, end)
         doubts |= np.any(ends[0] != ends[1], axis=1)
-    if taught.barred:
-        doubts[list(taught.barred)] = True
+    if len(taught.barred):
+        x, y, theta = pose
+        doubts |= [is_barred(taught.barred, x, y, theta, motion) for motion in range(motions)]
     return doubts
 
 
-def on_map(shield: Shield, known: LearnedMap, guess: bool = False) -> Shield:
-    """The shield on a session's own map. guess: whether it is one of several that a decision tries."""
-    if not len(known):
-        return shield
-    body = body_on(shield, known)
-    proposers = tuple(p.on_body(body, guess) if hasattr(p, "on_body") else p for p in shield.proposers)
-    return replace(shield, body=body, proposers=proposers)
+def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Floats | None = None) -> Shield:
+    """The shield on a session's own map. guess: whether it is one of several that a decision tries.
+
+    barred [n, 6]: what its policies are to find ways without (robot/barred.py).
+    """
+    body, proposers = shield.body, shield.proposers
+    if len(known):
+        body = body_on(shield, known)
+        proposers = tuple(p.on_body(body, guess) if hasattr(p, "on_body") else p for p in proposers)
+    if barred is not None and len(barred):
+        proposers = tuple(p.avoiding(barred) if hasattr(p, "avoiding") else p for p in proposers)
+    return shield if proposers is shield.proposers else replace(shield, body=body, proposers=proposers)
 
 
 def handed_on(shield: Shield, taught: Taught, drawn: int) -> bytes | None:

@@ -15,6 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from specshield.arrays import Floats
 from specshield.compiled import leaf
 from specshield.errors import InputError
 
@@ -75,8 +76,8 @@ class Care:
     """What J asks for beyond satisfaction at one step.
 
     margin [m]; least [steps]: the slack of every deadline. noise: because of which more of it is asked for.
-    stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice. barred: the
-    motions that lead nowhere from x_t, so that no future goes by them first where another keeps the rule.
+    stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice. barred
+    [n, 6]: what no future goes by where another keeps the rule (robot/barred.py); None where nothing is.
     """
 
     margin: float
@@ -84,7 +85,7 @@ class Care:
     noise: Noise = EXACT
     stride: float = 1.0
     chance: float = CHANCE
-    barred: tuple[int, ...] = ()
+    barred: Floats | None = None
 
     @property
     def has_slack(self) -> bool:

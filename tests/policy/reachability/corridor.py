@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from specshield.policy.reachability.guide import Guide
-from specshield.policy.reachability.policy import Settings, synthesise
+from specshield.policy.reachability.policy import NOTHING_BARRED, Settings, synthesise
 from specshield.robot.dynamics import make_body
 from specshield.rule.progress import make_rules
 from specshield.task import make_task
@@ -29,7 +29,9 @@ def make_corridor(formula, robot=ROBOT, **cells):
 
 def guide_of(task):
     tables = synthesise(task, Settings(pitch=CELL * 3)).tables  # a third of it is used: the map is small
-    return Guide(make_body(task.robot, task.grid), make_rules(task), tables, task.robot.wait_motion)
+    return Guide(
+        make_body(task.robot, task.grid), make_rules(task), tables, task.robot.wait_motion, NOTHING_BARRED
+    )
 
 
 def pose(column, heading=EAST):

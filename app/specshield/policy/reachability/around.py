@@ -31,6 +31,7 @@ from specshield.policy.reachability.tables import SAFE, UNKNOWN, goals_settled, 
 from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, climb, rejoin
 from specshield.policy.recall import forgive, recall
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
+from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import around, displacement, motion_count, step, step_from
 from specshield.rule.progress import ALWAYS, PENDING, advance
 
@@ -165,7 +166,7 @@ def _reach(
     """The row of a pose from where a climb can go on: one more goal is settled there, or only time is needed
     for that. Else NO_WAY or GAVE_UP. The scratch holds the progress at (x, y, theta).
     """
-    body, rules, tables, _ = guide
+    body, rules, tables, _, _ = guide
     seen[:] = -1
     turns_matter = reads_heading(rules)
     _put(tree, 0, x, y, theta, scratch, 0, -1, -1)
@@ -187,6 +188,8 @@ def _reach(
             x, y, theta = step_from(body, before_x, before_y, before, cos, sin, room, m)
             stays = x == before_x and y == before_y
             if (stays and theta == before) or count == tree.step.shape[0]:
+                continue
+            if is_barred(guide.barred, before_x, before_y, before, m):
                 continue
             copy_progress(tree.status[here], tree.run[here], scratch.status, scratch.run)
             if not (stays and read):

@@ -123,7 +123,7 @@ def _expand(
     edges: Edges, table: Int32s, scratch: Scratch,
 ) -> int:  # fmt: skip
     """Makes every motion from the first `count` poses of `here`; each new pose is written once. How many."""
-    body, rules, tables, wait = guide
+    body, rules, tables, wait, _ = guide
     found, joined, turns_matter = 0, 0, reads_heading(rules)
     for w in range(count):
         edges.tag[n, w] = here.tag[w]

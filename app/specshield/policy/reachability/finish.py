@@ -59,7 +59,7 @@ def finish(
 
     pose (3,), status, run (K,): at x_t. narrow (K,): the obligations that it is about.
     """
-    body, rules, tables, wait = guide
+    body, rules, tables, wait, _ = guide
     k_count, most = status.shape[0], search.most
     goal, some = np.zeros(k_count, np.bool_), False
     for k in range(k_count):

@@ -17,12 +17,15 @@ from specshield.stl.program import VALUE, evaluate_packed
 
 
 class Guide(NamedTuple):
-    """What leads a robot. wait: the motion that stands still, -1 where there is none."""
+    """What leads a robot. wait: the motion that stands still, -1 where there is none. barred [n, 6]: motions
+    that led nowhere, and from where (robot/barred.py).
+    """
 
     body: Body
     rules: Rules
     tables: Tables
     wait: int
+    barred: Floats
 
 
 class Scratch(NamedTuple):

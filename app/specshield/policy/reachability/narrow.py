@@ -152,7 +152,7 @@ def _nearest(
     """How many motions lead to where the latest feasible time is highest on the way from motions[:begin] to
     motions[:stop], after the last goal that is settled there. status, run (K,): at its beginning.
     """
-    body, rules, tables, _ = guide
+    body, rules, tables, _, _ = guide
     copy_progress(status, run, scratch.status, scratch.run)
     best, found, settled = HOPELESS, begin, 0
     for n in range(begin, stop + 1):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from specshield.policy.reachability.tables import Tables
 from specshield.policy.recall import pasts
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
+from specshield.robot.barred import in_vain
 from specshield.robot.dynamics import Body, make_body, simulate
 from specshield.rule.progress import ALWAYS, Rules, make_rules, signal_rows
 from specshield.rule.values import initial_signals
@@ -44,6 +45,7 @@ from specshield.world.occupancy import OccupancyGrid
 
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
 MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
+NOTHING_BARRED = np.empty((0, 6))
 FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
 
 
@@ -61,6 +63,7 @@ class ReachabilityPolicy:
     narrow: Bools
     told: bool = True  # whether the tables were made for the map that the policy goes by
     guess: bool = False  # whether that is one of several maps that one decision tries
+    barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
 
     @property
     def id(self) -> str:
@@ -82,6 +85,12 @@ class ReachabilityPolicy:
         """
         other = replace(self, told=False, guess=guess)
         other.__dict__.update(_body=body, _rules=self._rules)
+        return other
+
+    def avoiding(self, barred: Floats) -> ReachabilityPolicy:
+        """The policy for a robot that some motions led nowhere. barred [n, 6]: as `Guide` has it."""
+        other = replace(self, barred=barred)
+        other.__dict__.update(_body=self._body, _rules=self._rules)
         return other
 
     @cached_property
@@ -109,7 +118,7 @@ class ReachabilityPolicy:
         body, rules = self._body, self._rules
         rules = rules._replace(signals=rules.signals.copy(), margin=margin)
         rows = signal_rows(self.task, signals, len(history))
-        guide = Guide(body, rules, self.tables, self.task.robot.wait_motion)
+        guide = Guide(body, rules, self.tables, self.task.robot.wait_motion, self.barred)
         proposals = []
         for past in pasts(rules, history, rows):
             motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
@@ -128,8 +137,10 @@ class ReachabilityPolicy:
             else:
                 preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, int(preferred)))
-            if not (self.told or self.guess):
-                around = go_around(guide, past, history, rows, len(poses), poses, ways, POSES)
+            if not self.guess and (len(self.barred) or not self.told):
+                free = poses[~in_vain(self.barred, history[-1], motions, poses)]
+                poses[: len(free)] = free
+                around = go_around(guide, past, history, rows, len(free), poses, ways, POSES)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))
         return joined(*proposals)
@@ -156,7 +167,8 @@ class ReachabilityPolicy:
         except MapError:  # next to no free space
             return 0.0
         if not exact:
-            return share_with_slack(Guide(body, rules, self.tables, self.task.robot.wait_motion), poses)
+            guide = Guide(body, rules, self.tables, self.task.robot.wait_motion, self.barred)
+            return share_with_slack(guide, poses)
         return sum(self._keeps(pose) for pose in poses) / len(poses)
 
     def _keeps(self, pose: Floats) -> bool:

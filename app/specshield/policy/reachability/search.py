@@ -131,7 +131,7 @@ def _first_steps(
     starts: Starts, scratch: Scratch,
 ) -> None:  # fmt: skip
     """Makes every motion once, from `pose` (3,), with the progress `status`, `run` (K,) there."""
-    body, rules, tables, _ = guide
+    body, rules, tables, _, _ = guide
     for m in range(motions.shape[0]):
         x, y, theta = step(body, pose[0], pose[1], pose[2], m)
         motions[m, 0] = m

@@ -23,6 +23,7 @@ from specshield.policy.reachability.guide import (
     update_progress,
 )
 from specshield.policy.reachability.tables import HOPELESS, goals_settled, is_broken, score, slack
+from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import step
 from specshield.rule.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 
@@ -47,7 +48,7 @@ def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: S
     STUCK where the tables led round in a circle, with the number of motions to where the latest feasible time
     was highest; else FAILED.
     """
-    body, rules, tables, wait = guide
+    body, rules, tables, wait, _ = guide
     steps, last_phase, k_count = motions.shape[0], len(tables.end) - 1, rules.kind.shape[0]
     status, run, scores = scratch.status, scratch.run, scratch.scores
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
@@ -84,6 +85,7 @@ def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: S
                 break
             nx, ny, nth = step(body, x, y, theta, best)
             leads = abs(nx - x) + abs(ny - y) > SHORTEST_MOVE or nth != theta
+            leads = leads and not is_barred(guide.barred, x, y, theta, best)
             if leads and _keeps(rules, t + n + 1, nx, ny, nth, scratch):
                 chosen = best
                 x, y, theta = nx, ny, nth
@@ -187,7 +189,7 @@ def _deepen(
     """Repeats the last of motions[:n] as long as it leads deeper into a goal, until DEPTH_WANTED or the step
     `until` is reached; returns how many motions there are then.
     """
-    body, rules, _, _ = guide
+    body, rules, _, _, _ = guide
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     depth = predicate_at(rules, goal, x, y, theta, scratch)
     while n < motions.shape[0] and t + n < until and depth < DEPTH_WANTED:
@@ -213,7 +215,7 @@ def rejoin(
     The robot may be only nearly on that way, so the result says whether every goal was settled. The other
     arguments are those of `climb`.
     """
-    body, rules, tables, wait = guide
+    body, rules, tables, wait, _ = guide
     join(turn, move, base, at, wait, motions)
     x, y, theta = poses[0, 0], poses[0, 1], poses[0, 2]
     n, looked, joined = 1, False, 1 + (turn >= 0) + (move >= 0)

@@ -97,8 +97,11 @@ def within_noise(shield: Shield, carry: Carry) -> tuple[float, float] | None:
     return EXACT + FAR * noise.move, EXACT + FAR * noise.turn
 
 
-def was_stopped(shield: Shield, carry: Carry, poses: Floats) -> bool:
-    """Whether a motion that ended short at x_t met something: noise and slips do not explain it."""
+def was_stopped(shield: Shield, carry: Carry, poses: Floats, halts: int = 0) -> bool:
+    """Whether a motion that ended short at x_t met something: noise and slips do not explain it.
+
+    halts: how often it did nothing at this pose before.
+    """
     known = shield.config.uncertainty
     if known is None or carry.residuals is None:
         return True
@@ -107,7 +110,7 @@ def was_stopped(shield: Shield, carry: Carry, poses: Floats) -> bool:
     far = EXACT + FAR * (noise.move + noise.turn)
     miss = min((_gap(end, pose) for end in carry.next_poses if _gap(end, before) > EXACT), default=math.inf)
     if still < miss and still <= far:
-        return seen.slipping * _slip(noise) < SELDOM
+        return min(seen.slipping * _slip(noise), _slip(noise) ** (halts + 1)) < SELDOM
     return miss > far
 
 

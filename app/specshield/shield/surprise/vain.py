@@ -1,0 +1,45 @@
+"""What a robot tried in vain: from which poses which motions led nowhere.
+
+A mark on the map does not always say why a motion led nowhere. The footprint may be told wrong, and marks are
+doubted and forgotten. So what was tried is remembered beside them, and no future goes by it again where
+another keeps the rule: else a robot turns away and back for ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.robot.barred import is_barred
+from specshield.shield.decision import Stuck
+from specshield.shield.surprise.contact import Near
+
+MOST_STUCK = 16  # motions that are remembered, the newest of them
+
+
+def halts_at(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> int:
+    """How often a motion did nothing at a pose (3,) and may only have slipped."""
+    return sum(each[3] == ~motion and _is_at(each, pose, near) for each in stuck)
+
+
+def led_nowhere(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
+    """With a motion that leads nowhere from a pose (3,)."""
+    others = (each for each in stuck if each[3] not in (motion, ~motion) or not _is_at(each, pose, near))
+    return (*others, (*pose.tolist(), motion))[-MOST_STUCK:]
+
+
+def halted(stuck: Iterable[Stuck], pose: Floats, motion: int) -> tuple[Stuck, ...]:
+    """With a motion that did nothing at a pose (3,) and may only have slipped."""
+    return (*stuck, (*pose.tolist(), ~motion))[-MOST_STUCK:]
+
+
+def _is_at(stuck: Stuck, pose: Floats, near: Near) -> bool:
+    return bool(is_barred(np.array([(*stuck, *near)]), pose[0], pose[1], pose[2], stuck[3]))
+
+
+def barred_by(stuck: Iterable[Stuck], near: Near) -> Floats:
+    """The motions that lead nowhere for sure, as robot/barred.py has them. Shape [n, 6]."""
+    found = [(*each, *near) for each in stuck if each[3] >= 0]
+    return np.array(found, np.float64).reshape(-1, 6)
