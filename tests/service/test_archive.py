@@ -77,6 +77,30 @@ async def in_store(store: ArchivingStore, id: str) -> bool:
     return bool(await store.redis.exists(f"specshield:v2:{{{id}}}:session"))
 
 
+def test_a_session_that_its_server_was_killed_over_is_found_by_others(url, archive):
+    async def story(store):
+        await begin(store, "back", 2)
+        dump = await move(store, "back")
+        killed = ArchivingStore(url, 10.0, TTL, archive)
+        lists = killed.redis.zadd
+
+        async def zadd(name, ids):
+            if await in_store(store, *ids):
+                raise asyncio.CancelledError  # as the end of the process would cut it off
+            return await lists(name, ids)
+
+        killed.redis.zadd = zadd
+        with pytest.raises(asyncio.CancelledError):
+            await killed.append("back", dump.version, change(2))
+        with pytest.raises(asyncio.CancelledError):
+            await killed.create("new", b"config", Change(b"state", ROW))
+        await killed.aclose()
+        found, _ = await store.idle(None, 10, -1.0)
+        assert sorted(id for id, *_ in found) == ["back", "new"]
+
+    run(url, archive, story)
+
+
 def test_a_session_that_has_left_is_read_byte_for_byte_and_goes_on(url, archive):
     async def story(store):
         await begin(store, "robot", 5)

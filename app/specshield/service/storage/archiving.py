@@ -201,9 +201,10 @@ class ArchivingStore(Store):
         if dump is None:
             return False
         contents = [dump.config, dump.state, dump.rows, *dump.steps]
+        await self.list_name(id)
         async with self._reaching():
             await self._return(keys=_keys(id), args=[dump.version, FENCE, self._ttl * 1000, *contents])
-            await self.redis.zadd(INDEX, {id: 0})
+        await self.list_name(id)
         return True
 
     def _archived(self, id: str) -> Dump | None:

@@ -111,15 +111,23 @@ class Store:
         """The first version. Raises SessionExists. `config` has to be unlike any other, so that a retry knows
         its own.
         """
+        await self.list_name(id)
         begun = await self._write(id, b"", change, config)
         if isinstance(begun, Record) and begun.config == config:  # a try whose answer was lost
             begun = begun.version
         if not isinstance(begun, bytes):
             told = f"there is a session {shown(id)!r} already"
             raise SessionExists(told, path="id", got=shown(id), expected="an id not in use")
+        await self.list_name(id)
+        return begun
+
+    async def list_name(self, id: str) -> None:
+        """Lists a session that is being made. It has to be listed before it is there: else a server that is
+        killed in between leaves one that nobody ever finds or moves. And again afterwards, since names without
+        a session are taken off the list.
+        """
         async with self._reaching():
             await self.redis.zadd(INDEX, {id: 0})
-        return begun
 
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
         """All of the change, and the new version; or nothing where `version` is no longer the latest: then
