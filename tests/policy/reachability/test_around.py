@@ -7,7 +7,9 @@ import numpy as np
 from specshield.policy.heap import Heap
 from specshield.policy.reachability.around import Tree, _slot_of
 from specshield.policy.reachability.policy import synthesise
-from specshield.robot.dynamics import make_body
+from specshield.robot.barred import in_vain
+from specshield.robot.dynamics import make_body, simulate
+from specshield.stl import robustness
 from tests.policy.rooms import flat
 
 
@@ -57,3 +59,19 @@ def test_where_a_search_on_one_of_several_maps_gives_up_nothing_else_is_tried():
     whole, quick = (policy.on_body(body, guess).propose(history, {}, 0.0) for guess in (False, True))
     assert (quick.motions[:, 1:] == task.robot.wait_motion).all()
     assert (whole.motions[:, 1:] != task.robot.wait_motion).any()
+
+
+def test_a_way_is_found_without_the_motions_that_led_nowhere():
+    """From the start, nothing leads straight ahead, nor backwards, whatever the tables say."""
+    task = flat("F[0,60] East")
+    policy, body = synthesise(task), make_body(task.robot, task.grid)
+    history = np.array([[*task.grid.to_map([0.7, 1.5]), 0.0]])
+    moves = [m for m, (far, _) in enumerate(task.robot.motions) if far]
+    barred = np.array([[*history[0], m, 0.01, 0.01] for m in moves])
+    ways = policy.avoiding(barred).propose(history, {}, 0.0)
+    poses = np.empty((*ways.motions.shape, 3))
+    for motions, led in zip(ways.motions, poses, strict=True):
+        simulate(body, history[0], motions, led)
+    free = ~in_vain(barred, history[0], ways.motions, poses)
+    kept = [robustness(task.formula, task.samples(np.concatenate([history, led]))) > 0 for led in poses[free]]
+    assert any(kept)
