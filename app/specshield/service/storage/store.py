@@ -122,9 +122,9 @@ class Store:
         return begun
 
     async def list_name(self, id: str) -> None:
-        """Lists a session that is being made. It has to be listed before it is there: else a server that is
-        killed in between leaves one that nobody ever finds or moves. And again afterwards, since names without
-        a session are taken off the list.
+        """Lists a session that is being made, before it is there: else a server that is killed in between
+        leaves one that nobody ever finds or moves. It is listed again afterwards, since names without a
+        session are taken off the list.
         """
         async with self._reaching():
             await self.redis.zadd(INDEX, {id: 0})
