@@ -110,7 +110,9 @@ def teach(
         if motion >= 0:
             stuck = led_nowhere(stuck, poses[-1], motion, near)
         elif followed.halted >= 0 and followed is not before.followed:
-            stuck = halted(stuck, poses[-1], followed.halted)
+            # Slips come one after the other, where it tries again; not after it has turned away and back.
+            comes_back = halts > 0 and before.followed.halted != followed.halted
+            stuck = (led_nowhere if comes_back else halted)(stuck, poses[-1], followed.halted, near)
         half_way = np.empty(3)
         covers = _covers(body, poses[-2], poses[-1], half_way)
         for pose, deep in zip((half_way, poses[-1]), covers, strict=True):

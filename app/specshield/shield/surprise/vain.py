@@ -30,7 +30,7 @@ def led_nowhere(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -
     return (*others, (*pose.tolist(), motion))[-MOST_STUCK:]
 
 
-def halted(stuck: Iterable[Stuck], pose: Floats, motion: int) -> tuple[Stuck, ...]:
+def halted(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
     """With a motion that did nothing at a pose (3,) and may only have slipped."""
     return (*stuck, (*pose.tolist(), ~motion))[-MOST_STUCK:]
 
