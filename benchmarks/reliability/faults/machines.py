@@ -157,7 +157,7 @@ def _watched(folder: Path) -> Iterator[tuple[list[RedisServer], list[RedisServer
                 f"sentinel monitor shield 127.0.0.1 {pair[0].port} {QUORUM}\n"
                 "sentinel down-after-milliseconds shield 500\nsentinel failover-timeout shield 3000\n"
             )
-            Program.__init__(watcher, ["redis-sentinel", str(told)], watcher.log)
+            Program.__init__(watcher, ["redis-server", str(told), "--sentinel"], watcher.log)
             watchers.append(stack.enter_context(watcher))
         wait_for(lambda: _known_replica(watchers), 60.0, "sentinels that know the replica")
         hosts = ",".join(f"127.0.0.1:{watcher.port}" for watcher in watchers)
