@@ -21,8 +21,9 @@ def test_a_motion_is_barred_at_its_pose_and_near_it():
     assert not is_barred(np.empty((0, 6)), 0.0, 0.0, 0.0, 1)
 
 
-def test_a_future_is_in_vain_that_goes_by_a_barred_motion_at_any_step():
+def test_a_future_is_in_vain_that_goes_by_a_barred_motion_at_any_step_or_before_it_leads_away():
     here, there = [0.0, 0.0, 0.0], [1.0, 2.0, math.pi]
     motions = np.array([[1, 0], [0, 3], [0, 1], [3, 3]])
     poses = np.array([[there, there], [there, here], [there, here], [here, here]])
-    assert in_vain(BARRED, np.array(here), motions, poses).tolist() == [True, True, False, False]
+    assert in_vain(BARRED, np.array(here), motions, poses, True).tolist() == [True, True, False, False]
+    assert in_vain(BARRED, np.array(here), motions, poses, False).tolist() == [True, False, False, False]

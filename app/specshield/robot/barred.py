@@ -28,10 +28,11 @@ def is_barred(barred: Floats, x: float, y: float, theta: float, motion: int) -> 
 
 
 @kernel
-def in_vain(barred: Floats, pose: Floats, motions: Ints, poses: Floats) -> Bools:
+def in_vain(barred: Floats, pose: Floats, motions: Ints, poses: Floats, whole: bool) -> Bools:
     """[N]: the futures from a pose (3,) that go by a motion from where it led nowhere.
 
-    motions [N, L], poses [N, L, 3]: they, and where they lead. barred [n, 6].
+    motions [N, L], poses [N, L, 3]: they, and where they lead. whole: look at every step; else only
+    until the robot is elsewhere. barred [n, 6].
     """
     found = np.zeros(motions.shape[0], np.bool_)
     for i in range(motions.shape[0]):
@@ -40,5 +41,8 @@ def in_vain(barred: Floats, pose: Floats, motions: Ints, poses: Floats) -> Bools
             if is_barred(barred, x, y, theta, motions[i, k]):
                 found[i] = True
                 break
-            x, y, theta = poses[i, k, 0], poses[i, k, 1], poses[i, k, 2]
+            nx, ny, nth = poses[i, k, 0], poses[i, k, 1], poses[i, k, 2]
+            if not (whole or (nx == x and ny == y and nth == theta)):
+                break
+            x, y, theta = nx, ny, nth
     return found

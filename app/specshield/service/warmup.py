@@ -2,8 +2,9 @@
 
     python -m specshield.service.warmup PART     # compiles one part, for `startup`; the disk keeps it
 
-The parts have few kernels in common, so that two processes can compile them side by side. What only a
-planner's or a look-ahead session needs is compiled when the first of them is made.
+Two processes compile the parts side by side. What both need is compiled twice where neither has it yet, so
+the second part begins with what the first does not need. What only a planner's or a look-ahead session needs
+is compiled when the first of them is made.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -52,8 +54,8 @@ def _propose(task: Task) -> None:
 
 def _decide(task: Task) -> None:
     """What the shield takes to begin a session, to decide and to refuse, with a DQN that proposes: in a world
-    that is as told, and by a session's defaults. Then what reachability takes to find a way around: by then
-    the other part has compiled what the two have in common, and this makes both as long.
+    that is as told, and by a session's defaults. Then what reachability takes to find a way around, so that
+    both parts take about as long.
     """
     policy = Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))
     logits = np.zeros(len(STRETCH.actions))
@@ -62,7 +64,8 @@ def _decide(task: Task) -> None:
         episode.start(shield, START)
         first = episode.decide(shield, [START], logits)
         second = [START, first.next_poses[0].tolist()]
-        episode.decide(shield, second, logits, carry=first.carry, occupied=[[1.9, 0.5]], explain=explanations)
+        carry = replace(first.carry, stuck=((*START, 0),))
+        episode.decide(shield, second, logits, carry=carry, occupied=[[1.9, 0.5]], explain=explanations)
     refusal(shield, np.array([START]), {})
     around = synthesise(task).on_body(make_body(task.robot, task.grid))
     around.propose(np.array([START]), {}, 0.0)

@@ -38,7 +38,7 @@ class Judged:
     margin: float  # [m] and
     slack: int  # [steps]: how much of what was asked for can be had
     margin_unattainable: bool  # it is less
-    vain: bool  # whether every future that keeps the rule goes by what led nowhere before
+    vain: bool  # whether no future keeps the rule without what led nowhere before
 
     @cached_property
     def some(self) -> bool:
@@ -61,7 +61,9 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         tried, best, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried)
     if care.barred is not None:
-        goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses)
+        # Where nobody looks for ways without it, what comes back to a barred motion later still counts.
+        whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
+        goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses, whole)
         others = np.where(goes, -np.inf, kept)
         vain = others.max() <= SATISFIED_ABOVE
         if not vain:

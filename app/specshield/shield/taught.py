@@ -15,14 +15,23 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike
 
-from specshield.arrays import Bools, Floats, Ints
+from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import Body, make_body, overlap, successors
 from specshield.shield.caution.experience import was_stopped, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
-from specshield.shield.surprise.contact import NEAR, UNDER, Followed, Near, cells_met, cells_under, contact_of
-from specshield.shield.surprise.vain import barred_by, halted, halts_at, led_nowhere
+from specshield.shield.surprise.contact import (
+    NEAR,
+    UNDER,
+    Followed,
+    Near,
+    cells_met,
+    cells_under,
+    contact_of,
+    is_near,
+)
+from specshield.shield.surprise.vain import barred_by, did_nothing, halts_at, led_nowhere, worked
 from specshield.shield.uncertainty import Care
 from specshield.world.learned import (
     BEHIND,
@@ -36,7 +45,6 @@ from specshield.world.learned import (
     learn,
     revised,
 )
-from specshield.world.occupancy import OccupancyGrid
 
 # [steps] what a way around something takes that only contacts show. Chosen by hand: of 60 runs in cases 1 and
 # 2, `evaluation worlds --world obstacle --sensing contact` kept 58 and 52 with 12, and 59 and 56 with 20.
@@ -103,16 +111,18 @@ def teach(
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
-        halts = halts_at(stuck, poses[-1], followed.drawn, near)
+        drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
+        halts = halts_at(stuck, poses[-1], drawn, near)
         motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, halts > 0)
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses, halts):
             motion, followed = -1, replace(followed, halted=motion, met=0)
-        if motion >= 0:
-            stuck = led_nowhere(stuck, poses[-1], motion, near)
+        if motion >= 0 or (halts > 0 and came_back and followed.halted == drawn):
+            # Slips come in a row; what does nothing, and again once the robot is back, did not slip.
+            stuck = led_nowhere(stuck, poses[-1], max(motion, followed.halted), near)
         elif followed.halted >= 0 and followed is not before.followed:
-            # Slips come one after the other, where it tries again; not after it has turned away and back.
-            comes_back = halts > 0 and before.followed.halted != followed.halted
-            stuck = (led_nowhere if comes_back else halted)(stuck, poses[-1], followed.halted, near)
+            stuck = did_nothing(stuck, poses[-1], followed.halted, near)
+        elif drawn >= 0 and not is_near(poses[-2:-1], poses[-1], near):
+            stuck = worked(stuck, poses[-2], drawn, near)
         half_way = np.empty(3)
         covers = _covers(body, poses[-2], poses[-1], half_way)
         for pose, deep in zip((half_way, poses[-1]), covers, strict=True):
@@ -120,10 +130,13 @@ def teach(
                 known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)
         if motion >= 0:
             driven = poses[np.hypot(*(poses[:, :2] - poses[-1, :2]).T) <= NEARBY]
-            marked = _marked(grid, known, t, cells_met(body, poses[-1], motion, driven))
-            if marked is known:  # the footprint is told wrong: it seems to have been where it met something
-                marked = _marked(grid, known, t, cells_met(body, poses[-1], motion, poses[-1:]))
-            known = marked
+            met = cells_met(body, poses[-1], motion, driven)
+            if not any(len(cells) for _, cells in met):  # the footprint is told wrong, or someone came
+                met = cells_met(body, poses[-1], motion, poses[-1:])
+            for by, cells in met:
+                # A cell along the front was touched, which replaces a guess. A guess replaces nothing.
+                kept = known.cell if by == BEHIND else known.cell[known.by != BEHIND]
+                known = learn(grid, known, t, np.setdiff1d(cells, kept), True, by)
     beyond = 0
     for name, points in (("free", free), ("occupied", occupied)):  # what is both is taken for occupied
         if points is not None:
@@ -133,15 +146,6 @@ def teach(
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
     return Taught(own, followed, motion >= 0, stuck, near), said
-
-
-def _marked(grid: OccupancyGrid, known: LearnedMap, t: int, met: list[tuple[int, Ints]]) -> LearnedMap:
-    """With what a motion may have met (surprise/contact.py) at step t; the same map where all is marked."""
-    for by, cells in met:
-        # A cell along the front was touched, which replaces a guess. A guess replaces nothing.
-        new = np.setdiff1d(cells, known.cell if by == BEHIND else known.cell[known.by != BEHIND])
-        known = learn(grid, known, t, new, True, by) if len(new) else known
-    return known
 
 
 @leaf

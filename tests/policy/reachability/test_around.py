@@ -72,6 +72,6 @@ def test_a_way_is_found_without_the_motions_that_led_nowhere():
     poses = np.empty((*ways.motions.shape, 3))
     for motions, led in zip(ways.motions, poses, strict=True):
         simulate(body, history[0], motions, led)
-    free = ~in_vain(barred, history[0], ways.motions, poses)
+    free = ~in_vain(barred, history[0], ways.motions, poses, True)
     kept = [robustness(task.formula, task.samples(np.concatenate([history, led]))) > 0 for led in poses[free]]
     assert any(kept)

@@ -138,7 +138,7 @@ class ReachabilityPolicy:
                 preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, int(preferred)))
             if not self.guess and (len(self.barred) or not self.told):
-                free = poses[~in_vain(self.barred, history[-1], motions, poses)]
+                free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
                 poses[: len(free)] = free
                 around = go_around(guide, past, history, rows, len(free), poses, ways, POSES)
             if around >= 0:

@@ -193,6 +193,8 @@ def _deepen(
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     depth = predicate_at(rules, goal, x, y, theta, scratch)
     while n < motions.shape[0] and t + n < until and depth < DEPTH_WANTED:
+        if is_barred(guide.barred, x, y, theta, motions[n - 1]):
+            break
         x, y, theta = step(body, x, y, theta, motions[n - 1])
         deeper = predicate_at(rules, goal, x, y, theta, scratch)
         if deeper < depth + DEPTH_GAIN or not _keeps(rules, t + n + 1, x, y, theta, scratch):

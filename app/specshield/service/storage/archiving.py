@@ -152,9 +152,9 @@ class ArchivingStore(Store):
                 for id in idle:
                     pipe.hget(keys(id)[0], "state")
                 states = await pipe.execute() if idle else []
-            expired = [id for id, ms in zip(ids, left, strict=True) if ms == -2]
+            expired = [id.encode() for id, ms in zip(ids, left, strict=True) if ms == -2]
             if expired:
-                await self.redis.zrem(INDEX, *expired)
+                await self.take_off(expired)
         found = [(id, waits[id], state) for id, state in zip(idle, states, strict=True) if state is not None]
         return found, ids[-1] if len(ids) == limit else None
 

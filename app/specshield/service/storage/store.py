@@ -129,6 +129,16 @@ class Store:
         async with self._reaching():
             await self.redis.zadd(INDEX, {id: 0})
 
+    async def take_off(self, ids: Sequence[bytes]) -> None:
+        """Takes names off the list that have no session. One that was made meanwhile is listed again."""
+        await self.redis.zrem(INDEX, *ids)
+        async with self.redis.pipeline(transaction=False) as pipe:
+            for id in ids:
+                pipe.exists(keys(id.decode())[0])
+            there = await pipe.execute()
+        if back := {id: 0 for id, found in zip(ids, there, strict=True) if found}:
+            await self.redis.zadd(INDEX, back)
+
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
         """All of the change, and the new version; or nothing where `version` is no longer the latest: then
         the session as it is, with what step `change.t` left, or None where it is gone. One round trip.
@@ -265,7 +275,7 @@ class Store:
             found = await pipe.execute()
         expired = [id for id, (config, _) in zip(ids, found, strict=True) if config is None]
         if expired:
-            await self.redis.zrem(INDEX, *expired)
+            await self.take_off(expired)
         return [(config, state) for config, state in found if config is not None]
 
 

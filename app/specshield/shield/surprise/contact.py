@@ -51,11 +51,11 @@ def contact_of(
     after: Floats,
     foreseen: Floats,
     near: Near = NEAR,
-    halted: bool = False,
+    again: bool = False,
 ) -> tuple[int, Followed]:
     """The motion that stopped short between two poses (3,), -1 for none, and what is known of the caller now.
 
-    foreseen [M, 3]: where f leads from `before`. near: what noise explains. halted: whether the drawn motion
+    foreseen [M, 3]: where f leads from `before`. near: what noise explains. again: whether the drawn motion
     did nothing at this pose before.
     """
     drawn = followed.drawn
@@ -64,7 +64,7 @@ def contact_of(
     if is_near(before[None], after, near):  # it stands where it stood
         if drawn < 0 or not followed.follows:
             return -1, followed
-        if followed.halted == drawn or followed.met or halted:  # what stopped it a moment ago does so again
+        if followed.halted == drawn or followed.met or again:  # what stopped it a moment ago does so again
             return drawn, replace(followed, halted=-1, met=followed.met + 1)
         return -1, replace(followed, halted=drawn)
     if is_near(foreseen, after, near):

@@ -16,23 +16,34 @@ from specshield.robot.barred import is_barred
 from specshield.shield.decision import Stuck
 from specshield.shield.surprise.contact import Near
 
-MOST_STUCK = 16  # motions that are remembered, the newest of them
+MOST_STUCK = 16  # motions of each kind that are remembered, the newest of them
 
 
 def halts_at(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> int:
-    """How often a motion did nothing at a pose (3,) and may only have slipped."""
+    """How often a motion did nothing at a pose (3,) and may only have slipped. motion: -1 for none."""
+    if motion < 0:
+        return 0
     return sum(each[3] == ~motion and _is_at(each, pose, near) for each in stuck)
 
 
 def led_nowhere(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
     """With a motion that leads nowhere from a pose (3,)."""
-    others = (each for each in stuck if each[3] not in (motion, ~motion) or not _is_at(each, pose, near))
-    return (*others, (*pose.tolist(), motion))[-MOST_STUCK:]
+    return _newest((*worked(stuck, pose, motion, near), (*pose.tolist(), motion)))
 
 
-def halted(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
+def did_nothing(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
     """With a motion that did nothing at a pose (3,) and may only have slipped."""
-    return (*stuck, (*pose.tolist(), ~motion))[-MOST_STUCK:]
+    return _newest((*stuck, (*pose.tolist(), ~motion)))
+
+
+def worked(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
+    """Without a motion that has led away from a pose (3,)."""
+    return tuple(each for each in stuck if each[3] not in (motion, ~motion) or not _is_at(each, pose, near))
+
+
+def _newest(stuck: tuple[Stuck, ...]) -> tuple[Stuck, ...]:
+    bars, halts = ([each for each in stuck if (each[3] >= 0) == sure][-MOST_STUCK:] for sure in (True, False))
+    return (*bars, *halts)
 
 
 def _is_at(stuck: Stuck, pose: Floats, near: Near) -> bool:
