@@ -167,7 +167,7 @@ class _Motion:
     def known(self) -> str:
         """Why a motion is forbidden of which a future is known that keeps all that is asked."""
         if self.doubtful:
-            return "the rule could still be kept, but the robot was stopped there before"
+            return "the rule could still be kept, but only by what led nowhere before, or may lead nowhere"
         told = "a way is known that keeps the rule, but the policies did not find it"
         margin, slack = self.judged.margin, self.judged.slack
         if not margin and not slack:

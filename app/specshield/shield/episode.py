@@ -154,7 +154,8 @@ def decide(
             taught, (shield, prefix, judged, withstands) = believed
             said = (*said, "no way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
-        judged = without(recovered(shield, judged), shield, doubts := doubtful(told, taught, poses[-1]))
+        doubts = doubtful(told, taught, poses[-1]) | judged.left_out
+        judged = without(recovered(shield, judged), shield, doubts)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)

@@ -39,6 +39,7 @@ class Judged:
     slack: int  # [steps]: how much of what was asked for can be had
     margin_unattainable: bool  # it is less
     vain: bool  # whether no future keeps the rule without what led nowhere before
+    left_out: Bools  # [M]: only futures with that keep the rule, and others without it do
 
     @cached_property
     def some(self) -> bool:
@@ -57,6 +58,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     tried = futures(prefix, shield.body, shield.proposers, tail, asked)
     kept, leaves = tried.rho, tried.leaves
     best, part, vain = best_of(tried, kept, motions), prefix, False
+    left_out = np.zeros(motions, np.bool_)
     if violated:
         tried, best, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried)
@@ -67,7 +69,9 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         others = np.where(goes, -np.inf, kept)
         vain = others.max() <= SATISFIED_ABOVE
         if not vain:
-            kept, best = others, best_of(tried, others, motions)
+            without_it = best_of(tried, others, motions)
+            left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
+            kept, best = others, without_it
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and _some(best)):
@@ -83,7 +87,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     completion = int(robot.representative[first])
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
     asked_and_had = aimed.margin, aimed.slack, aimed.lowered
-    return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had, vain)
+    return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had, vain, left_out)
 
 
 def recovered(shield: Shield, judged: Judged) -> Judged:
