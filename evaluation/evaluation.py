@@ -11,6 +11,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +63,7 @@ def _over_processes(experiment: Experiment, missing: Missing, processes: int) ->
     """Each run in one of `processes` new processes. They end when this one does, even if it is killed."""
     for name in THREADS:  # one thread each: the processes share the cores out
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
-    try:
+    with workers(processes) as pool:
         under_way: set[Future[list[Record]]] = {
             pool.submit(run, experiment, i, list(names)) for i, names in missing.items()
         }
@@ -71,8 +71,21 @@ def _over_processes(experiment: Experiment, missing: Missing, processes: int) ->
             finished, under_way = wait(under_way, return_when=FIRST_COMPLETED)
             for future in finished:
                 yield future.result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def workers(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """New processes for runs. They end when this one does, and at once where it is interrupted: a run that
+    has to compile first takes minutes.
+    """
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent) as pool:
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in multiprocessing.active_children():
+                worker.terminate()
+            raise
 
 
 def _end_with_parent() -> None:

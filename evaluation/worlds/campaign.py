@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.evaluation import workers
 from evaluation.statistics import clopper_pearson
 from evaluation.worlds.runs import Outcome, Trial, run
 
@@ -49,7 +48,7 @@ def _made(trial: Trial, missing: Sequence[int], processes: int) -> Iterator[Outc
     if processes == 1 or len(missing) < 2:
         yield from (run(trial, i) for i in missing)
         return
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+    with workers(processes) as pool:
         yield from pool.map(partial(run, trial), missing)
 
 
