@@ -105,14 +105,13 @@ def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Compiles a function once for each combination of types it is called with.
 
     A number that is written in a call counts as any other of its type. Left alone, numba compiles the callee
-    once more for each such number, which took a sixth of all the time that compiling takes. C calls none of
-    them, so none has the wrapper that C would need: about a twentieth of the time.
+    once more for each such number, which took a sixth of all the time that compiling takes.
     """
     before = config.CACHE_DIR
     if function.__module__.startswith("specshield."):
         config.CACHE_DIR = _folder(function.__module__) or before
     try:
-        compiled = njit(cache=True, no_cfunc_wrapper=True, **options)(function)
+        compiled = njit(cache=True, **options)(function)
     finally:
         config.CACHE_DIR = before
     template = compiled.get_call_template

@@ -2,9 +2,8 @@
 
     python -m specshield.service.warmup PART     # compiles one part, for `startup`; the disk keeps it
 
-Two processes compile the parts side by side. What both need is compiled twice where neither has it yet, so
-the second part begins with what the first does not need. What only a planner's or a look-ahead session needs
-is compiled when the first of them is made.
+The parts have few kernels in common, so that two processes can compile them side by side. What only a
+planner's or a look-ahead session needs is compiled when the first of them is made.
 """
 
 from __future__ import annotations
@@ -49,13 +48,14 @@ def warm_up(part: str) -> None:
 
 def _propose(task: Task) -> None:
     """What reachability takes to make its tables and to propose. Nothing else takes as long to compile."""
-    synthesise(task).propose(np.array([START]), {}, 0.0)
+    policy = synthesise(task)
+    policy.propose(np.array([START]), {}, 0.0)
+    policy.on_body(make_body(task.robot, task.grid)).propose(np.array([START]), {}, 0.0)
 
 
 def _decide(task: Task) -> None:
     """What the shield takes to begin a session, to decide and to refuse, with a DQN that proposes: in a world
-    that is as told, and by a session's defaults. Then what reachability takes to find a way around, so that
-    both parts take about as long.
+    that is as told, and by a session's defaults.
     """
     policy = Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))
     logits = np.zeros(len(STRETCH.actions))
@@ -67,8 +67,6 @@ def _decide(task: Task) -> None:
         carry = replace(first.carry, stuck=((*START, 0),))
         episode.decide(shield, second, logits, carry=carry, occupied=[[1.9, 0.5]], explain=explanations)
     refusal(shield, np.array([START]), {})
-    around = synthesise(task).on_body(make_body(task.robot, task.grid))
-    around.propose(np.array([START]), {}, 0.0)
 
 
 PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
