@@ -27,17 +27,17 @@ def halts_at(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> i
 
 
 def led_nowhere(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
-    """With a motion that leads nowhere from a pose (3,)."""
+    """What is remembered, and that a motion leads nowhere from a pose (3,) [m, m, rad]."""
     return _newest((*worked(stuck, pose, motion, near), (*pose.tolist(), motion)))
 
 
 def did_nothing(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
-    """With a motion that did nothing at a pose (3,) and may only have slipped."""
+    """What is remembered, and that a motion did nothing at a pose (3,), but may only have slipped."""
     return _newest((*stuck, (*pose.tolist(), ~motion)))
 
 
 def worked(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> tuple[Stuck, ...]:
-    """Without a motion that has led away from a pose (3,)."""
+    """What is remembered, without a motion that has now led away from a pose (3,)."""
     return tuple(each for each in stuck if each[3] not in (motion, ~motion) or not _is_at(each, pose, near))
 
 
