@@ -6,7 +6,7 @@ BIN := .venv/bin
 # A clone shares no compiled kernels with another, and keeps its own between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
 
-.PHONY: install demo run test wheel-check lint lines docs bench reliability results openapi clean
+.PHONY: install demo run test wheels lint lines docs bench reliability results openapi clean
 
 install: .venv/.dev
 
@@ -32,8 +32,9 @@ run: .venv/.server
 test: .venv/.dev
 	$(BIN)/python -m pytest -n 2 --dist loadfile  # each module's tests stay in one of two processes
 
-# The wheel, in an empty folder and a new environment, with no compiled kernels: what a newcomer has.
-wheel-check: .venv/bin/python
+# The wheels, into dist/: one that compiles at its first start, one that brings its kernels for this Python and
+# processor. Both are installed in a new environment and run in an empty folder, as a newcomer would.
+wheels: .venv/bin/python
 	$(BIN)/python .ci/wheel.py
 
 lint: .venv/.dev

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -76,3 +77,12 @@ def test_compose_tells_servers_nothing_that_is_not_a_setting_and_gives_them_time
         assert services[name]["environment"].keys() <= KNOWN
         wait = float(services[name]["stop_grace_period"].removesuffix("s"))
         assert wait > float(services[name]["environment"]["SPECSHIELD_DRAIN"]) + GRACE
+
+
+def test_docker_is_given_what_the_image_is_built_of():
+    """.dockerignore leaves everything out that it does not name."""
+    let_in = {line[1:] for line in (DOCKER.parent / ".dockerignore").read_text().split() if line[0] == "!"}
+    lines = (DOCKER / "Dockerfile").read_text().splitlines()
+    copied = {name for line in lines if re.match(r"COPY (?!--from)", line) for name in line.split()[1:-1]}
+    assert {"app", "LICENSE"} <= copied <= let_in
+    assert all((DOCKER.parent / name).exists() for name in copied)

@@ -2,11 +2,14 @@
 
 numba keeps what it compiled under the file of the function alone. A kernel made of others would go on with
 what they were before they changed, and an upgrade with old code: so each module's kernels have a folder of
-their own, named after its source and that of all it imports from here.
+their own, named after its source and that of all it imports from here. Neither the path nor the time of a
+file counts, and the processor is one that nearly all machines have. So a wheel can bring its kernels
+(`make wheels`), and an image may be built on another machine than it runs on.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
@@ -15,16 +18,22 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
+from numba.core.caching import CacheImpl, _CacheLocator
 
 njit: Any = numba.njit  # its types leave out the option below
 config: Any = numba.config
 unliteral: Any = numba.types.unliteral
 F = TypeVar("F", bound=Callable[..., Any])
 PACKAGE = Path(__file__).parent
+SHIPPED = PACKAGE / "kernels"  # what a wheel brings
+# Every x86-64 processor with AVX2 is at least one of these (the x86-64 psABI, section 3.1.1). NUMBA_CPU_NAME
+# names another.
+COMMON, HAS = "x86-64-v3", ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
 IMPORTED = re.compile(
     r"^ *(?:from|import) +(specshield[\w.]*)(?: +import +(\([^)]*\)|[^\n]*))?", re.MULTILINE
 )
@@ -35,11 +44,14 @@ def _base() -> Path:
     if config.CACHE_DIR:
         return Path(config.CACHE_DIR)
     if os.access(PACKAGE, os.W_OK):
-        return PACKAGE / "__pycache__"
+        return SHIPPED
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "specshield"
 
 
 BASE = _base()
+_found = get_host_cpu_features()
+if config.CPU_NAME is None and all(_found.get(feature) for feature in HAS):
+    config.CPU_NAME, config.CPU_FEATURES = COMMON, ""
 
 
 def kernel(function: F) -> F:
@@ -78,8 +90,11 @@ def mark(name: str) -> Path | None:
     or numba are others. None where no kernel can be kept.
     """
     made_of = [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(PACKAGE.rglob("*.py"))]
-    made_of += [numba.__version__, sys.version, get_host_cpu_name(), get_host_cpu_features().flatten()]
+    processor = config.CPU_NAME or get_host_cpu_name() + _found.flatten()
+    made_of += [numba.__version__, str(sys.implementation.cache_tag), processor]
     digest = hashlib.sha256("".join(made_of).encode()).hexdigest()[:16]
+    if (SHIPPED / f"{name}-{digest}").exists():
+        return SHIPPED / f"{name}-{digest}"
     try:
         BASE.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -107,21 +122,48 @@ def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     A number that is written in a call counts as any other of its type. Left alone, numba compiles the callee
     once more for each such number, which took a sixth of all the time that compiling takes.
     """
-    before = config.CACHE_DIR
-    if function.__module__.startswith("specshield."):
-        config.CACHE_DIR = _folder(function.__module__) or before
-    try:
-        compiled = njit(cache=True, **options)(function)
-    finally:
-        config.CACHE_DIR = before
+    compiled = njit(cache=True, **options)(function)
+    save = compiled._cache.save_overload
+
+    def save_where_possible(*kernel: Any) -> None:
+        with contextlib.suppress(OSError):  # a full disk, or one that is only read
+            save(*kernel)
+
+    compiled._cache.save_overload = save_where_possible
     template = compiled.get_call_template
     compiled.get_call_template = lambda args, kws: template([unliteral(arg) for arg in args], kws)
     return compiled
 
 
+class _BySource(_CacheLocator):
+    """Tells numba where this package's kernels are kept, and that they hold as long as their folder does."""
+
+    def __init__(self, folder: Path, line: int) -> None:
+        self._folder, self._line = folder, line
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        return self._folder.name
+
+    def get_disambiguator(self) -> str:
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _BySource | None:
+        ours = py_func.__module__.startswith("specshield.")
+        return cls(_folder(py_func.__module__), py_func.__code__.co_firstlineno) if ours else None
+
+
+CacheImpl._locator_classes.insert(0, _BySource)
+
+
 @cache
-def _folder(module: str) -> str | None:
-    """Where a module's kernels are kept, None where it cannot be; what was kept of an older source goes."""
+def _folder(module: str) -> Path:
+    """Where a module's kernels are kept; what was kept of an older source goes. What the wheel brought is
+    copied there, or taken where it is if nothing can be written.
+    """
     found, to_see = set[Path](), [module]
     while to_see:
         file = _file(to_see.pop())
@@ -129,15 +171,24 @@ def _folder(module: str) -> str | None:
             found.add(file)
             to_see += _read(file)[1]
     digest = hashlib.sha256(b"".join(_read(file)[0] for file in sorted(found))).hexdigest()[:16]
-    own = BASE / module / digest
+    own, shipped = BASE / module / digest, SHIPPED / module / digest
     if not own.exists():
         for old in own.parent.glob("*"):
             shutil.rmtree(old, ignore_errors=True)
         try:
-            own.mkdir(parents=True, exist_ok=True)
+            own.parent.mkdir(parents=True, exist_ok=True)
+            _copy(shipped, own) if shipped.is_dir() else own.mkdir(exist_ok=True)
         except OSError:
-            return None
-    return str(own)
+            return shipped
+    return own
+
+
+def _copy(folder: Path, to: Path) -> None:
+    """Copies it whole, or not at all where another process was first."""
+    with TemporaryDirectory(dir=BASE) as beside:
+        shutil.copytree(folder, Path(beside) / "copy")
+        with contextlib.suppress(OSError):
+            (Path(beside) / "copy").rename(to)
 
 
 @cache

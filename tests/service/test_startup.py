@@ -10,7 +10,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from specshield import compiled
 from specshield.client import ShieldClient
 from specshield.errors import Starting
 from specshield.service.startup import mark_of_kernels
@@ -26,21 +25,6 @@ def held(tmp_path):
     fcntl.flock(lock, fcntl.LOCK_EX)
     yield kernels, lock
     os.close(lock)
-
-
-def test_what_numba_would_compile_again_is_not_marked_as_compiled(tmp_path, monkeypatch):
-    """It knows a kernel by the path and the time of its file, whatever is in it."""
-    monkeypatch.setattr(compiled, "BASE", tmp_path / "kernels")
-    marks = []
-    for folder, seconds in (("here", 1), ("here", 1), ("here", 2), ("there", 2)):
-        file = tmp_path / folder / "kernel.py"
-        file.parent.mkdir(exist_ok=True)
-        file.touch()
-        os.utime(file, (seconds, seconds))
-        monkeypatch.setattr(compiled, "PACKAGE", file.parent)
-        marks.append(mark_of_kernels())
-    assert marks[0] == marks[1]
-    assert len(set(marks)) == 3
 
 
 def test_a_server_takes_in_nothing_before_it_is_ready_that_no_first_decision_needs():

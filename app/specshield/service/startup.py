@@ -12,7 +12,6 @@ import asyncio
 import contextlib
 import fcntl
 import gc
-import hashlib
 import logging
 import os
 import sys
@@ -26,7 +25,7 @@ from specshield.errors import InputError, ServerError, SpecshieldError, Starting
 from specshield.service import warmup
 
 KERNELS = 206  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
-TAKES = 85  # [s] that a first start took on two quiet cores: `make wheel-check` prints what it takes
+TAKES = 85  # [s] that a first start took on two quiet cores: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
 log = logging.getLogger("specshield")
@@ -71,12 +70,8 @@ class Startup:
 
 
 def mark_of_kernels() -> Path | None:
-    """The file that says that every kernel of a start is on the disk. numba recognises a cached kernel by the
-    path and the modification time of its source file, so the name of this file depends on both.
-    """
-    files = sorted(compiled.PACKAGE.rglob("*.py"))
-    stamps = repr([(str(file), file.stat().st_mtime_ns) for file in files])
-    return compiled.mark(f"ready-{hashlib.sha256(stamps.encode()).hexdigest()[:16]}")
+    """The file that says that every kernel of a start is on the disk."""
+    return compiled.mark("ready")
 
 
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
