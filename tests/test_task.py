@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import re
+import weakref
 
 import numpy as np
 import pytest
 
 from specshield.errors import FormulaError, HorizonError, MapError, SampleError
+from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH, robot_from_json
+from specshield.rule.view import view_of
+from specshield.shield import episode
+from specshield.shield.decision import Config, make_shield
+from specshield.shield.uncertainty import Uncertainty
 from specshield.stl import robustness
-from specshield.task import make_task
+from specshield.task import MAX_KEPT, kept_with_task, make_task
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Circle, region_from_json
 
@@ -125,3 +132,28 @@ def test_bad_specs_name_the_field(given, error, path):
 
 def test_a_rule_of_the_first_state_alone_is_a_task():
     assert task_of("x > 1").horizon == 0
+
+
+def test_a_task_that_nobody_uses_any_more_goes_with_its_map_and_all_that_was_made_of_it():
+    task = make_task(GRID, STRETCH, "F[0,3] A and G[0,2] theta < 1", {"A": DISC})
+    shield = make_shield([synthesise(task)], Config(uncertainty=Uncertainty(), learn_map=True))
+    decision = episode.decide(shield, [(1.0, 1.0, 0.0)], np.zeros(len(STRETCH.actions)))
+    assert view_of(task, task.formula) is view_of(task, task.formula)
+    gone = weakref.ref(task)
+    del task, shield, decision
+    gc.collect()
+    assert gone() is None
+
+
+def test_no_more_is_kept_with_a_task_than_its_bound():
+    task, calls = task_of(), []
+
+    @kept_with_task
+    def counted(task, number):
+        calls.append(number)
+        return None if number == 0 else number
+
+    assert [counted(task, 0), counted(task, 0)] == [None, None]
+    assert [counted(task, number) for number in range(1, MAX_KEPT + 1)] == list(range(1, MAX_KEPT + 1))
+    counted(task, 0)  # was the first to go
+    assert calls == [0, *range(1, MAX_KEPT + 1), 0]

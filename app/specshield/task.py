@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,7 @@ MAX_REGIONS = 256  # of one spec, and rooms of one map
 MAX_HORIZON = 1000  # [steps] unless the caller sets another limit
 MAX_NAME = 64  # characters
 LARGEST = 1e100  # magnitude of a signal's value, so that arithmetic on it stays finite
+MAX_KEPT = 64  # things of one kind that are kept with a task; its parts are seldom more than ten
 SIGNAL = f"a number from {-LARGEST:g} to {LARGEST:g}"
 
 
@@ -95,6 +96,31 @@ class Task:
         held = np.full(n, sent[-1] if len(sent) else self.signals[name])
         held[: len(sent)] = sent
         return held
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+NOT_KEPT: Any = object()
+
+
+def kept_with_task(function: Callable[Concatenate[Task, P], R]) -> Callable[Concatenate[Task, P], R]:
+    """Keeps what the function returns for a task with that task, until the task goes. A cache of the
+    function's own would hold the maps of tasks that nobody uses any more.
+    """
+    name = f"{function.__module__}.{function.__qualname__}"
+
+    @wraps(function)
+    def kept(task: Task, /, *more: P.args, **named: P.kwargs) -> R:
+        own: dict[Any, R] = task.__dict__.setdefault(name, {})
+        found: R = own.get(more, NOT_KEPT)
+        if found is NOT_KEPT:
+            found = function(task, *more, **named)
+            for old in list(own)[: max(len(own) + 1 - MAX_KEPT, 0)]:
+                own.pop(old, None)
+            own[more] = found
+        return found
+
+    return kept
 
 
 def make_task(

@@ -313,6 +313,7 @@ def sent(weights=None, **card):
         (sent(spec={**SPEC, "formula": "F[0,7] Goal"}), "card.task_hash"),
         (sent(seed="zero"), "card.seed"),
         (sent(robot="spot"), "card.robot"),
+        (sent(options={"units": "many"}), "card.options.units"),
         ({**sent(), "card": ("c", b"{")}, "card"),
         (sent(weights=b"\x80\x04\x95pickle"), "weights"),
         (sent(weights=policy_files()["weights"][:-8]), "weights"),

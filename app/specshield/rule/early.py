@@ -7,7 +7,6 @@ leaves along a trajectory, so that no formula is compiled at a step.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from specshield.compiled import kernel, leaf
 from specshield.rule.values import places
 from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts
 from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_value
-from specshield.task import Task
+from specshield.task import Task, kept_with_task
 
 OTHER, EVENTUALLY, ALWAYS = 0, 1, 2
 
@@ -40,7 +39,7 @@ class Conjuncts(NamedTuple):
     plain: Bools
 
 
-@lru_cache(maxsize=256)
+@kept_with_task
 def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
     """The formula as a plain conjunction, whose tree has the leaves, and its conjuncts, prepared once.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regi
 from specshield.stl import Always, And, Formula, Node, Until
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
 from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_bounds, tree_value
-from specshield.task import Task
+from specshield.task import Task, kept_with_task
 from specshield.world.regions import PackedRegions, turns_with_robot
 
 
@@ -33,7 +32,7 @@ class View(NamedTuple):
     binds: Bools
 
 
-@lru_cache(maxsize=256)
+@kept_with_task
 def view_of(task: Task, formula: Formula) -> View:
     """The formula, or a part of it, prepared once."""
     names = list(task.areas)

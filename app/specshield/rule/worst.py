@@ -11,7 +11,6 @@ positive.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 from itertools import islice, pairwise, product
 
 import numpy as np
@@ -19,12 +18,12 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.errors import SampleError
 from specshield.stl import SATISFIED_ABOVE, Comparison, Formula, Implies, Node, Not, Number, robustness
-from specshield.task import Task
+from specshield.task import Task, kept_with_task
 
 MOST_TRIED = 4096  # combinations of values of signals that are read together. Chosen by hand
 
 
-@lru_cache(maxsize=64)
+@kept_with_task
 def worst_signals(task: Task) -> Floats | None:
     """The worst values [1, S], in the order of `task.signals`, each held for ever.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from specshield.arrays import Ints
 from specshield.rule.view import View, view_of
 from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until
 from specshield.stl.tree import is_temporal
-from specshield.task import Task
+from specshield.task import Task, kept_with_task
 
 Ends = frozenset[tuple[Formula, int]]
 
@@ -56,7 +55,7 @@ class PackedLiterals(NamedTuple):
     margin: float
 
 
-@lru_cache(maxsize=64)
+@kept_with_task
 def literals_of(task: Task, formula: Formula) -> tuple[PackedLiterals, tuple[Literal, ...]]:
     """The literals of the task's formula or of a part of it, in the order of `PackedLiterals.literal`."""
     formula = separate(task, formula)

@@ -10,13 +10,14 @@ import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from specshield.errors import FormulaError, InputError, NotFound, PolicyError, SpecshieldError
 from specshield.policy.card import policy_id
-from specshield.policy.methods import load_policy
+from specshield.policy.methods import METHODS, load_policy
+from specshield.policy.options import read_options
 from specshield.robot import robot_from_json
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.library import files
@@ -207,6 +208,7 @@ class Policies:
         id = self._on_map(sent_id(_id(about, task), card, weights), about, task)
         card["id"] = id  # never the sender's
         load_policy(weights, card, task)
+        _check_options(about)
         record = replace(record, id=id, card=card)
         if name is not None:
             self.check_name(record, key.name, name)
@@ -309,6 +311,16 @@ def _left_out(folder: Path) -> Iterator[None]:
 
 def describe(card: Mapping[str, Any]) -> Description:
     return Description(*(card[name] for name in ("map_id", "robot", "spec", "method", "seed", "options")))
+
+
+def _check_options(about: Description) -> None:
+    """Raises PolicyError for a value that is not one of the method's. An older version may have had others."""
+    cls = METHODS.get(about.method).options
+    known = {each.name for each in fields(cls)}
+    try:
+        read_options(cls, {name: value for name, value in about.options.items() if name in known})
+    except PolicyError as error:
+        raise error.at("card") from None
 
 
 def _missing(key: str) -> NotFound:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import struct
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from specshield.robot.dynamics import wrap
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.uncertainty import CHANCE, Care, Noise, Uncertainty, margin_for
 from specshield.stl import Eventually, conjuncts
-from specshield.task import Task
+from specshield.task import Task, kept_with_task
 
 ASSUMED = Uncertainty()
 Told = tuple[float, float, float, bool]  # what `Uncertainty` says, and whether it is only assumed
@@ -114,7 +113,7 @@ def was_stopped(shield: Shield, carry: Carry, poses: Floats, halts: int = 0) -> 
     return miss > far
 
 
-@lru_cache(maxsize=256)
+@kept_with_task
 def _measures(task: Task) -> tuple[float, int]:
     """The longest move [m], and how many deadlines the formula has, both at least 1 where there is none."""
     longest = max((abs(move) for move, _ in task.robot.motions), default=0.0)
