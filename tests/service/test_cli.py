@@ -51,6 +51,12 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "SPECSHIELD_STORE_TIMEOUT is not valid: '0'",
             "greater than 0",
         ),
+        (
+            "serve",
+            {"SPECSHIELD_STORE_REPLICAS": "1"},
+            "SPECSHIELD_STORE_REPLICAS is not valid: '1'",
+            "0 where REDIS_URL is not set",
+        ),
         ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
         (
             "serve",

@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -19,7 +20,9 @@ import pytest
 import redis
 from redis.crc import key_slot
 
+from specshield.errors import StoreError
 from specshield.service.storage.connect import connect
+from specshield.service.storage.store import Change, Record, Store
 from tests.service.test_events import END, read
 from tests.service.world import ROBOT, SPEC, grid_json, send_policy
 from tests.serving import RunningServer, serving, wait_for
@@ -173,6 +176,43 @@ def test_a_life_under_sentinels_that_name_another_server(tmp_path):
 def test_a_life_behind_tls(tmp_path):
     with behind_tls(tmp_path / "store") as url, on_store(tmp_path, url) as server:
         a_whole_life(server, tmp_path, url)
+
+
+@pytest.mark.parametrize("kind", [watched, cluster])
+def test_what_its_replica_does_not_have_is_not_told(tmp_path, kind):
+    """With SPECSHIELD_STORE_REPLICAS=1. What is written is told later, to whoever asks again."""
+
+    async def scene(url: str, replica: int) -> None:
+        store = Store(url, timeout=1.0, ttl=60, replicas=1)
+        id = next(id for id in map(str, range(1000)) if key_slot(id.encode()) < FIRST)
+        await store.create(id, b"config", Change(b"state", bytes(24)))
+        seen = await store.load(id, 0)
+        assert isinstance(seen, Record)
+        step = Change(b"state", bytes(24), 24, 0, b"what the step left")
+        os.kill(replica, signal.SIGSTOP)
+        try:
+            with pytest.raises(StoreError, match="0 of 1 replicas"):
+                await store.append(id, seen.version, step)
+            with pytest.raises(StoreError, match="0 of 1 replicas"):
+                await store.load(id, 0)
+            if kind is watched:
+                with pytest.raises(StoreError, match="0 of 1 replicas"):
+                    await store.ping()
+        finally:
+            os.kill(replica, signal.SIGCONT)
+        while True:
+            try:
+                found = await store.append(id, seen.version, step)
+                break
+            except StoreError:
+                await asyncio.sleep(0.05)
+        assert isinstance(found, Record)
+        assert found.step == b"what the step left"
+        await store.aclose()
+
+    with kind(tmp_path) as there:
+        replica = there.replica if kind is watched else there.nodes[3]
+        asyncio.run(scene(there.url, replica.info("server")["process_id"]))
 
 
 def test_a_connection_that_is_closed_while_it_is_in_use_is_a_store_that_cannot_be_reached(tmp_path):

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Literal
 
-from pydantic import AliasChoices, Field, SecretStr, ValidationError, field_validator
+from pydantic import AliasChoices, Field, SecretStr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from specshield import shipped
@@ -44,6 +44,12 @@ class Settings(BaseSettings):
     )
     store_timeout: float = Field(
         default=2.0, gt=0, description="Longest wait for one answer of the store [s]."
+    )
+    store_replicas: int = Field(
+        default=0,
+        ge=0,
+        le=8,
+        description="Replicas of the store at REDIS_URL that have to have a step before it is answered.",
     )
     api_key: SecretStr | None = Field(
         default=None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
@@ -152,6 +158,13 @@ class Settings(BaseSettings):
         except (ValueError, TypeError):
             raise ValueError(f"a URL as {FORMS}") from None
         return url
+
+    @field_validator("store_replicas")
+    @classmethod
+    def _has_replicas(cls, replicas: int, others: ValidationInfo) -> int:
+        if replicas and others.data.get("redis_url") is None:
+            raise ValueError("0 where REDIS_URL is not set: the store that the server starts has no replica")
+        return replicas
 
     @field_validator("api_key")
     @classmethod

@@ -60,22 +60,21 @@ def cluster_slots(scene: Scene) -> dict[str, Any]:
 
 
 def sentinel(scene: Scene) -> dict[str, Any]:
-    """A master and a replica behind three sentinels; the master is killed, the replica takes over, and the
-    old master comes back as its replica. Redis replicates after it has answered, so what it answered in its
-    last moment may be lost: `lost` and `changed` count that; it is no promise (docs/scale.md).
+    """A master and a replica behind three sentinels, with `SPECSHIELD_STORE_REPLICAS=1`; the master is
+    killed, the replica takes over, and the old master comes back as its replica. Nothing is answered before.
     """
-    with _watched(scene.folder) as (pair, watcher, url), _served(scene, url) as service:
+    replicas = {"SPECSHIELD_STORE_REPLICAS": "1"}
+    with _watched(scene.folder) as (pair, watcher, url), _served(scene, url, **replicas) as service:
+
+        def mend(master: RedisServer, other: RedisServer) -> None:
+            wait_for(lambda: _master(watcher) == other.port, 60.0, "a new master")
+            master.start()
+
         with Crowd([service.url], scene.starts, 4) as crowd:
             for _ in range(scene.n):
                 master = next(node for node in pair if node.port == _master(watcher))
                 other = next(node for node in pair if node is not master)
-                crowd.fault(
-                    master.kill,
-                    lambda other=other: wait_for(
-                        lambda: _master(watcher) == other.port, 60.0, "a new master"
-                    ),
-                )
-                master.start()
+                crowd.fault(master.kill, lambda master=master, other=other: mend(master, other))
                 wait_for(lambda master=master: _follows(master), 60.0, "a replica again")
                 wait_for(lambda: _known_replica(watcher), 60.0, "a replica that the sentinels know")
         return {"kills": scene.n, **crowd.result(service.url, scene.reference)}

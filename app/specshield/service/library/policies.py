@@ -314,7 +314,9 @@ def describe(card: Mapping[str, Any]) -> Description:
 
 
 def _check_options(about: Description) -> None:
-    """Raises PolicyError for a value that is not one of the method's. An older version may have had others."""
+    """Raises PolicyError for a value that no option of the method takes. An older version may have had
+    other options.
+    """
     cls = METHODS.get(about.method).options
     known = {each.name for each in fields(cls)}
     try:

@@ -60,8 +60,8 @@ return redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3]) > 0 and 1 or 0"""
 class ArchivingStore(Store):
     """A `Store` whose sessions may lie in the archive. Its `page` and `count` are of those in the store."""
 
-    def __init__(self, url: str, timeout: float, ttl: int, archive: Archive) -> None:
-        super().__init__(url, timeout, ttl)
+    def __init__(self, url: str, timeout: float, ttl: int, archive: Archive, replicas: int = 0) -> None:
+        super().__init__(url, timeout, ttl, replicas)
         self.archive = archive
         self._leave, self._return, self._erase = map(self.redis.register_script, (LEAVE, RETURN, ERASE))
         self.full = False

@@ -19,7 +19,7 @@ import anyio
 from specshield.errors import SessionExists, StoreError
 from specshield.service.access.owners import between, shown
 from specshield.service.storage.connect import FAILURES, connect, is_cluster
-from specshield.service.storage.wire import Script, Wire
+from specshield.service.storage.wire import PART, Script, Wire, too_few
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
 AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
@@ -77,14 +77,17 @@ class Change:
 
 
 class Store:
-    """Every method raises StoreError where the store cannot be reached in time."""
+    """Every method raises StoreError where the store cannot be reached in time.
 
-    def __init__(self, url: str, timeout: float, ttl: int) -> None:
+    replicas: how many of the store's have to have a change, or what is read of a session, before it is told.
+    """
+
+    def __init__(self, url: str, timeout: float, ttl: int, replicas: int = 0) -> None:
         self.redis: Any = connect(url, socket_timeout=timeout)
         self._drop, self._append = self.redis.register_script(DROP), self.redis.register_script(APPEND.text)
         # A cluster has no one connection: redis-py finds the server that has a session's keys.
-        self._wire = None if is_cluster(url) else Wire(self.redis.connection_pool, timeout)
-        self._timeout, self._ttl = timeout, ttl
+        self._wire = None if is_cluster(url) else Wire(self.redis.connection_pool, timeout, replicas)
+        self._timeout, self._ttl, self._replicas = timeout, ttl, replicas
 
     async def aclose(self) -> None:
         if self._wire is not None:
@@ -106,6 +109,8 @@ class Store:
         """Whether it takes a write: one whose disk is full still answers reads."""
         async with self._reaching():
             await self.redis.set("specshield:ready", 1, ex=60)
+        if self._replicas:
+            await self.load("ready")
 
     async def create(self, id: str, config: bytes, change: Change) -> bytes:
         """The first version. Raises SessionExists. `config` has to be unlike any other, so that a retry knows
@@ -161,12 +166,26 @@ class Store:
         if self._wire is None:
             async with self._reaching():
                 written = await self._append(keys=keys(id), args=args)
+                if self._replicas:
+                    await self._replicated(id, written if isinstance(written, bytes) else written[2])
         else:
             try:
                 written = await self._wire.run(APPEND, keys(id), args)
             except FAILURES as error:
                 raise _away(error) from error
         return written if isinstance(written, bytes) else _record(*written)
+
+    async def _replicated(self, id: str, version: bytes | None) -> None:
+        """Waits until the replicas of this session's node have it; it is still of this version there. WAIT is
+        for all that the node had done when the command before it, on the same connection, was done.
+        """
+        node, longest = self.redis.get_node_from_key(keys(id)[0]), int(PART * 1000 * self._timeout)
+        pipe = self.redis.pipeline()
+        pipe.execute_command("HGET", keys(id)[0], "version", target_nodes=node)
+        pipe.execute_command("WAIT", self._replicas, longest, target_nodes=node)
+        found, count = await pipe.execute()
+        if found != version or count < self._replicas:
+            raise too_few(count, self._replicas)
 
     async def dump(self, id: str) -> Dump | None:
         """All of a session as it is at one moment; None where there is none."""

@@ -16,7 +16,10 @@ from typing import Any
 import hiredis
 import redis
 
+from specshield.errors import StoreError
+
 TRIES = 3  # after the first, over new connections; all within the caller's time limit. Chosen by hand.
+PART = 0.8  # of the time that is left for an answer, in which replicas may have it; the rest is to say so
 GONE = ("LOADING", "READONLY", "MASTERDOWN")  # replies of a server that is not, or no longer, the one to ask
 
 
@@ -28,17 +31,19 @@ class Script:
 
 
 class Wire:
-    """pool: redis-py's, of a single server. timeout: longest wait for one answer, with all tries [s]."""
+    """pool: redis-py's, of a single server. timeout: longest wait for one answer, with all tries [s].
+    replicas: how many of the server's have to have all that an answer tells of before it is given.
+    """
 
-    def __init__(self, pool: Any, timeout: float) -> None:
-        self._pool, self._timeout = pool, timeout
+    def __init__(self, pool: Any, timeout: float, replicas: int = 0) -> None:
+        self._pool, self._timeout, self._replicas = pool, timeout, replicas
         self._link: _Link | None = None
         self._opening = asyncio.Lock()
 
     async def run(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
         """What the script returns. It may run twice where the answer to the first time was lost.
 
-        Raises redis.RedisError, OSError or TimeoutError.
+        Raises redis.RedisError, OSError or TimeoutError, and StoreError where replicas are missing.
         """
         deadline = asyncio.get_running_loop().time() + self._timeout
         tries_left = TRIES
@@ -58,7 +63,7 @@ class Wire:
             if self._link is None or self._link.closed:
                 connection = self._pool.make_connection()
                 await connection.connect()
-                self._link = _Link(connection)
+                self._link = _Link(connection, self._replicas)
             return self._link
 
     def close(self) -> None:
@@ -80,14 +85,19 @@ async def _run(link: _Link, script: Script, keys: Sequence[str], args: Sequence[
 
 
 class _Link(asyncio.Protocol):
-    """An open connection, taken over from redis-py's; `closed` once it is of no more use."""
+    """An open connection, taken over from redis-py's; `closed` once it is of no more use.
 
-    def __init__(self, connection: Any) -> None:
-        self._connection = connection  # kept, or its transport would be closed
+    Where replicas are asked for, each round of commands ends with a WAIT, and their answers are held until
+    the server says how many replicas have what it had done by then.
+    """
+
+    def __init__(self, connection: Any, replicas: int) -> None:
+        self._connection, self._replicas = connection, replicas  # kept, or its transport would be closed
         self._transport: asyncio.Transport = connection._writer.transport
         self._transport.set_protocol(self)
         self._reader, self._unsent = hiredis.Reader(), list[bytes]()
-        self._waiting = deque[tuple[asyncio.Future[Any], float]]()
+        self._waiting = deque[tuple[asyncio.Future[Any] | None, float]]()  # None: a WAIT
+        self._held = list[tuple[asyncio.Future[Any], Any]]()
         self._loop = asyncio.get_running_loop()
         self._watch: asyncio.TimerHandle | None = None
         self.closed = self._transport.is_closing()
@@ -110,6 +120,12 @@ class _Link(asyncio.Protocol):
         """
         content = b"".join(self._unsent)
         self._unsent.clear()
+        if self._replicas and self._waiting:
+            deadline = self._waiting[-1][1]
+            longest = max(int(PART * 1000 * (deadline - self._loop.time())), 1)
+            wait: tuple[Any, ...] = ("WAIT", self._replicas, longest)
+            content += hiredis.pack_command(wait)
+            self._waiting.append((None, deadline))
         try:
             self._transport.write(content)
         except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
@@ -122,12 +138,21 @@ class _Link(asyncio.Protocol):
             if isinstance(found, hiredis.PushNotification):
                 continue
             answer, _ = self._waiting.popleft()
-            if answer.done():  # whoever waited has gone
-                continue
-            if isinstance(found, hiredis.ReplyError):
-                answer.set_exception(redis.ResponseError(str(found)))
+            if answer is None:
+                self._release(found)
+            elif self._replicas:
+                self._held.append((answer, found))
             else:
-                answer.set_result(found)
+                _give(answer, found)
+
+    def _release(self, count: Any) -> None:
+        """Gives the answers that wait for the replicas. count: what WAIT returned."""
+        missing = not isinstance(count, int) or count < self._replicas
+        for answer, found in self._held:
+            if missing and not isinstance(found, hiredis.ReplyError):
+                found = too_few(count, self._replicas)
+            _give(answer, found)
+        self._held.clear()
 
     def _late(self) -> None:
         """Looks after the oldest that waits. One that is late ends the connection: answers come in order."""
@@ -135,8 +160,8 @@ class _Link(asyncio.Protocol):
         now = self._loop.time()
         while self._waiting and self._waiting[0][1] <= now:
             answer, _ = self._waiting.popleft()
-            if not answer.done():
-                answer.set_exception(TimeoutError("the store did not answer in time"))
+            if answer is not None:
+                _give(answer, TimeoutError("the store did not answer in time"))
             self.close()  # also where nobody waits any more: else the next would get this one's answer
         if self._waiting:
             self._watch = self._loop.call_at(self._waiting[0][1], self._late)
@@ -145,11 +170,31 @@ class _Link(asyncio.Protocol):
         self.closed = True
         if self._watch is not None:
             self._watch.cancel()
-        for answer, _ in self._waiting:
-            if not answer.done():
-                answer.set_exception(redis.ConnectionError(f"the connection was lost: {error}"))
+        for answer, _ in (*self._held, *self._waiting):
+            if answer is not None:
+                _give(answer, redis.ConnectionError(f"the connection was lost: {error}"))
+        self._held.clear()
         self._waiting.clear()
 
     def close(self) -> None:
         self.closed = True
         self._transport.abort()
+
+
+def too_few(count: Any, replicas: int) -> StoreError:
+    return StoreError(
+        f"{count} of {replicas} replicas of the store had the answer in time",
+        expected="what SPECSHIELD_STORE_REPLICAS asks for",
+    )
+
+
+def _give(answer: asyncio.Future[Any], found: Any) -> None:
+    """Gives an answer to whoever waits for it, unless they have gone."""
+    if answer.done():
+        return
+    if isinstance(found, hiredis.ReplyError):
+        found = redis.ResponseError(str(found))
+    if isinstance(found, Exception):
+        answer.set_exception(found)
+    else:
+        answer.set_result(found)
