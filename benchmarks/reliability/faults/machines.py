@@ -60,22 +60,23 @@ def cluster_slots(scene: Scene) -> dict[str, Any]:
 
 
 def sentinel(scene: Scene) -> dict[str, Any]:
-    """A master and two replicas behind three sentinels, with `SPECSHIELD_STORE_REPLICAS=1`; the master is
-    killed, a replica takes over, and the old master comes back as its replica.
+    """A master and a replica behind three sentinels, with `SPECSHIELD_STORE_REPLICAS=1`; the master is
+    killed, the replica takes over, and the old master comes back as its replica. Nothing is answered before.
     """
     replicas = {"SPECSHIELD_STORE_REPLICAS": "1"}
-    with _watched(scene.folder) as (nodes, watcher, url), _served(scene, url, **replicas) as service:
+    with _watched(scene.folder) as (pair, watcher, url), _served(scene, url, **replicas) as service:
 
-        def another(master: RedisServer) -> None:
-            wait_for(lambda: _master(watcher) != master.port, 60.0, "a new master")
+        def mend(master: RedisServer, other: RedisServer) -> None:
+            wait_for(lambda: _master(watcher) == other.port, 60.0, "a new master")
+            master.start()
 
         with Crowd([service.url], scene.starts, 4) as crowd:
             for _ in range(scene.n):
-                master = next(node for node in nodes if node.port == _master(watcher))
-                crowd.fault(master.kill, lambda master=master: another(master))
-                master.start()
-                wait_for(lambda: sum(map(_follows, nodes)) == len(nodes) - 1, 60.0, "replicas again")
-                wait_for(lambda: _known_replicas(watcher), 60.0, "replicas that the sentinels know")
+                master = next(node for node in pair if node.port == _master(watcher))
+                other = next(node for node in pair if node is not master)
+                crowd.fault(master.kill, lambda master=master, other=other: mend(master, other))
+                wait_for(lambda master=master: _follows(master), 60.0, "a replica again")
+                wait_for(lambda: _known_replica(watcher), 60.0, "a replica that the sentinels know")
         return {"kills": scene.n, **crowd.result(service.url, scene.reference)}
 
 
@@ -139,27 +140,27 @@ def _cluster(folder: Path) -> Iterator[list[RedisServer]]:
 
 @contextmanager
 def _watched(folder: Path) -> Iterator[tuple[list[RedisServer], list[RedisServer], str]]:
-    """A master with its two replicas, the sentinels, and the URL of it all."""
+    """A master with its replica, the sentinels, and the URL of it all."""
     with ExitStack() as stack:
         quick = ["--repl-diskless-sync-delay", "0"]
-        nodes = [stack.enter_context(RedisServer(folder / "first", *quick))]
-        follows = ["--replicaof", "127.0.0.1", str(nodes[0].port), *quick]
-        nodes += [stack.enter_context(RedisServer(folder / name, *follows)) for name in ("second", "third")]
-        wait_for(lambda: all(map(_follows, nodes[1:])), 60.0, "replicas")
+        pair = [stack.enter_context(RedisServer(folder / "first", *quick))]
+        follows = ["--replicaof", "127.0.0.1", str(pair[0].port), *quick]
+        pair.append(stack.enter_context(RedisServer(folder / "second", *follows)))
+        wait_for(lambda: _follows(pair[1]), 60.0, "a replica")
         watchers = []
         for i in range(3):
             watcher = RedisServer(folder / f"sentinel-{i}")
             told = watcher.folder / "sentinel.conf"
             told.write_text(
                 f"port {watcher.port}\nbind 127.0.0.1\ndir {watcher.folder}\n"
-                f"sentinel monitor shield 127.0.0.1 {nodes[0].port} {QUORUM}\n"
+                f"sentinel monitor shield 127.0.0.1 {pair[0].port} {QUORUM}\n"
                 "sentinel down-after-milliseconds shield 500\nsentinel failover-timeout shield 3000\n"
             )
             Program.__init__(watcher, ["redis-server", str(told), "--sentinel"], watcher.log)
             watchers.append(stack.enter_context(watcher))
-        wait_for(lambda: _known_replicas(watchers), 60.0, "sentinels that know the replicas")
+        wait_for(lambda: _known_replica(watchers), 60.0, "sentinels that know the replica")
         hosts = ",".join(f"127.0.0.1:{watcher.port}" for watcher in watchers)
-        yield nodes, watchers, f"redis+sentinel://{hosts}/shield"
+        yield pair, watchers, f"redis+sentinel://{hosts}/shield"
 
 
 def _ask(node: RedisServer, *command: Any) -> Any:
@@ -189,8 +190,8 @@ def _master(watchers: list[RedisServer]) -> int:
     return max(set(named), key=named.count)
 
 
-def _known_replicas(watchers: list[RedisServer]) -> bool:
-    """Whether every sentinel knows two replicas that are there, and the other sentinels."""
+def _known_replica(watchers: list[RedisServer]) -> bool:
+    """Whether every sentinel knows a replica that is there, and the other sentinels."""
     for watcher in watchers:
         with redis.Redis(port=watcher.port, socket_timeout=5.0) as found:
             try:
@@ -198,7 +199,7 @@ def _known_replicas(watchers: list[RedisServer]) -> bool:
                 others = found.sentinel_sentinels("shield")
             except redis.RedisError:
                 return False
-        if len(others) < len(watchers) - 1 or sum(map(_up, replicas)) < 2:
+        if len(others) < len(watchers) - 1 or not any(_up(each) for each in replicas):
             return False
     return True
 
