@@ -15,8 +15,11 @@ import pytest
 
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.robot import STRETCH
+from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import in_collision, make_body, step
+from specshield.shield.caution.experience import FORMAT, Seen
 from specshield.shield.episode import Config, decide, make_shield
+from specshield.shield.surprise.vain import barred_by
 from specshield.shield.taught import Taught, on_map
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import make_task
@@ -219,3 +222,66 @@ def test_a_motion_that_leads_nowhere_is_not_tried_for_ever(over, noise):
     assert drawn[0] == left
     assert any(action != left for action in drawn[4:])
     assert int(STRETCH.motion_of[left]) in [motion for *_, motion in carry.stuck]
+
+
+def test_what_came_in_the_only_way_is_waited_for_before_it_and_passed_when_it_has_gone():
+    """A wall with one gap, and someone in it for 35 steps: nothing else leads to what is behind the wall.
+
+    From where the goal is nearest, at the wall, there would be too little time left.
+    """
+    walls = np.zeros((40, 80), bool)
+    walls[19:21, :56] = True
+    someone = [(x, 1.0) for x in np.arange(2.825, 4.0, 0.05)]
+    goal, pose = {"Goal": {"type": "circle", "center": [0.6, 0.45], "radius": 0.35}}, (2.0, 1.5, 0.0)
+    task = make_task(OccupancyGrid(walls, 0.05), STRETCH, "F[0,64] Goal", goal)
+    shield = make_shield([synthesise(task, Settings(pitch=0.1))], Config(learn_map=True))
+    there = task.grid.occupied.copy()
+    there[20, 56:] = True
+    bodies = make_body(STRETCH, replace(task.grid, occupied=there)), shield.body
+    poses, carry, said = [pose], None, []
+    for t in range(task.horizon + 1):
+        gone = t >= 35
+        points = {"free": someone} if gone else {"occupied": someone}
+        decision = decide(shield, poses, None, main_task_done=True, carry=carry, **points)
+        carry, said = decision.carry, [*said, decision.mode]
+        if decision.spec_status != "pending":
+            break
+        motion = int(STRETCH.motion_of[decision.action])
+        if not gone:  # it never drives into who is there
+            assert step(bodies[0], *poses[-1], motion) == step(bodies[1], *poses[-1], motion)
+        poses.append(step(bodies[gone], *poses[-1], motion))
+    assert decision.spec_status == "satisfied"
+    assert set(said[:35]) == {"fallback"}
+    assert poses[20] == poses[35]
+
+
+def test_a_motion_that_goes_on_where_f_stops_it_is_no_noise_and_is_not_relied_on_again():
+    shield = shield_of(40, learn_map=True, uncertainty=Uncertainty())
+    decision = decide(shield, [START], None, True, occupied=[(0.725, 1.0)])  # 4.85 cm before the footprint
+    foreseen, motion = decision.next_poses[AHEAD], int(STRETCH.motion_of[AHEAD])
+    assert START[0] < foreseen[0] < START[0] + 0.05
+    carry = replace(decision.carry, learned=drawn_by(decision.carry.learned, motion))
+    on = [(START[0] + 0.12, 1.0, 0.0), tuple(foreseen), (START[0] + 0.2, 1.0, 0.0)]
+    found = [decide(shield, [START, pose], None, True, carry=carry) for pose in on]
+    assert [len(each.carry.stuck) for each in found] == [1, 0, 1]
+    assert found[0].carry.stuck[0] == (*START, motion)
+    seen = [Seen(*FORMAT.unpack(each.carry.residuals)) for each in found]
+    assert [(each.moved, each.lost) for each in seen] == [(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)]
+    bars = barred_by(found[0].carry.stuck, (0.0, 0.0))
+    near = [is_barred(bars, START[0] + off, 1.0, math.radians(turn), motion) for off, turn in
+            [(0.04, 10.0), (0.06, 0.0), (0.0, 14.0)]]  # fmt: skip
+    assert near == [True, False, False]
+
+
+def drawn_by(learned, motion):
+    before = Taught.from_bytes(learned)
+    return replace(before, followed=replace(before.followed, drawn=motion)).to_bytes()
+
+
+@pytest.mark.parametrize(("y", "counts"), [(0.35, False), (1.0, True)])
+def test_what_stands_beside_something_may_have_met_it_and_is_not_taken_to_slip(y, counts):
+    shield = shield_of(40, learn_map=True, uncertainty=Uncertainty())
+    pose = (1.0, y, 0.0)  # 16 and 81 cm from the wall
+    carry = decide(shield, [pose], None, True).carry
+    after = decide(shield, [pose, pose], None, True, carry=carry)
+    assert (Seen(*FORMAT.unpack(after.carry.residuals)).lost > 0.0) == counts

@@ -33,13 +33,12 @@ from specshield.shield.judgement import (
     as_actions,
     feasible_mass_of,
     j_values_of,
-    recovered,
     robustness_of,
     without,
     witnesses_of,
 )
 from specshield.shield.signals import judged_by_signals
-from specshield.shield.surprise.doubt import tried_again
+from specshield.shield.surprise.doubt import recovered, tried_again
 from specshield.shield.taught import doubtful, handed_on, on_map, teach, wary
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
@@ -149,13 +148,14 @@ def decide(
         answer = _unmodified(shield, log_prior)
     else:
         shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
-        believed = None if judged.some else tried_again(told, taught, prefix, tail, spec_status, care)
+        believed = tried_again(told, taught, judged, prefix, tail, spec_status, care)
         if believed is not None:
             taught, (shield, prefix, judged, withstands) = believed
             said = (*said, "no way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
         doubts = doubtful(told, taught, poses[-1]) | judged.left_out
-        judged = without(recovered(shield, judged), shield, doubts)
+        judged = recovered(told, shield, taught, judged, prefix, tail, spec_status, care)
+        judged = without(judged, shield, doubts)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)

@@ -18,7 +18,7 @@ from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, flat, is_place
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, rho_of, together
-from specshield.shield.surprise.recovery import given_up, most_kept, recovers
+from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
 
@@ -66,12 +66,14 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         # Where nobody looks for ways without it, what comes back to a barred motion later still counts.
         whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
         goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses, whole)
-        others = np.where(goes, -np.inf, kept)
-        vain = others.max() <= SATISFIED_ABOVE
-        if not vain:
-            without_it = best_of(tried, others, motions)
+        vain = not (kept[~goes] > SATISFIED_ABOVE).any()
+        if vain and care.enough:
+            goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses, False)
+        if not vain or care.enough:
+            kept = np.where(goes, -np.inf, kept)
+            without_it = best_of(tried, kept, motions)
             left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
-            kept, best = others, without_it
+            best = without_it
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and _some(best)):
@@ -88,15 +90,6 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
     asked_and_had = aimed.margin, aimed.slack, aimed.lowered
     return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had, vain, left_out)
-
-
-def recovered(shield: Shield, judged: Judged) -> Judged:
-    """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words."""
-    if judged.some or not recovers(shield.config):
-        return judged
-    first, said = most_kept(shield, judged.part, judged.tried)
-    tried = replace(judged.tried, warnings=(*judged.tried.warnings, *said))
-    return replace(judged, tried=tried, completion=int(shield.task.robot.representative[first]))
 
 
 def without(judged: Judged, shield: Shield, doubtful: Bools) -> Judged:

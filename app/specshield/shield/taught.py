@@ -19,7 +19,7 @@ from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import Body, make_body, overlap, successors
-from specshield.shield.caution.experience import was_stopped, within_noise
+from specshield.shield.caution.experience import was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
 from specshield.shield.surprise.contact import (
     NEAR,
@@ -61,9 +61,9 @@ MOST_MET = 255  # contacts at one pose that HEAD can hold
 class Taught:
     """What a session has learned: its map, and how its caller follows what is drawn.
 
-    contact: whether the last motion ran into something; it is not handed on. stuck: where the robot stood and
-    which motion led nowhere from there, whatever is marked; handed on beside the bytes. near: how far apart
-    two poses are that may be one.
+    contact: whether the last motion ran into something, or on through it; it is not handed on. stuck: where
+    the robot stood and which motion led nowhere from there, or elsewhere than f has it, whatever is marked;
+    handed on beside the bytes. near: how far apart two poses are that may be one.
     """
 
     map: LearnedMap = field(default_factory=LearnedMap)
@@ -105,7 +105,7 @@ def teach(
     if learned is None and occupied is None and free is None and not config.learn_map:
         return NOTHING, ()
     before = Taught.from_bytes(learned)
-    known, followed, motion = before.map, before.followed, -1
+    known, followed, motion, on = before.map, before.followed, -1, False
     stuck, near = () if carry is None else carry.stuck, NEAR
     if config.map_memory is not None:
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
@@ -116,11 +116,14 @@ def teach(
         motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, halts > 0)
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses, halts):
             motion, followed = -1, replace(followed, halted=motion, met=0)
+        on = motion < 0 and went_on(body, poses[-2], carry.next_poses, poses[-1], near)
         if motion >= 0 or (halts > 0 and came_back and followed.halted == drawn):
             # Slips come in a row; what does nothing, and again once the robot is back, did not slip.
             stuck = led_nowhere(stuck, poses[-1], max(motion, followed.halted), near)
         elif followed.halted >= 0 and followed is not before.followed:
             stuck = did_nothing(stuck, poses[-1], followed.halted, near)
+        elif on:  # it led elsewhere than f has it: to rely on f there again may lead round in a circle
+            stuck = led_nowhere(stuck, poses[-2], drawn, near) if drawn >= 0 else stuck
         elif drawn >= 0 and not is_near(poses[-2:-1], poses[-1], near):
             stuck = worked(stuck, poses[-2], drawn, near)
         half_way = np.empty(3)
@@ -145,7 +148,7 @@ def teach(
             beyond += outside
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
-    return Taught(own, followed, motion >= 0, stuck, near), said
+    return Taught(own, followed, motion >= 0 or on, stuck, near), said
 
 
 @leaf
@@ -164,7 +167,8 @@ def wary(config: Config, care: Care, taught: Taught) -> Care:
     if not config.learn_map:
         return care
     least = care.least if config.uncertainty is None else max(care.least, AROUND)
-    return replace(care, least=least, barred=taught.barred if len(taught.barred) else None)
+    barred = taught.barred if len(taught.barred) else None
+    return replace(care, least=least, barred=barred, enough=taught.followed.met > 1)
 
 
 def changes_map(learned: bytes | None) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel, leaf
-from specshield.robot.dynamics import wrap
+from specshield.robot.dynamics import Body, in_collision, unhindered, wrap
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.uncertainty import CHANCE, Care, Noise, Uncertainty, margin_for
 from specshield.stl import Eventually, conjuncts
@@ -35,6 +35,7 @@ STRAY = (
 )
 MOST_ODDS = 1e6  # so that what changes late is still noticed
 TINY = 1e-9  # [motions]
+BESIDE = 0.2  # [m] from the footprint, which may be told wrong: what is so near may be met. By hand.
 FAR = 5.0  # [sigma] what noise does: one motion in 270,000 ends farther off
 
 SELDOM = 1e-3  # what slips alone do not do so often is done by something else; chosen by hand
@@ -68,7 +69,7 @@ def learn(
 ) -> tuple[Seen | None, Care]:
     """What has been seen up to x_t, and what J asks for because of it. poses [t + 1, 3].
 
-    contact: the last motion ran into something, and says nothing of how the robot moves.
+    contact: the last motion ran into something, or on through it, and says nothing of how the robot moves.
     """
     config, t, known = shield.config, len(poses) - 1, shield.config.uncertainty
     if known is None:
@@ -76,7 +77,11 @@ def learn(
     told = _told(known)
     seen = Seen() if carry is None or carry.residuals is None else Seen(*FORMAT.unpack(carry.residuals))
     if carry is not None and carry.t == t - 1 and not contact:
-        seen = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
+        found = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
+        wider = shield.body._replace(radius=shield.body.radius + BESIDE)
+        if config.learn_map and found.lost > seen.lost and in_collision(wider, *poses[-1]):
+            found = seen._replace(slipping=found.slipping)  # it may have met what it stands beside
+        seen = found
     noise = noise_of(told, seen)
     stride, deadlines = _measures(shield.task)
     margin = margin_for(noise, stride, shield.task.horizon - t)
@@ -163,6 +168,20 @@ def noise_of(told: Told, seen: Seen) -> Noise:
         max(weight_of_slip * slip + seen.lost, TINY),
         max(weight_of_slip * (1.0 - slip) + seen.moved - seen.lost, TINY),
     )
+
+
+@kernel
+def went_on(body: Body, before: Floats, foreseen: Floats, pose: Floats, near: tuple[float, float]) -> bool:
+    """Whether some motion led farther than f, which has it run into something: the map or the footprint is
+    not as told. near [m], [rad]: what noise explains; the other arguments are those of `observe`.
+    """
+    led, (x, y, theta) = False, before
+    for m in range(foreseen.shape[0]):
+        if _gap(foreseen[m], pose) <= near[0] + near[1]:
+            return False
+        free = np.array(unhindered(body, x, y, theta, math.cos(theta), math.sin(theta), m))
+        led = led or _gap(free, pose) < _gap(free, foreseen[m]) - EXACT
+    return led
 
 
 @kernel

@@ -1,4 +1,7 @@
-"""What is believed of contacts where they leave no way: less than is marked, one guess after the other."""
+"""What is believed where what was seen or touched leaves no way, and what is done where there is none left.
+
+Of contacts less is believed than is marked, one guess after the other.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from specshield.robot.barred import in_vain
+from specshield.robot.dynamics import step
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.signals import judged_by_signals
+from specshield.shield.surprise.recovery import most_kept, recovers
 from specshield.shield.taught import Taught, on_map
 from specshield.shield.uncertainty import Care
 from specshield.stl import Verdict
@@ -21,18 +27,22 @@ DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else
 
 
 def tried_again(
-    told: Shield, taught: Taught, prefix: Prefix, tail: bytes | None, spec_status: Verdict, care: Care
-) -> tuple[Taught, tuple[Shield, Prefix, Judged, bool]] | None:
-    """The first guess that leaves a way without what was tried in vain, else the first that leaves any, and
-    how it was judged. None where no guess leaves a way. told: the shield on the policy's map.
+    told: Shield, taught: Taught, judged: Judged, prefix: Prefix, tail: bytes | None, status: Verdict,
+    care: Care,
+) -> tuple[Taught, tuple[Shield, Prefix, Judged, bool]] | None:  # fmt: skip
+    """The first guess that leaves a way without what was tried in vain, else, where all the marks leave none,
+    the first that leaves any, and how it was judged. None where no guess is needed, or none leaves a way.
+    told: the shield on the policy's map; judged: where all the marks are believed.
     """
+    if judged.some and not judged.vain:
+        return None
     vain = None
     for guess in doubted(taught, prefix.t):
         other = on_map(told, guess.map, True, taught.barred)
-        found = judged_by_signals(other, prefix, tail, spec_status, care)
+        found = judged_by_signals(other, prefix, tail, status, care)
         if found[2].some and not found[2].vain:
             return guess, found
-        if found[2].some and vain is None:
+        if found[2].some and vain is None and not judged.some:
             vain = guess, found
     return vain
 
@@ -56,3 +66,46 @@ def doubted(taught: Taught, t: int) -> Iterator[Taught]:
             yield replace(taught, map=revised(known, forget(known, ~stays)))
     if not (seen | young).all():
         yield replace(taught, map=revised(known, forget(known, ~(seen | young))))
+
+
+def recovered(
+    told: Shield, shield: Shield, taught: Taught, judged: Judged, prefix: Prefix, tail: bytes | None,
+    status: Verdict, care: Care,
+) -> Judged:  # fmt: skip
+    """Where no motion is feasible, what keeps the rule if what is in the way goes; else what keeps most of
+    it, and what that gives up, in words. No future begins with what leads nowhere if there are others.
+
+    told: the shield on the policy's map; shield: on the session's own.
+    """
+    if judged.some or not recovers(shield.config):
+        return judged
+    tried = judged.tried
+    said: tuple[str, ...] = ("something is in every way that is left: it is waited for",)
+    first = _awaited(told, shield, taught, prefix, tail, status, care)
+    if first is None:
+        begins = ~in_vain(taught.barred, prefix.poses[-1], tried.motions, tried.poses, False)
+        which = begins if begins.any() else ~begins
+        tried = replace(tried, motions=tried.motions[which], poses=tried.poses[which])
+        first, said = most_kept(shield, judged.part, tried)
+    warnings = (*judged.tried.warnings, *said)
+    completion = int(shield.task.robot.representative[first])
+    return replace(judged, tried=replace(judged.tried, warnings=warnings), completion=completion)
+
+
+def _awaited(
+    told: Shield, shield: Shield, taught: Taught, prefix: Prefix, tail: bytes | None, status: Verdict,
+    care: Care,
+) -> int | None:  # fmt: skip
+    """The motion of a way that would be there if all that came in the way went again, as far as nothing known
+    hinders it, and then the one that waits. None where no such way is left either, or the robot cannot wait.
+    """
+    known, wait = taught.map, told.task.robot.wait_motion
+    if not known.occupied.any() or wait < 0:
+        return None
+    gone = on_map(told, revised(known, forget(known, known.occupied)), True, taught.barred)
+    gone, _, judged, _ = judged_by_signals(gone, prefix, tail, status, care)
+    if not judged.some or judged.vain:
+        return None
+    motion, (x, y, theta) = int(told.task.robot.motion_of[judged.completion]), prefix.poses[-1]
+    ends = [step(body, x, y, theta, motion) for body in (gone.body, shield.body)]
+    return motion if ends[0] == ends[1] else wait

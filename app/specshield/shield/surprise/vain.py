@@ -7,6 +7,7 @@ another keeps the rule: else a robot turns away and back for ever.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -17,6 +18,8 @@ from specshield.shield.decision import Stuck
 from specshield.shield.surprise.contact import Near
 
 MOST_STUCK = 16  # motions of each kind that are remembered, the newest of them
+# What hinders a motion hinders it from poses so near, too: two turns of a Stretch, a cell of 5 cm. By hand.
+ALIKE: Near = (0.05, math.radians(12.0))
 
 
 def halts_at(stuck: Iterable[Stuck], pose: Floats, motion: int, near: Near) -> int:
@@ -51,6 +54,8 @@ def _is_at(stuck: Stuck, pose: Floats, near: Near) -> bool:
 
 
 def barred_by(stuck: Iterable[Stuck], near: Near) -> Floats:
-    """The motions that lead nowhere for sure, as robot/barred.py has them. Shape [n, 6]."""
-    found = [(*each, *near) for each in stuck if each[3] >= 0]
+    """The motions that lead nowhere for sure, as robot/barred.py has them. Shape [n, 6]. near: what noise
+    explains.
+    """
+    found = [(*each, *np.maximum(near, ALIKE)) for each in stuck if each[3] >= 0]
     return np.array(found, np.float64).reshape(-1, 6)
