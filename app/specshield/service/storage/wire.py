@@ -91,7 +91,7 @@ class _Link(asyncio.Protocol):
     the server says how many replicas have what it had done by then.
     """
 
-    def __init__(self, connection: Any, replicas: int) -> None:
+    def __init__(self, connection: Any, replicas: int = 0) -> None:
         self._connection, self._replicas = connection, replicas  # kept, or its transport would be closed
         self._transport: asyncio.Transport = connection._writer.transport
         self._transport.set_protocol(self)
