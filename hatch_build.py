@@ -3,7 +3,7 @@
     make wheels     # compiles them, and builds a wheel with them and one without
 
 Such a wheel is for one version of Python and one kind of processor. Elsewhere pip takes the one without, and
-the first start compiles.
+the first start compiles; so it does with another version of numba than the one that compiled them.
 """
 
 from __future__ import annotations

@@ -172,15 +172,15 @@ def _folder(module: str) -> Path:
             to_see += _read(file)[1]
     digest = hashlib.sha256(b"".join(_read(file)[0] for file in sorted(found))).hexdigest()[:16]
     own, shipped = BASE / module / digest, SHIPPED / module / digest
-    if not own.exists():
-        for old in own.parent.glob("*"):
-            shutil.rmtree(old, ignore_errors=True)
-        try:
+    try:
+        if not own.exists():
+            for old in own.parent.glob("*"):
+                shutil.rmtree(old, ignore_errors=True)
             own.parent.mkdir(parents=True, exist_ok=True)
             _copy(shipped, own) if shipped.is_dir() else own.mkdir(exist_ok=True)
-        except OSError:
-            return shipped
-    return own
+        return own if own.is_dir() else shipped
+    except OSError:
+        return shipped
 
 
 def _copy(folder: Path, to: Path) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -98,23 +98,22 @@ class Task:
         return held
 
 
-P = ParamSpec("P")
 R = TypeVar("R")
 NOT_KEPT: Any = object()
 
 
-def kept_with_task(function: Callable[Concatenate[Task, P], R]) -> Callable[Concatenate[Task, P], R]:
+def kept_with_task(function: Callable[..., R]) -> Callable[..., R]:
     """Keeps what the function returns for a task with that task, until the task goes. A cache of the
     function's own would hold the maps of tasks that nobody uses any more.
     """
     name = f"{function.__module__}.{function.__qualname__}"
 
     @wraps(function)
-    def kept(task: Task, /, *more: P.args, **named: P.kwargs) -> R:
+    def kept(task: Task, /, *more: Hashable) -> R:
         own: dict[Any, R] = task.__dict__.setdefault(name, {})
         found: R = own.get(more, NOT_KEPT)
         if found is NOT_KEPT:
-            found = function(task, *more, **named)
+            found = function(task, *more)
             for old in list(own)[: max(len(own) + 1 - MAX_KEPT, 0)]:
                 own.pop(old, None)
             own[more] = found

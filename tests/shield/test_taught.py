@@ -285,3 +285,43 @@ def test_what_stands_beside_something_may_have_met_it_and_is_not_taken_to_slip(y
     carry = decide(shield, [pose], None, True).carry
     after = decide(shield, [pose, pose], None, True, carry=carry)
     assert (Seen(*FORMAT.unpack(after.carry.residuals)).lost > 0.0) == counts
+
+
+@pytest.mark.parametrize("uncertainty", [None, Uncertainty()])
+def test_what_is_in_the_way_is_not_waited_for_where_waiting_would_break_the_rule(uncertainty):
+    """The robot stands in a zone that it has to leave within 12 steps, and the way to its goal is blocked."""
+    grid = OccupancyGrid(np.zeros((20, 120), bool), 0.05)
+    regions = {"Goal": GOAL | {"center": [5.3, 0.5]}, "Zone": GOAL | {"center": [3.0, 0.5], "radius": 0.45}}
+    task = make_task(grid, STRETCH, "F[0,70] Goal and G[12,80] not Zone", regions)
+    shield = make_shield(
+        [synthesise(task, Settings(pitch=0.1))], Config(learn_map=True, uncertainty=uncertainty)
+    )
+    blocked = [(x, y) for x in np.arange(3.525, 3.8, 0.05) for y in np.arange(0.025, 1.0, 0.05)]
+    there = grid.occupied.copy()
+    there[:20, 70:76] = True
+    body = make_body(STRETCH, OccupancyGrid(there, 0.05))
+    poses, carry = [(3.0, 0.5, 0.0)], None
+    for _ in range(14):
+        decision = decide(shield, poses, None, True, carry=carry, occupied=blocked)
+        carry = decision.carry
+        poses.append(step(body, *poses[-1], int(STRETCH.motion_of[decision.action])))
+    assert decision.spec_status == "pending"
+
+
+@pytest.mark.parametrize("uncertainty", [None, Uncertainty()])
+@pytest.mark.parametrize("steps", [17, 19, 22])
+def test_whoever_pauses_within_the_time_that_is_left_is_there_in_time(steps, uncertainty):
+    """The caller does nothing for some steps, as after an emergency stop: what was drawn was not in vain."""
+    grid, goal = OccupancyGrid(np.zeros((20, 80), bool), 0.05), {"Goal": GOAL | {"center": [3.5, 0.5]}}
+    policy = synthesise(make_task(grid, STRETCH, f"F[0,{steps}] Goal", goal), Settings(pitch=0.1))
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=uncertainty))
+    for pause in range(2, steps - 13 + 1):  # 13 steps lead there
+        poses, carry = [(0.6, 0.5, 0.0)], None
+        for t in range(steps + 1):
+            decision = decide(shield, poses, None, True, carry=carry)
+            carry, motion = decision.carry, int(STRETCH.motion_of[decision.action])
+            motion = STRETCH.wait_motion if 3 <= t < 3 + pause else motion
+            poses.append(step(shield.body, *poses[-1], motion))
+            if decision.spec_status != "pending":
+                break
+        assert decision.spec_status == "satisfied", pause

@@ -162,8 +162,8 @@ class Settings(BaseSettings):
     @field_validator("store_replicas")
     @classmethod
     def _has_replicas(cls, replicas: int, others: ValidationInfo) -> int:
-        if replicas and others.data.get("redis_url") is None:
-            raise ValueError("0 where REDIS_URL is not set: the store that the server starts has no replica")
+        if replicas and others.data.get("redis_url", "") is None:
+            raise ValueError("no replicas unless REDIS_URL is set: the store that the server starts has none")
         return replicas
 
     @field_validator("api_key")

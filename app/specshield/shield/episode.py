@@ -151,7 +151,7 @@ def decide(
         believed = tried_again(told, taught, judged, prefix, tail, spec_status, care)
         if believed is not None:
             taught, (shield, prefix, judged, withstands) = believed
-            said = (*said, "no way was left, so what was run into is tried again")
+            said = (*said, "no other way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
         doubts = doubtful(told, taught, poses[-1]) | judged.left_out
         judged = recovered(told, shield, taught, judged, prefix, tail, spec_status, care)

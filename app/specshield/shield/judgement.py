@@ -66,14 +66,12 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         # Where nobody looks for ways without it, what comes back to a barred motion later still counts.
         whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
         goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses, whole)
-        vain = not (kept[~goes] > SATISFIED_ABOVE).any()
-        if vain and care.enough:
-            goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses, False)
-        if not vain or care.enough:
-            kept = np.where(goes, -np.inf, kept)
-            without_it = best_of(tried, kept, motions)
+        others = np.where(goes, -np.inf, kept)
+        vain = others.max() <= SATISFIED_ABOVE
+        if not vain:
+            without_it = best_of(tried, others, motions)
             left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
-            best = without_it
+            kept, best = others, without_it
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and _some(best)):

@@ -105,7 +105,7 @@ def teach(
     if learned is None and occupied is None and free is None and not config.learn_map:
         return NOTHING, ()
     before = Taught.from_bytes(learned)
-    known, followed, motion, on = before.map, before.followed, -1, False
+    known, followed, motion, on = before.map, before.followed, -1, -1
     stuck, near = () if carry is None else carry.stuck, NEAR
     if config.map_memory is not None:
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
@@ -116,14 +116,15 @@ def teach(
         motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, halts > 0)
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses, halts):
             motion, followed = -1, replace(followed, halted=motion, met=0)
-        on = motion < 0 and went_on(body, poses[-2], carry.next_poses, poses[-1], near)
+        if motion < 0:
+            on = went_on(body, poses[-2], carry.next_poses, poses[-1], near)
         if motion >= 0 or (halts > 0 and came_back and followed.halted == drawn):
             # Slips come in a row; what does nothing, and again once the robot is back, did not slip.
             stuck = led_nowhere(stuck, poses[-1], max(motion, followed.halted), near)
         elif followed.halted >= 0 and followed is not before.followed:
             stuck = did_nothing(stuck, poses[-1], followed.halted, near)
-        elif on:  # it led elsewhere than f has it: to rely on f there again may lead round in a circle
-            stuck = led_nowhere(stuck, poses[-2], drawn, near) if drawn >= 0 else stuck
+        elif on >= 0:  # it led elsewhere than f has it: to rely on f there again may lead round in a circle
+            stuck = led_nowhere(stuck, poses[-2], on, near)
         elif drawn >= 0 and not is_near(poses[-2:-1], poses[-1], near):
             stuck = worked(stuck, poses[-2], drawn, near)
         half_way = np.empty(3)
@@ -148,7 +149,7 @@ def teach(
             beyond += outside
     said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
     own = known if known is before.map else revised(before.map, known)
-    return Taught(own, followed, motion >= 0 or on, stuck, near), said
+    return Taught(own, followed, motion >= 0 or on >= 0, stuck, near), said
 
 
 @leaf
@@ -167,8 +168,7 @@ def wary(config: Config, care: Care, taught: Taught) -> Care:
     if not config.learn_map:
         return care
     least = care.least if config.uncertainty is None else max(care.least, AROUND)
-    barred = taught.barred if len(taught.barred) else None
-    return replace(care, least=least, barred=barred, enough=taught.followed.met > 1)
+    return replace(care, least=least, barred=taught.barred if len(taught.barred) else None)
 
 
 def changes_map(learned: bytes | None) -> bool:

@@ -78,7 +78,6 @@ class Care:
     margin [m]; least [steps]: the slack of every deadline. noise: because of which more of it is asked for.
     stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice. barred
     [n, 6]: what no future goes by where another keeps the rule (robot/barred.py); None where nothing is.
-    enough: whether none begins with it either, since it was just tried twice.
     """
 
     margin: float
@@ -87,7 +86,6 @@ class Care:
     stride: float = 1.0
     chance: float = CHANCE
     barred: Floats | None = None
-    enough: bool = False
 
     @property
     def has_slack(self) -> bool:

@@ -137,6 +137,8 @@ class _Link(asyncio.Protocol):
         while (found := self._reader.gets()) is not False:
             if isinstance(found, hiredis.PushNotification):
                 continue
+            if self.closed:  # its callers are told by connection_lost
+                return
             answer, _ = self._waiting.popleft()
             if answer is None:
                 self._release(found)
@@ -147,9 +149,11 @@ class _Link(asyncio.Protocol):
 
     def _release(self, count: Any) -> None:
         """Gives the answers that wait for the replicas. count: what WAIT returned."""
-        missing = not isinstance(count, int) or count < self._replicas
+        if not isinstance(count, int):  # it is, or has become, a replica itself
+            self.close()
+            return
         for answer, found in self._held:
-            if missing and not isinstance(found, hiredis.ReplyError):
+            if count < self._replicas and not isinstance(found, hiredis.ReplyError):
                 found = too_few(count, self._replicas)
             _give(answer, found)
         self._held.clear()

@@ -171,16 +171,18 @@ def noise_of(told: Told, seen: Seen) -> Noise:
 
 
 @kernel
-def went_on(body: Body, before: Floats, foreseen: Floats, pose: Floats, near: tuple[float, float]) -> bool:
-    """Whether some motion led farther than f, which has it run into something: the map or the footprint is
-    not as told. near [m], [rad]: what noise explains; the other arguments are those of `observe`.
+def went_on(body: Body, before: Floats, foreseen: Floats, pose: Floats, near: tuple[float, float]) -> int:
+    """The motion that led farther than f, which has it run into something, so that the map or the footprint
+    is not as told; -1 where none did. near [m], [rad]: what noise explains; the others are as in `observe`.
     """
-    led, (x, y, theta) = False, before
+    led, closest, (x, y, theta) = -1, np.inf, before
     for m in range(foreseen.shape[0]):
         if _gap(foreseen[m], pose) <= near[0] + near[1]:
-            return False
+            return -1
         free = np.array(unhindered(body, x, y, theta, math.cos(theta), math.sin(theta), m))
-        led = led or _gap(free, pose) < _gap(free, foreseen[m]) - EXACT
+        gap = _gap(free, pose)
+        if gap < _gap(free, foreseen[m]) - EXACT and gap < closest:
+            led, closest = m, gap
     return led
 
 

@@ -10,10 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from specshield.robot.barred import in_vain
 from specshield.robot.dynamics import step
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Prefix
+from specshield.shield.feasibility import Futures, Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.recovery import most_kept, recovers
@@ -72,24 +71,28 @@ def recovered(
     told: Shield, shield: Shield, taught: Taught, judged: Judged, prefix: Prefix, tail: bytes | None,
     status: Verdict, care: Care,
 ) -> Judged:  # fmt: skip
-    """Where no motion is feasible, what keeps the rule if what is in the way goes; else what keeps most of
-    it, and what that gives up, in words. No future begins with what leads nowhere if there are others.
+    """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words. If what is
+    in the way may go again, it is waited for, as long as that gives up no more.
 
     told: the shield on the policy's map; shield: on the session's own.
     """
     if judged.some or not recovers(shield.config):
         return judged
     tried = judged.tried
-    said: tuple[str, ...] = ("something is in every way that is left: it is waited for",)
-    first = _awaited(told, shield, taught, prefix, tail, status, care)
-    if first is None:
-        begins = ~in_vain(taught.barred, prefix.poses[-1], tried.motions, tried.poses, False)
-        which = begins if begins.any() else ~begins
-        tried = replace(tried, motions=tried.motions[which], poses=tried.poses[which])
-        first, said = most_kept(shield, judged.part, tried)
-    warnings = (*judged.tried.warnings, *said)
-    completion = int(shield.task.robot.representative[first])
-    return replace(judged, tried=replace(judged.tried, warnings=warnings), completion=completion)
+    first, lost, said = most_kept(shield, judged.part, tried)
+    awaited = _awaited(told, shield, taught, prefix, tail, status, care)
+    if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
+        first, said = awaited, ("something is in every way that is left: it is waited for",)
+    tried = replace(tried, warnings=(*tried.warnings, *said))
+    return replace(judged, tried=tried, completion=int(shield.task.robot.representative[first]))
+
+
+def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
+    """The futures that begin with this motion, and the one that waits after it for ever."""
+    still = np.full_like(tried.motions[:1], told.task.robot.wait_motion)
+    still[0, 0] = first
+    motions = np.concatenate([tried.motions[tried.motions[:, 0] == first], still])
+    return replace(tried, motions=motions, poses=np.empty((len(motions), *tried.poses.shape[1:])))
 
 
 def _awaited(

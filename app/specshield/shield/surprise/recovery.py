@@ -23,15 +23,17 @@ def recovers(config: Config) -> bool:
     return config.uncertainty is not None or config.learn_map
 
 
-def most_kept(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[int, tuple[str, ...]]:
-    """The first motion of the future that keeps most of `prefix.formula`, and a sentence for each part that
-    it gives up.
+def most_kept(
+    shield: Shield, prefix: Prefix, tried: Futures
+) -> tuple[int, tuple[Formula, ...], tuple[str, ...]]:
+    """The first motion of the future that keeps most of `prefix.formula`, the parts that it gives up, the
+    safest first, and a sentence for each of them.
     """
     whole = np.empty_like(tried.poses)
     for motions, poses in zip(tried.motions, whole, strict=True):
         simulate(shield.body, prefix.poses[-1], motions, poses)
     futures = replace(tried, poses=whole)
-    left, said = np.ones(len(tried.motions), np.bool_), list[str]()
+    left, said, lost = np.ones(len(tried.motions), np.bool_), list[str](), list[Formula]()
     nearest = np.zeros(len(tried.motions))
     for part in sorted(conjuncts(prefix.formula), key=_order):
         rho, _ = rho_of(prefix.of(part), futures)
@@ -40,8 +42,10 @@ def most_kept(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[int, tupl
             left = keeps
             continue
         nearest = nearest if said else rho
+        lost.append(part)
         said.append(f"no way was found to keep {part}: the nearest misses it by {-rho[left].max():.3g}")
-    return int(tried.motions[int(np.argmax(np.where(left, nearest, -np.inf))), 0]), tuple(said)
+    first = int(tried.motions[int(np.argmax(np.where(left, nearest, -np.inf))), 0])
+    return first, tuple(lost), tuple(said)
 
 
 def given_up(prefix: Prefix) -> tuple[str, ...]:
