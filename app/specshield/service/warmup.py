@@ -28,6 +28,7 @@ from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
 from specshield.shield import episode
 from specshield.shield.decision import Config, make_shield
+from specshield.shield.surprise.contact import cells_met
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
@@ -36,7 +37,7 @@ FORMULA = "F[0,3] A and F[0,2] G[0,1] B and G[0,4] not C"
 REGIONS = {
     "A": {"type": "circle", "center": [1.0, 1.0], "radius": 1.0},
     "B": {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 2.0]},
-    "C": {"type": "polygon", "vertices": [[1.8, 1.8], [1.9, 1.8], [1.9, 1.9]]},
+    "C": {"type": "polygon", "vertices": [[1.2, 1.2], [2.0, 1.2], [2.0, 2.0]]},
 }
 START = (1.0, 1.0, 0.0)
 
@@ -67,6 +68,21 @@ def _decide(task: Task) -> None:
         carry = replace(first.carry, stuck=((*START, 0),))
         episode.decide(shield, second, logits, carry=carry, occupied=[[1.9, 0.5]], explain=explanations)
     refusal(shield, np.array([START]), {})
+    _in_trouble(policy, logits)
+
+
+def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
+    """What only a robot in trouble needs, so that no decision waits for a compiler then: walled in, where it
+    must not be, or stopped by something unknown. And what a probability for the whole episode needs.
+    """
+    shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
+    first = episode.decide(shield, [START], logits)
+    around = [[1.0 + 0.4 * np.cos(a), 1.0 + 0.4 * np.sin(a)] for a in np.arange(0.0, 6.3, 0.1)]
+    episode.decide(shield, [START, START], logits, carry=first.carry, occupied=around)
+    episode.decide(shield, [START, (1.766, 1.434, 0.0)], logits, carry=first.carry)  # in C
+    cells_met(shield.body, np.array(START), 0, np.array([START]))
+    shield = make_shield([policy], Config(0.5, uncertainty=Uncertainty(), threshold_over="episode"))
+    episode.decide(shield, [START], logits)
 
 
 PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
