@@ -22,6 +22,8 @@ class Kernels(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         kernels = os.environ.get("SPECSHIELD_KERNELS")
         if kernels and version != "editable":
+            if sys.platform != "linux":
+                raise RuntimeError("a wheel can bring kernels on Linux alone: unset SPECSHIELD_KERNELS")
             python = f"cp{sys.version_info.major}{sys.version_info.minor}"
             build_data["force_include"][kernels] = "specshield/kernels"
             build_data["pure_python"] = False

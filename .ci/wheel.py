@@ -82,8 +82,9 @@ def main() -> None:
         print(f"demo: {demo(python, empty, clean):.1f} s")
         (package,) = (folder / "venv").glob("lib/*/site-packages/specshield")
         assert count(package / "kernels") == count(kernels), "the wheel did not bring every kernel"
-        shutil.rmtree(REPOSITORY / "dist", ignore_errors=True)
-        (REPOSITORY / "dist").mkdir()
+        (REPOSITORY / "dist").mkdir(exist_ok=True)
+        for old in (REPOSITORY / "dist").glob("specshield-*.whl"):
+            old.unlink()
         for wheel in (plain, whole):
             shutil.copy(wheel, REPOSITORY / "dist")
 

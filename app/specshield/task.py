@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, wraps
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -98,20 +98,20 @@ class Task:
         return held
 
 
-R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
 NOT_KEPT: Any = object()
 
 
-def kept_with_task(function: Callable[..., R]) -> Callable[..., R]:
+def kept_with_task(function: F) -> F:
     """Keeps what the function returns for a task with that task, until the task goes. A cache of the
     function's own would hold the maps of tasks that nobody uses any more.
     """
     name = f"{function.__module__}.{function.__qualname__}"
 
     @wraps(function)
-    def kept(task: Task, /, *more: Hashable) -> R:
-        own: dict[Any, R] = task.__dict__.setdefault(name, {})
-        found: R = own.get(more, NOT_KEPT)
+    def kept(task: Task, /, *more: Hashable) -> Any:
+        own: dict[Any, Any] = task.__dict__.setdefault(name, {})
+        found = own.get(more, NOT_KEPT)
         if found is NOT_KEPT:
             found = function(task, *more)
             for old in list(own)[: max(len(own) + 1 - MAX_KEPT, 0)]:
@@ -119,7 +119,7 @@ def kept_with_task(function: Callable[..., R]) -> Callable[..., R]:
             own[more] = found
         return found
 
-    return kept
+    return cast(F, kept)
 
 
 def make_task(

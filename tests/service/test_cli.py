@@ -55,7 +55,7 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
             "serve",
             {"SPECSHIELD_STORE_REPLICAS": "1"},
             "SPECSHIELD_STORE_REPLICAS is not valid: '1'",
-            "no replicas unless REDIS_URL is set",
+            "0 unless REDIS_URL is set",
         ),
         ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
         (

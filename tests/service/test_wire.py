@@ -36,3 +36,22 @@ def test_an_answer_that_comes_too_late_is_nobody_elses():
         server.close()
 
     asyncio.run(scene())
+
+
+def test_a_server_that_can_wait_for_no_replica_any_more_is_left():
+    """As one that has become a replica itself: its answers are not told, and another connection is opened."""
+
+    async def scene():
+        async def demoted(reader, writer):
+            await reader.readuntil(b"GET")
+            writer.write(b"+there\r\n-ERR WAIT cannot be used with replica instances\r\n")
+
+        server = await asyncio.start_server(demoted, "127.0.0.1", 0)
+        _, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        link, loop = _Link(SimpleNamespace(_writer=writer), 1), asyncio.get_running_loop()
+        with pytest.raises(redis.ConnectionError):
+            await link.send(("GET", "one"), loop.time() + 60.0)
+        assert link.closed
+        server.close()
+
+    asyncio.run(scene())

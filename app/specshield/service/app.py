@@ -109,9 +109,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     if embedded is not None:
         await asyncio.to_thread(embedded.join)
     url = embedded.url if embedded is not None else str(settings.redis_url)
-    archive = Archive(open_objects(f"{settings.files_at}/archive"))
-    limits = settings.store_timeout, settings.session_ttl
-    store = ArchivingStore(url, *limits, archive, settings.store_replicas)
+    archive, replicas = Archive(open_objects(f"{settings.files_at}/archive")), settings.store_replicas
+    store = ArchivingStore(url, settings.store_timeout, settings.session_ttl, archive, replicas)
     mover, jobs = Mover(store, settings), Jobs(url, settings)
     claims = Claims(lambda: jobs.redis, settings)
     library = Maps(settings, claims)

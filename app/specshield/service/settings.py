@@ -163,7 +163,7 @@ class Settings(BaseSettings):
     @classmethod
     def _has_replicas(cls, replicas: int, others: ValidationInfo) -> int:
         if replicas and others.data.get("redis_url", "") is None:
-            raise ValueError("no replicas unless REDIS_URL is set: the store that the server starts has none")
+            raise ValueError("0 unless REDIS_URL is set: the store that the server starts has no replicas")
         return replicas
 
     @field_validator("api_key")

@@ -35,21 +35,23 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
         plan.text(pose, f"t={t}", 12, SHIELDED, shift=(9, -9), anchor="ls")
     plan.start(shielded.start)
     plan.dot(case.target, 8.0, colors.TARGET, colors.INK)
-    plan.text(case.target, case.instruction.split()[-1], 14, shift=(0, 12), anchor="mt")
+    sought = case.instruction.split()[-1]
+    plan.text(case.target, sought if sought.isalpha() else "target", 14, shift=(0, 12), anchor="mt")
     _legend(plan, case, shielded, unshielded)
     path.parent.mkdir(parents=True, exist_ok=True)
     plan.picture().save(path)
 
 
 def _rooms(plan: canvas.Canvas, case: Case) -> None:
-    """The name of each room, where there is most space in it that no region and no target takes."""
+    """The names of rooms that are no regions of the rule, where no region and no target takes the space."""
     grid = case.task.grid
     taken = [signed_distance(region, grid.centres) > -0.4 for region in case.task.regions.values()]
     taken.append(np.hypot(*np.moveaxis(grid.centres - case.target, -1, 0)) < 0.8)
     for name, room in case.rooms.items():
         roomy = np.minimum(signed_distance(room, grid.centres), grid.clearance)
         free = np.where(np.any(taken, axis=0), -1.0, roomy)
-        plan.text(grid.centres[np.unravel_index(np.argmax(free), free.shape)], name, 13, colors.FAINT)
+        if name not in case.task.regions and free.max() > 0.0:
+            plan.text(grid.centres[np.unravel_index(np.argmax(free), free.shape)], name, 13, colors.FAINT)
 
 
 def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:

@@ -92,7 +92,8 @@ class _Link(asyncio.Protocol):
     """
 
     def __init__(self, connection: Any, replicas: int = 0) -> None:
-        self._connection, self._replicas = connection, replicas  # kept, or its transport would be closed
+        self._connection = connection  # kept, or its transport would be closed
+        self._replicas = replicas
         self._transport: asyncio.Transport = connection._writer.transport
         self._transport.set_protocol(self)
         self._reader, self._unsent = hiredis.Reader(), list[bytes]()
@@ -186,10 +187,8 @@ class _Link(asyncio.Protocol):
 
 
 def too_few(count: Any, replicas: int) -> StoreError:
-    return StoreError(
-        f"{count} of {replicas} replicas of the store had the answer in time",
-        expected="what SPECSHIELD_STORE_REPLICAS asks for",
-    )
+    said = f"{count} of {replicas} replicas of the store had the answer in time"
+    return StoreError(said, expected="what SPECSHIELD_STORE_REPLICAS asks for")
 
 
 def _give(answer: asyncio.Future[Any], found: Any) -> None:

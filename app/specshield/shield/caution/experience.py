@@ -78,8 +78,8 @@ def learn(
     seen = Seen() if carry is None or carry.residuals is None else Seen(*FORMAT.unpack(carry.residuals))
     if carry is not None and carry.t == t - 1 and not contact:
         found = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
-        wider = shield.body._replace(radius=shield.body.radius + BESIDE)
-        if config.learn_map and found.lost > seen.lost and in_collision(wider, *poses[-1]):
+        lost = config.learn_map and found.lost > seen.lost
+        if lost and in_collision(shield.body._replace(radius=shield.body.radius + BESIDE), *poses[-1]):
             found = seen._replace(slipping=found.slipping)  # it may have met what it stands beside
         seen = found
     noise = noise_of(told, seen)

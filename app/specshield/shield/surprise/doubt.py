@@ -99,8 +99,8 @@ def _awaited(
     told: Shield, shield: Shield, taught: Taught, prefix: Prefix, tail: bytes | None, status: Verdict,
     care: Care,
 ) -> int | None:  # fmt: skip
-    """The motion of a way that would be there if all that came in the way went again, as far as nothing known
-    hinders it, and then the one that waits. None where no such way is left either, or the robot cannot wait.
+    """The first motion of the way that there would be if all that came in the way were gone; the one that
+    waits where something known hinders that motion. None where there is no such way, or no such motion.
     """
     known, wait = taught.map, told.task.robot.wait_motion
     if not known.occupied.any() or wait < 0:
