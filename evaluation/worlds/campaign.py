@@ -30,7 +30,7 @@ def compare(trials: Sequence[Trial], runs: int, out: Path | None, processes: int
 
 def outcomes(trial: Trial, runs: int, out: Path | None, processes: int) -> list[Outcome]:
     """Runs 0 to `runs` - 1 of a trial, those that were kept before among them."""
-    file = None if out is None else out / f"{'-'.join(str(value) for value in asdict(trial).values())}.jsonl"
+    file = None if out is None else out / f"{'-'.join(_parts(trial))}.jsonl"
     done: dict[int, Outcome] = {}
     if file is not None and file.exists():
         kept = (Outcome(**json.loads(line)) for line in file.read_text().splitlines())
@@ -42,6 +42,11 @@ def outcomes(trial: Trial, runs: int, out: Path | None, processes: int) -> list[
             with open(file, "a") as lines:
                 lines.write(json.dumps(outcome.to_json()) + "\n")
     return [done[i] for i in range(runs)]
+
+
+def _parts(trial: Trial) -> list[str]:
+    """What tells a trial's file from others; a house by its file's name, so that it lies in the folder."""
+    return [Path(trial.case).name, *(str(value) for value in list(asdict(trial).values())[1:])]
 
 
 def _made(trial: Trial, missing: Sequence[int], processes: int) -> Iterator[Outcome]:

@@ -18,7 +18,7 @@ from specshield.robot import STRETCH
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield.caution.experience import FORMAT, Seen
-from specshield.shield.episode import Config, decide, make_shield
+from specshield.shield.episode import Carry, Config, decide, make_shield
 from specshield.shield.surprise.vain import barred_by
 from specshield.shield.taught import Taught, on_map
 from specshield.shield.uncertainty import Uncertainty
@@ -128,6 +128,46 @@ def test_no_motion_is_certified_because_a_mere_mark_would_stop_it():
     assert step(ends, *poses[0], AHEAD)[0] < 1.2
     assert found.j_values[AHEAD] == 0.0
     assert max(found.j_values) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("config", "allowed"),
+    [
+        ({"learn_map": True, "uncertainty": Uncertainty(0.0, 0.0, 0.0)}, False),
+        ({"learn_map": True}, True),
+        ({}, True),
+    ],
+)
+def test_no_motion_is_kept_out_of_a_forbidden_place_by_a_wall_alone(config, allowed):
+    """The wall may stand a little farther on than the map has it. What is not uncertain relies on it."""
+    occupied = np.zeros((40, 80), bool)
+    occupied[:, 40] = True  # x from 2.0 to 2.05 m; behind it lies what is forbidden
+    places = {
+        "Goal": {"type": "circle", "center": [0.6, 1.0], "radius": 0.4},
+        "Behind": {"type": "rectangle", "min": [2.05, 0.0], "max": [4.0, 2.0]},
+    }
+    task = make_task(OccupancyGrid(occupied, 0.05), STRETCH, "F[0,40] Goal and G[0,40] not Behind", places)
+    shield = make_shield([synthesise(task, Settings(pitch=0.1))], Config(**config))
+    near = decide(shield, [(1.89, 1.0, 0.0)], np.zeros(20))
+    assert near.next_poses[AHEAD][0] < 2.0  # the wall stops it
+    assert near.j_values[AHEAD] == float(allowed)
+    assert near.j_values[BACK] == 1.0
+    away = decide(shield, [(1.8, 1.0, 0.0)], np.zeros(20))  # 0.2 m on, it would still be before it
+    assert away.j_values[AHEAD] == 1.0
+
+
+def test_a_way_that_does_is_not_changed_for_a_better_one():
+    """A robot that takes the best way at each step may go to and fro between two, and never arrive."""
+    shield = shield_of(learn_map=True, uncertainty=Uncertainty(0.0, 0.0, 0.0))
+    turn, wait = (STRETCH.action_names.index(name) for name in ("ls", "sub_done"))
+    motions = STRETCH.motion_of[[turn, *[AHEAD] * 14, *[wait] * 25]]
+    carry = Carry(-2, np.empty((len(STRETCH.motions), 3)), (), way=bytes(motions.tolist()))
+    decision = decide(shield, [START], None, True, carry=carry)
+    assert decision.action == turn
+    assert decision.witness == (*[AHEAD] * 14, *[wait] * 25)
+    assert decision.robustness[turn] == pytest.approx(0.085, abs=0.001)  # it ends at the goal's side
+    alone = decide(shield, [START], None, True)
+    assert alone.robustness[turn] > 0.09
 
 
 def test_what_is_free_again_is_unlearned_and_the_policy_never_changes():

@@ -153,7 +153,7 @@ def decide(
             taught, (shield, prefix, judged, withstands) = believed
             said = (*said, "no other way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
-        doubts = doubtful(told, taught, poses[-1]) | judged.left_out
+        doubts = doubtful(told, taught, judged.part, nexts) | judged.left_out
         judged = recovered(told, shield, taught, judged, prefix, tail, spec_status, care)
         judged = without(judged, shield, doubts)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":

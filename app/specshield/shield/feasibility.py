@@ -62,6 +62,11 @@ class Prefix:
         seen = prefix_of(self.task, formula, view_of(self.task, formula), self.poses, self.signals)
         return replace(seen, held=self.held)
 
+    def then(self, pose: Floats) -> Prefix:
+        """The prefix if the next pose is this one (3,)."""
+        poses = np.concatenate([self.poses, pose[None]])
+        return prefix_of(self.task, self.formula, self.view, poses, self.foreseen)
+
     @property
     def foreseen(self) -> Signals:
         """The signals to step t, and once more what they are taken to hold from then on."""

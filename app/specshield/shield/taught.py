@@ -6,6 +6,7 @@ it too: one that has `on_body` proposes on the session's map, whatever its table
 
 from __future__ import annotations
 
+import math
 import struct
 from collections import OrderedDict
 from dataclasses import dataclass, field, replace
@@ -18,9 +19,10 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.robot.barred import is_barred
-from specshield.robot.dynamics import Body, make_body, overlap, successors
+from specshield.robot.dynamics import Body, displacements, make_body, overlap, successors
 from specshield.shield.caution.experience import was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
+from specshield.shield.feasibility import Prefix
 from specshield.shield.surprise.contact import (
     NEAR,
     UNDER,
@@ -33,6 +35,7 @@ from specshield.shield.surprise.contact import (
 )
 from specshield.shield.surprise.vain import barred_by, did_nothing, halts_at, led_nowhere, worked
 from specshield.shield.uncertainty import Care
+from specshield.stl import SATISFIED_ABOVE
 from specshield.world.learned import (
     BEHIND,
     CONTACT,
@@ -50,6 +53,7 @@ from specshield.world.learned import (
 # 2, `evaluation worlds --world obstacle --sensing contact` kept 58 and 52 with 12, and 59 and 56 with 20.
 AROUND = 20
 NEARBY = 2.0  # [m] poses farther away than this say nothing of a thing that was run into
+SAME_PLACE = 1e-6  # [m]
 KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 
 
@@ -176,22 +180,29 @@ def changes_map(learned: bytes | None) -> bool:
     return learned is not None and len(learned) > HEAD.size
 
 
-def doubtful(told: Shield, taught: Taught, pose: Floats) -> Bools:
-    """[M]: the motions from a pose (3,) that lead elsewhere if contacts are believed than if they are not,
-    and those that led nowhere before.
+def doubtful(told: Shield, taught: Taught, prefix: Prefix, nexts: Floats) -> Bools:
+    """[M]: the motions from x_t that lead elsewhere if contacts are believed than if they are not, those that
+    would break what the prefix asks for if nothing stopped them short, and those that led nowhere before.
 
-    told: the shield on the policy's map. A motion that only a mark stops may go on in truth, into what the
-    rule forbids.
+    told: the shield on the policy's map. nexts [M, 3]: where f leads on the session's own. A motion that only
+    a mark stops may go on in truth; and what is on the map may stand a little elsewhere, so no motion is kept
+    out of a forbidden place by that alone.
     """
-    known, motions = taught.map, len(told.task.robot.motions)
-    doubts = np.zeros(motions, np.bool_)
+    known, motions, pose = taught.map, len(nexts), prefix.poses[-1]
+    doubts, config = np.zeros(motions, np.bool_), told.config
     if len(known) and (marks := known.occupied & (known.by != SENT)).any():
         ends = np.empty((2, motions, 3))
         for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
             successors(body_on(told, believed), pose, end)
         doubts |= np.any(ends[0] != ends[1], axis=1)
+    x, y, theta = pose
+    if config.learn_map and (config.uncertainty is not None or len(known)):
+        far, turn = displacements(told.body)
+        headings = np.remainder(theta + turn + math.pi, 2.0 * math.pi) - math.pi
+        free = np.stack([x + far * math.cos(theta), y + far * math.sin(theta), headings], axis=1)
+        for motion in np.flatnonzero(np.hypot(*(free - nexts)[:, :2].T) > SAME_PLACE):
+            doubts[motion] |= prefix.then(free[motion]).high <= SATISFIED_ABOVE
     if len(taught.barred):
-        x, y, theta = pose
         doubts |= [is_barred(taught.barred, x, y, theta, motion) for motion in range(motions)]
     return doubts
 

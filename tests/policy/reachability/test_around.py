@@ -3,14 +3,20 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from specshield.policy.heap import Heap
-from specshield.policy.reachability.around import Tree, _slot_of
+from specshield.policy.reachability.around.field import distances, goal_cells, spare_on
+from specshield.policy.reachability.around.search import Tree, _slot_of
 from specshield.policy.reachability.policy import synthesise
+from specshield.robot import STRETCH
 from specshield.robot.barred import in_vain
 from specshield.robot.dynamics import make_body, simulate
+from specshield.rule.progress import PENDING, SETTLED, make_rules
 from specshield.stl import robustness
-from tests.policy.rooms import flat
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
+from tests.policy.rooms import OCCUPIED, flat
 
 
 def empty(rows):
@@ -75,3 +81,52 @@ def test_a_way_is_found_without_the_motions_that_led_nowhere():
     free = ~in_vain(barred, history[0], ways.motions, poses, True)
     kept = [robustness(task.formula, task.samples(np.concatenate([history, led]))) > 0 for led in poses[free]]
     assert any(kept)
+
+
+TWO_DOORS = OCCUPIED.copy()
+TWO_DOORS[25:, 20] = False  # a second door, at the upper end of the wall
+WEST = {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 3.0]}
+EAST = {"type": "rectangle", "min": [3.0, 1.0], "max": [3.9, 2.0]}
+
+
+def two_rooms(formula):
+    """4 x 3 m, and the robot on the same map with the door in the middle shut."""
+    grid = OccupancyGrid(TWO_DOORS, 0.1)
+    task = make_task(grid, STRETCH, formula, {"West": WEST, "East": EAST})
+    shut = TWO_DOORS.copy()
+    shut[10:20, 20] = True
+    return task, make_body(STRETCH, replace(grid, occupied=shut))
+
+
+def test_where_a_robot_stands_is_no_use_while_another_goal_is_due_before():
+    """It begins where it has to be from step 60 on, and has to be elsewhere by then. Neither there nor on its
+    way back may it wait before the door that is shut.
+    """
+    task, body = two_rooms("F[0,60] East and F[60,110] West")
+    pose = np.array([0.7, 1.5, 0.0])
+    ways = synthesise(task).on_body(body).propose(pose[None], {}, 0.0).motions
+    best = -np.inf
+    for motions in ways:
+        poses = np.empty((len(motions), 3))
+        simulate(body, pose, motions, poses)
+        best = max(best, robustness(task.formula, task.samples(np.concatenate([pose[None], poses]))))
+    assert best > 0.0
+
+
+def test_distances_lead_through_the_door_that_is_open():
+    task, body = two_rooms("F[0,60] East and G[0,60] West")
+    rules = make_rules(task)
+    goals = goal_cells(body, rules)
+    assert goals.shape == (2, 15, 20)
+    assert goals[0, 5:10, 15:19].all()
+    assert goals[0].sum() == 20  # cells of 20 cm whose centres lie in East
+    assert not goals[1].any()  # of an `always`
+    fields = distances(body, goals)
+    # From (0.7, 1.5) over the upper door, about (2.05, 2.75), to East's corner (3.1, 1.9).
+    over = np.hypot(2.05 - 0.7, 2.75 - 1.5) + np.hypot(3.1 - 2.05, 2.75 - 1.9)
+    status = np.array([PENDING, PENDING], np.int8)
+    spare = spare_on(body, rules, fields, 0.2, 0.7, 1.5, 0.0, 10, status)
+    assert spare == pytest.approx(60 - 10 - over / 0.2, abs=2.0)
+    assert spare_on(body, rules, fields, 0.2, 3.5, 1.5, 0.0, 10, status) == 50.0
+    status[0] = SETTLED
+    assert spare_on(body, rules, fields, 0.2, 0.7, 1.5, 0.0, 10, status) == np.inf

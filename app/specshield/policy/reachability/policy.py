@@ -21,7 +21,8 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.reachability.around import FEWER, GAVE_UP, NO_WAY, POSES, go_around
+from specshield.policy.reachability.around.field import distances, goal_cells
+from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import Guide, share_with_slack
 from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
 from specshield.policy.reachability.method import Settings
@@ -84,14 +85,22 @@ class ReachabilityPolicy:
         way around gives up, nothing else is tried then.
         """
         other = replace(self, told=False, guess=guess)
-        other.__dict__.update(_body=body, _rules=self._rules)
+        other.__dict__.update(_body=body, _rules=self._rules, _goals=self._goals)
         return other
 
     def avoiding(self, barred: Floats) -> ReachabilityPolicy:
         """The policy for a robot that some motions led nowhere. barred [n, 6]: as `Guide` has it."""
         other = replace(self, barred=barred)
-        other.__dict__.update(_body=self._body, _rules=self._rules)
+        other.__dict__.update(_body=self._body, _rules=self._rules, _goals=self._goals)
         return other
+
+    @cached_property
+    def _goals(self) -> Bools:
+        return goal_cells(self._body, self._rules)
+
+    @cached_property
+    def _fields(self) -> Floats:
+        return distances(self._body, self._goals)
 
     @cached_property
     def _top(self) -> Floats:
@@ -125,7 +134,7 @@ class ReachabilityPolicy:
             poses, ways = np.empty((*motions.shape, 3)), np.empty_like(motions)
             around = NO_WAY
             if self.guess:
-                around = go_around(guide, past, history, rows, 0, poses, ways, FEWER)
+                around = go_around(guide, past, history, rows, self._fields, poses, ways, FEWER)
             if around == GAVE_UP:
                 ways[:], ways[:, 0] = guide.wait, np.arange(len(ways))
                 proposals.append(Proposal(ways, guide.wait))
@@ -139,8 +148,8 @@ class ReachabilityPolicy:
             proposals.append(Proposal(motions, int(preferred)))
             if not self.guess and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
-                poses[: len(free)] = free
-                around = go_around(guide, past, history, rows, len(free), poses, ways, POSES)
+                if not is_known(guide, past, history, rows, free):
+                    around = go_around(guide, past, history, rows, self._fields, poses, ways, POSES)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))
         return joined(*proposals)

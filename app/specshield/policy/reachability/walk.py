@@ -40,13 +40,16 @@ FAILED, SETTLED_ALL, STUCK = 0, 1, 2
 
 
 @leaf
-def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: Scratch) -> tuple[int, int]:
+def climb(
+    guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: Scratch, patient: bool = True
+) -> tuple[int, int]:
     """Goes on from motions[:n], n >= 1, to the horizon, by the motion with the latest feasible time.
 
     motions (T - t,) and poses (T - t, 3) are written from n on. The scratch holds the progress at
     poses[n - 1], which is taken along. Returns SETTLED_ALL where every goal was settled and nothing broken;
     STUCK where the tables led round in a circle, with the number of motions to where the latest feasible time
-    was highest; else FAILED.
+    was highest; else FAILED. patient: where no motion leads on, it waits for another phase; else that is
+    STUCK too.
     """
     body, rules, tables, wait, _ = guide
     steps, last_phase, k_count = motions.shape[0], len(tables.end) - 1, rules.kind.shape[0]
@@ -68,7 +71,7 @@ def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: S
         elif n - high_n >= STUCK_AFTER:
             return STUCK, high_n
         phase = tables.phase[t + n + 1]
-        chosen, goal = -1, -1
+        chosen, goal, waits_for_phase = -1, -1, False
         while True:
             best = wait
             for m in range(scores.shape[0]):
@@ -107,6 +110,8 @@ def climb(guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: S
             if n > before:
                 x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
                 continue
+        if not (patient or waits_for_phase or goal >= 0):
+            return STUCK, high_n
         # Waiting stays best until it changes the progress, or the phase ends.
         pending = _pending(status)
         read_pending(rules, x, y, theta, scratch)

@@ -1,6 +1,6 @@
 """Tables for the maps that sessions learn, made beside their decisions and used when they are there.
 
-Until then, and on what the map has learned since, the ways around are searched for (reachability/around.py).
+Until then, and on what the map has learned since, the ways around are searched for (reachability/around/).
 Which tables a decision used is in its record, by the digest of the map that they were made for: so it can be
 decided again.
 """

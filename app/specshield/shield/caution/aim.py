@@ -35,11 +35,14 @@ class Aimed:
     lowered: bool
 
 
-def aim(shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Floats, leaves: Floats) -> Aimed:
+def aim(
+    shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Floats, leaves: Floats, follows: bool
+) -> Aimed:
     """The most that can be had of the margin and the slack.
 
     whole [N], leaves [N, size]: rho of the futures on the whole of `prefix.formula`, and its leaves. A future
-    that does not satisfy it counts for nothing, whatever it keeps of a part.
+    that does not satisfy it counts for nothing, whatever it keeps of a part. follows: whether the first
+    future is what is left of the way that the robot is on.
     """
     task, margin = shield.task, SATISFIED_ABOVE + care.margin
     own = prefix.formula is task.formula
@@ -56,7 +59,18 @@ def aim(shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Float
     def at(most: int) -> tuple[Best, bool]:
         rows, robustness = np.empty(motions, np.int64), np.empty(motions)
         highest = _best_open(
-            parts, still, prefix.t, asked, most, leaves, whole, tried.motions, rows, robustness
+            parts,
+            still,
+            prefix.t,
+            asked,
+            most,
+            leaves,
+            whole,
+            tried.motions,
+            follows,
+            margin,
+            rows,
+            robustness,
         )
         return Best(robustness, rows), highest > margin
 
@@ -104,18 +118,22 @@ def _ask(
 @kernel
 def _best_open(
     parts: Conjuncts, still: Bools, t: int, asked: Ints, most: int, leaves: Floats, whole: Floats,
-    motions: Ints, rows: Ints, robustness: Floats,
+    motions: Ints, follows: bool, margin: float, rows: Ints, robustness: Floats,
 ) -> float:  # fmt: skip
     """Writes the best future of each motion, as `feasibility.Best` has it, by what is open; the highest
-    robustness of them.
+    robustness of them. The way that the robot is on stays its motion's future where it keeps enough: a robot
+    that changes to a better one at each step may go to and fro and never arrive.
     """
-    rho = np.empty(whole.shape[0])
+    rho, stays = np.empty(whole.shape[0]), -1
     rate_open(parts, still, t, np.minimum(asked, most), leaves, rho)
     rows[:] = -1
     robustness[:] = -np.inf
     for f in range(whole.shape[0]):
         m = motions[f, 0]
         value = rho[f] if whole[f] > SATISFIED_ABOVE else -np.inf
+        if follows and f == 0 and value > margin:
+            stays = m
         if rows[m] < 0 or value > robustness[m]:
-            rows[m], robustness[m] = f, value
+            robustness[m] = value
+            rows[m] = 0 if m == stays else f
     return float(robustness.max())

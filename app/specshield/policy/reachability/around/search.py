@@ -18,6 +18,7 @@ from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.heap import Heap, pop, push
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
+from specshield.policy.reachability.around.field import due, spare_on
 from specshield.policy.reachability.guide import (
     Guide,
     Scratch,
@@ -32,13 +33,13 @@ from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, 
 from specshield.policy.recall import forgive, recall
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
 from specshield.robot.barred import is_barred
-from specshield.robot.dynamics import around, displacement, motion_count, step, step_from
-from specshield.rule.progress import ALWAYS, PENDING, advance
+from specshield.robot.dynamics import around, displacement, longest_motions, motion_count, step, step_from
+from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
 
 # Chosen by hand; python -m evaluation worlds says what comes of them.
-POSES = 8_192  # that one search may come to, in some 12 ms; a power of two, for the hash table
+POSES = 16_384  # that one search may come to, in some 10 ms; a power of two, for the hash table
 FEWER = 2_048  # the same, where one decision tries several maps
-ONWARD = 0.1  # [steps] of slack that a step farther on its way is worth
+ONWARD = 0.3  # [steps] of slack that a step farther on its way is worth
 PLACE_GRAIN = 20.0  # [1/m] places that round to the same multiples of its inverse count once
 HEADING_GRAIN = 60.0 / (2.0 * math.pi)  # [1/rad]
 BAND = -3.0  # [steps] of slack: how far the tables may err
@@ -62,23 +63,43 @@ class Tree(NamedTuple):
 
 
 @kernel
+def is_known(guide: Guide, past: float, history: Floats, signals: Floats, poses: Floats) -> bool:
+    """Whether one of the ways poses (M, T - t, 3) settles every goal and breaks nothing. The other arguments
+    are those of `continue_all`.
+    """
+    k_count = guide.rules.kind.shape[0]
+    status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
+    scratch = make_scratch(guide.rules, 1)
+    recall(guide.rules, past, history, signals, status, run)
+    forgive(guide.rules, history.shape[0] - 1, status)
+    for m in range(poses.shape[0]):
+        copy_progress(status, run, scratch.status, scratch.run)
+        for i in range(poses.shape[1]):
+            x, y, theta = poses[m, i, 0], poses[m, i, 1], poses[m, i, 2]
+            update_progress(guide.rules, history.shape[0] + i, x, y, theta, scratch)
+        if goals_settled(guide.rules, scratch.status):
+            return True
+    return False
+
+
+@kernel
 def go_around(
-    guide: Guide, past: float, history: Floats, signals: Floats, known: int, poses: Floats, motions: Ints,
+    guide: Guide, past: float, history: Floats, signals: Floats, fields: Floats, poses: Floats, motions: Ints,
     most: int,
 ) -> int:  # fmt: skip
-    """Searches for a way from x_t to every goal, unless one is known. Returns its first motion; then motions
-    (M, T - t) hold it, and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the
-    search came to `most` poses.
+    """Searches for a way from x_t to every goal. Returns its first motion; then motions (M, T - t) hold it,
+    and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the search came to `most`
+    poses.
 
-    poses (M, T - t, 3): the ways that are known, the first `known` of them; overwritten. The other arguments
-    are those of `continue_all`.
+    fields [K, ny, nx]: the distances to the goals (field.py). poses (M, T - t, 3): overwritten. The other
+    arguments are those of `continue_all`.
     """
     t, k_count, steps = history.shape[0] - 1, guide.rules.kind.shape[0], motions.shape[1]
     status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
     recall(guide.rules, past, history, signals, status, run)
     forgive(guide.rules, t, status)
     scratch = make_scratch(guide.rules, motions.shape[0])
-    if guide.wait < 0 or _is_known(guide, t, status, run, poses[:known], scratch):
+    if guide.wait < 0:
         return NO_WAY
     tree = Tree(
         np.empty((most, 3)), np.empty((most, k_count), np.int8), np.empty((most, k_count), np.int64),
@@ -93,7 +114,7 @@ def go_around(
         x, y, theta = history[t, 0], history[t, 1], history[t, 2]
         if n > 0:
             x, y, theta = led[n - 1, 0], led[n - 1, 1], led[n - 1, 2]
-        found = _reach(guide, t + n, steps - n, x, y, theta, tree, seen, scratch)
+        found = _reach(guide, fields, t + n, steps - n, x, y, theta, tree, seen, scratch)
         if found < 0:
             return int(found)
         length = tree.step[found]
@@ -108,7 +129,7 @@ def go_around(
         copy_progress(tree.status[found], tree.run[found], scratch.status, scratch.run)
         if n == 0:
             return NO_WAY
-        outcome, n = climb(guide, t, n, way, led, scratch)
+        outcome, n = climb(guide, t, n, way, led, scratch, False)
         if outcome == SETTLED_ALL:
             break
         if outcome == FAILED:
@@ -118,18 +139,6 @@ def go_around(
         return NO_WAY
     _after_each(guide, t, history[t], status, run, way, led, motions, poses, scratch)
     return int(way[0])
-
-
-@leaf
-def _is_known(guide: Guide, t: int, status: Int8s, run: Ints, poses: Floats, scratch: Scratch) -> bool:
-    """Whether one of the ways poses (M, T - t, 3) settles every goal and breaks nothing."""
-    for m in range(poses.shape[0]):
-        copy_progress(status, run, scratch.status, scratch.run)
-        for i in range(poses.shape[1]):
-            update_progress(guide.rules, t + 1 + i, poses[m, i, 0], poses[m, i, 1], poses[m, i, 2], scratch)
-        if goals_settled(guide.rules, scratch.status):
-            return True
-    return False
 
 
 @leaf
@@ -160,14 +169,15 @@ def _after_each(
 
 @leaf
 def _reach(
-    guide: Guide, t: int, steps: int, x: float, y: float, theta: float, tree: Tree, seen: Int32s,
-    scratch: Scratch,
+    guide: Guide, fields: Floats, t: int, steps: int, x: float, y: float, theta: float, tree: Tree,
+    seen: Int32s, scratch: Scratch,
 ) -> int:  # fmt: skip
     """The row of a pose from where a climb can go on: one more goal is settled there, or only time is needed
     for that. Else NO_WAY or GAVE_UP. The scratch holds the progress at (x, y, theta).
     """
     body, rules, tables, _, _ = guide
     seen[:] = -1
+    stride, _ = longest_motions(body)
     turns_matter = reads_heading(rules)
     _put(tree, 0, x, y, theta, scratch, 0, -1, -1)
     tree.rank[0] = 0.0
@@ -212,7 +222,8 @@ def _reach(
             if ahead < BAND:
                 seen[slot] = -1  # the end of its chain; its row goes to the next pose
                 continue
-            tree.rank[count] = ahead + ONWARD * (s + 1)
+            spare = spare_on(body, rules, fields, stride, x, y, theta, t + s + 1, scratch.status)
+            tree.rank[count] = min(ahead, spare) + ONWARD * (s + 1)
             size = push(tree.heap, size, count, -tree.rank[count])
             count += 1
     return GAVE_UP if count == tree.step.shape[0] else NO_WAY
@@ -226,14 +237,28 @@ def _arrived(guide: Guide, t: int, row: int, tree: Tree, scratch: Scratch) -> bo
     if tree.rank[row] >= SAFE:
         return True
     for k in range(rules.kind.shape[0]):
-        if tree.status[row, k] != tree.status[0, k] and rules.kind[k] != ALWAYS:
+        if rules.kind[k] == ALWAYS:
+            continue
+        if tree.status[row, k] != tree.status[0, k]:
             return True
-        opens = rules.kind[k] != ALWAYS and tree.status[row, k] == PENDING
-        if opens and predicate_at(rules, k, x, y, theta, scratch) > rules.margin:
+        waits = tree.status[row, k] == PENDING and _has_time(rules, t, tree.status[row], k)
+        if waits and predicate_at(rules, k, x, y, theta, scratch) > rules.margin:
             return True
     phase = tables.phase[t]
     latest = tree.rank[row] - ONWARD * tree.step[row] + t
     return bool(phase < len(tables.end) - 1 and latest >= tables.end[phase] - PHASE_END)
+
+
+@leaf
+def _has_time(rules: Rules, t: int, status: Int8s, goal: int) -> bool:
+    """Whether no other goal is due before this one is settled by waiting for it from step t on."""
+    until = rules.a[goal]
+    if rules.kind[goal] == EVENTUALLY_ALWAYS:
+        until = max(until + rules.b[goal], t + rules.b[goal] - rules.c2[goal])
+    for k in range(status.shape[0]):
+        if k != goal and rules.kind[k] != ALWAYS and status[k] == PENDING and due(rules, k) <= until:
+            return False
+    return True
 
 
 @leaf

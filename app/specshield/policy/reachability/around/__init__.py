@@ -1,0 +1,1 @@
+"""Ways around what the tables do not know of."""
