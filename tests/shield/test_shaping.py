@@ -44,8 +44,9 @@ def check_optimal(answer, prior, values, threshold):
     assert (answer >= 0.0).all()
     assert answer @ values >= threshold - 1e-9
     numeric = solved(prior, values, threshold)
-    assert abs(numeric.sum() - 1.0) < 1e-9
-    assert kl(answer, prior) == pytest.approx(kl(np.maximum(numeric, 0.0), prior), abs=1e-6)
+    assert abs(numeric.sum() - 1.0) < 1e-8
+    # The answer keeps the constraints, so no less is possible; the solver stops some 2e-6 short of it at times.
+    assert kl(answer, prior) <= kl(np.maximum(numeric, 0.0), prior) + 1e-6
     np.testing.assert_allclose(
         answer, numeric, atol=2e-4
     )  # KL is flat at its minimum: 1e-6 in KL is 1e-3 here

@@ -166,8 +166,24 @@ def test_a_way_that_does_is_not_changed_for_a_better_one():
     assert decision.action == turn
     assert decision.witness == (*[AHEAD] * 14, *[wait] * 25)
     assert decision.robustness[turn] == pytest.approx(0.085, abs=0.001)  # it ends at the goal's side
-    alone = decide(shield, [START], None, True)
-    assert alone.robustness[turn] > 0.09
+    exact = shield_of(slack=5)  # a world that is as told: the best way of each motion, whatever was begun
+    for told, way in ((shield, None), (exact, None), (exact, carry)):
+        assert decide(told, [START], None, True, carry=way).robustness[turn] > 0.09
+
+
+def test_where_the_arithmetic_ends_nothing_is_relied_on():
+    """One centimetre behind the wall the rule's formula divides by zero."""
+    occupied = np.zeros((40, 80), bool)
+    occupied[:, 40] = True
+    goal = {"Goal": {"type": "circle", "center": [0.6, 1.0], "radius": 0.4}}
+    formula = "F[0,40] Goal and G[0,40] 1/(2.09 - x) > 0.1"
+    task = make_task(OccupancyGrid(occupied, 0.05), STRETCH, formula, goal)
+    config = Config(learn_map=True, uncertainty=Uncertainty(0.0, 0.0, 0.0))
+    decision = decide(
+        make_shield([synthesise(task, Settings(pitch=0.1))], config), [(1.89, 1.0, 0.0)], np.zeros(20)
+    )
+    assert decision.j_values[AHEAD] == 0.0
+    assert decision.j_values[BACK] == 1.0
 
 
 def test_what_is_free_again_is_unlearned_and_the_policy_never_changes():

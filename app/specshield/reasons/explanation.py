@@ -51,7 +51,8 @@ def explanations(
     """One an action: None where it is allowed, or terminal.
 
     prefix: as the whole formula sees it. judged: None where the rule forbids nothing any more. doubtful [M]:
-    motions by which the robot was stopped before, or that lead where it has run into something.
+    motions by which the robot was stopped before, that lead where it has run into something, or that only an
+    obstacle would keep out of a forbidden place.
     """
     robot = shield.task.robot
     if judged is None or not prefix.formula.names:
@@ -167,7 +168,10 @@ class _Motion:
     def known(self) -> str:
         """Why a motion is forbidden of which a future is known that keeps all that is asked."""
         if self.doubtful:
-            return "the rule could still be kept, but only by what led nowhere before, or may lead nowhere"
+            return (
+                "the rule could still be kept, but only by what led nowhere before, or by an obstacle that "
+                "would have to stop the robot in time"
+            )
         told = "a way is known that keeps the rule, but the policies did not find it"
         margin, slack = self.judged.margin, self.judged.slack
         if not margin and not slack:

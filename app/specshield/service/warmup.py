@@ -20,6 +20,7 @@ import numpy as np
 from specshield.policy.dqn.network import make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
+from specshield.policy.reachability.around.field import distances, goal_cells
 from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
@@ -51,7 +52,10 @@ def _propose(task: Task) -> None:
     """What reachability takes to make its tables and to propose. Nothing else takes as long to compile."""
     policy = synthesise(task)
     policy.propose(np.array([START]), {}, 0.0)
-    policy.on_body(make_body(task.robot, task.grid)).propose(np.array([START]), {}, 0.0)
+    body = make_body(task.robot, task.grid)
+    for guess in (False, True):  # the ways that are known do; a guess is searched for
+        policy.on_body(body, guess).propose(np.array([START]), {}, 0.0)
+    distances(body, goal_cells(body, make_rules(task)))
 
 
 def _decide(task: Task) -> None:

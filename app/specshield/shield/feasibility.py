@@ -62,10 +62,13 @@ class Prefix:
         seen = prefix_of(self.task, formula, view_of(self.task, formula), self.poses, self.signals)
         return replace(seen, held=self.held)
 
-    def then(self, pose: Floats) -> Prefix:
-        """The prefix if the next pose is this one (3,)."""
-        poses = np.concatenate([self.poses, pose[None]])
-        return prefix_of(self.task, self.formula, self.view, poses, self.foreseen)
+    def allows(self, pose: Floats) -> bool:
+        """Whether the formula can still be kept if the next pose is this one (3,). False where its arithmetic
+        is not finite there.
+        """
+        poses, known = np.concatenate([self.poses, pose[None]]), np.empty(self.view.tree.size)
+        _, high = look(self.view, poses, signal_rows(self.task, self.foreseen, len(poses)), known)
+        return bool(high > SATISFIED_ABOVE)
 
     @property
     def foreseen(self) -> Signals:

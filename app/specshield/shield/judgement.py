@@ -75,7 +75,8 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and _some(best)):
-        aimed = aim(shield, care, part, tried, kept, leaves, tail is not None and len(tail) == prefix.steps)
+        follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
+        aimed = aim(shield, care, part, tried, kept, leaves, follows)
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):

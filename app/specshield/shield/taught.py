@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.robot.barred import is_barred
-from specshield.robot.dynamics import Body, displacements, make_body, overlap, successors
+from specshield.robot.dynamics import Body, displacement, make_body, overlap, successors, wrap
 from specshield.shield.caution.experience import was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
 from specshield.shield.feasibility import Prefix
@@ -35,7 +36,6 @@ from specshield.shield.surprise.contact import (
 )
 from specshield.shield.surprise.vain import barred_by, did_nothing, halts_at, led_nowhere, worked
 from specshield.shield.uncertainty import Care
-from specshield.stl import SATISFIED_ABOVE
 from specshield.world.learned import (
     BEHIND,
     CONTACT,
@@ -53,7 +53,7 @@ from specshield.world.learned import (
 # 2, `evaluation worlds --world obstacle --sensing contact` kept 58 and 52 with 12, and 59 and 56 with 20.
 AROUND = 20
 NEARBY = 2.0  # [m] poses farther away than this say nothing of a thing that was run into
-SAME_PLACE = 1e-6  # [m]
+SAME_PLACE = 1e-6  # [m]; what rounding explains
 KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 
 
@@ -197,14 +197,26 @@ def doubtful(told: Shield, taught: Taught, prefix: Prefix, nexts: Floats) -> Boo
         doubts |= np.any(ends[0] != ends[1], axis=1)
     x, y, theta = pose
     if config.learn_map and (config.uncertainty is not None or len(known)):
-        far, turn = displacements(told.body)
-        headings = np.remainder(theta + turn + math.pi, 2.0 * math.pi) - math.pi
-        free = np.stack([x + far * math.cos(theta), y + far * math.sin(theta), headings], axis=1)
-        for motion in np.flatnonzero(np.hypot(*(free - nexts)[:, :2].T) > SAME_PLACE):
-            doubts[motion] |= prefix.then(free[motion]).high <= SATISFIED_ABOVE
+        for motion in np.flatnonzero(~doubts).tolist():
+            doubts[motion] = any(
+                not prefix.allows(end) for end in _farther(told.body, pose, motion, nexts[motion])
+            )
     if len(taught.barred):
         doubts |= [is_barred(taught.barred, x, y, theta, motion) for motion in range(motions)]
     return doubts
+
+
+def _farther(body: Body, pose: Floats, motion: int, end: Floats) -> Iterator[Floats]:
+    """Where a motion from a pose (3,) may lead if what f has stop it at `end` (3,) stands farther on: every
+    cell's side, and where nothing stops it. None where nothing does.
+    """
+    (far, turn), (x, y, theta) = displacement(body, motion), pose
+    goes_on = far - math.copysign(math.hypot(end[0] - x, end[1] - y), far)
+    if abs(goes_on) <= SAME_PLACE and (turn == 0.0 or end[2] != theta):
+        return
+    for more in np.linspace(0.0, goes_on, math.ceil(abs(goes_on) / body.resolution) + 1)[1:-1]:
+        yield np.array([end[0] + more * math.cos(theta), end[1] + more * math.sin(theta), theta])
+    yield np.array([x + far * math.cos(theta), y + far * math.sin(theta), wrap(theta + turn)])
 
 
 def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Floats | None = None) -> Shield:

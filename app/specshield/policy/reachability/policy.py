@@ -21,7 +21,7 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.reachability.around.field import distances, goal_cells
+from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import Guide, share_with_slack
 from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
@@ -134,7 +134,7 @@ class ReachabilityPolicy:
             poses, ways = np.empty((*motions.shape, 3)), np.empty_like(motions)
             around = NO_WAY
             if self.guess:
-                around = go_around(guide, past, history, rows, self._fields, poses, ways, FEWER)
+                around = go_around(guide, past, history, rows, NO_FIELDS, poses, ways, FEWER)
             if around == GAVE_UP:
                 ways[:], ways[:, 0] = guide.wait, np.arange(len(ways))
                 proposals.append(Proposal(ways, guide.wait))
@@ -148,7 +148,7 @@ class ReachabilityPolicy:
             proposals.append(Proposal(motions, int(preferred)))
             if not self.guess and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
-                if not is_known(guide, past, history, rows, free):
+                if guide.wait >= 0 and not is_known(guide, past, history, rows, free):
                     around = go_around(guide, past, history, rows, self._fields, poses, ways, POSES)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))

@@ -120,9 +120,10 @@ def _best_open(
     parts: Conjuncts, still: Bools, t: int, asked: Ints, most: int, leaves: Floats, whole: Floats,
     motions: Ints, follows: bool, margin: float, rows: Ints, robustness: Floats,
 ) -> float:  # fmt: skip
-    """Writes the best future of each motion, as `feasibility.Best` has it, by what is open; the highest
-    robustness of them. The way that the robot is on stays its motion's future where it keeps enough: a robot
-    that changes to a better one at each step may go to and fro and never arrive.
+    """Writes the best future of each motion by what is open, and its robustness; the highest of them.
+
+    The way that the robot is on stays its motion's future (`rows`) where it keeps enough, though another may
+    be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
     """
     rho, stays = np.empty(whole.shape[0]), -1
     rate_open(parts, still, t, np.minimum(asked, most), leaves, rho)

@@ -19,22 +19,25 @@ from specshield.policy.reachability.guide import make_scratch, predicate_at
 from specshield.robot.body import Body, centre
 from specshield.rule.progress import ALWAYS, EVENTUALLY, PENDING, Rules
 
-COARSE = 2  # cells of the map to a side of the field's: 10 cm where the map has 5. Chosen by hand.
+COARSE = 2  # cells of the map to a side of a field's, at least: 10 cm where the map has 5. By hand.
+MOST = 20_000  # cells of a field, which take some 2 ms; on larger maps they are larger
+NO_FIELDS = np.empty((0, 1, 1))  # for a search that the tables alone lead
 
 
 def goal_cells(body: Body, rules: Rules) -> Bools:
-    """Where each goal's predicate holds, for a robot that looks along the map's x axis. Shape [K, ny, nx];
-    nowhere for an `always`.
+    """Where each goal's predicate holds for a robot whose heading is 0, by what signals hold at first. Shape
+    [K, ny, nx]; nowhere for an `always`.
     """
-    ny, nx = (-(-side // COARSE) for side in body.occupied.shape)
+    coarse = max(COARSE, math.ceil(math.sqrt(body.occupied.size / MOST)))
+    ny, nx = (-(-side // coarse) for side in body.occupied.shape)
     held = np.zeros((len(rules.kind), ny, nx), np.bool_)
-    _fill_goals(body, rules, held)
+    _fill_goals(body, rules, coarse * body.resolution, held)
     return held
 
 
 @kernel
-def _fill_goals(body: Body, rules: Rules, held: Bools) -> None:
-    scratch, side = make_scratch(rules, 1), COARSE * body.resolution
+def _fill_goals(body: Body, rules: Rules, side: float, held: Bools) -> None:
+    scratch = make_scratch(rules, 1)
     for k in range(held.shape[0]):
         if rules.kind[k] == ALWAYS:
             continue
@@ -51,14 +54,15 @@ def distances(body: Body, goals: Bools) -> Floats:
     is no way. Shape [K, ny, nx].
     """
     h, (ny, nx), (height, width) = body.resolution, goals.shape[1:], body.clearance.shape
-    fine = np.zeros((COARSE * ny, COARSE * nx), np.bool_)
+    coarse = -(-height // ny)
+    fine = np.zeros((coarse * ny, coarse * nx), np.bool_)
     fine[:height, :width] = body.clearance > body.radius - 0.5 * h
-    free: Bools = np.any(fine.reshape(ny, COARSE, nx, COARSE), axis=(1, 3))
+    free: Bools = np.any(fine.reshape(ny, coarse, nx, coarse), axis=(1, 3))
     found = np.full(goals.shape, np.inf)
     for goal, far in zip(goals, found, strict=True):
         if goal.any():
-            far[:] = geodesic_distance(free, goal, COARSE * h)
-            beside = minimum_filter(far, 3) + COARSE * h  # a pose may be in a cell whose centre is not free
+            far[:] = geodesic_distance(free, goal, coarse * h)
+            beside = minimum_filter(far, 3) + coarse * h  # a pose may be in a cell whose centre is not free
             far[:] = np.where(np.isinf(far), beside, far)
     return found
 
@@ -71,9 +75,12 @@ def spare_on(
     """The steps that moves of `stride` [m] straight to any one pending goal leave, at the least; inf where
     no distance is known. fields [K, ny, nx]: as `distances` gives them.
     """
+    least = math.inf
+    if fields.shape[0] == 0 or stride == 0.0:
+        return least
     u, v = centre(body, x, y, theta)
-    side, least = COARSE * body.resolution, math.inf
-    j, i = math.floor(v / side), math.floor(u / side)
+    coarse = -(-body.occupied.shape[0] // fields.shape[1])
+    j, i = math.floor(v / (coarse * body.resolution)), math.floor(u / (coarse * body.resolution))
     if j < 0 or j >= fields.shape[1] or i < 0 or i >= fields.shape[2]:
         return least
     for k in range(fields.shape[0]):

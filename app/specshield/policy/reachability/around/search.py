@@ -89,18 +89,16 @@ def go_around(
 ) -> int:  # fmt: skip
     """Searches for a way from x_t to every goal. Returns its first motion; then motions (M, T - t) hold it,
     and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the search came to `most`
-    poses.
+    poses. The robot has to be one that can wait.
 
-    fields [K, ny, nx]: the distances to the goals (field.py). poses (M, T - t, 3): overwritten. The other
-    arguments are those of `continue_all`.
+    fields [K, ny, nx]: the distances to the goals (field.py), or none. poses (M, T - t, 3): overwritten. The
+    other arguments are those of `continue_all`.
     """
     t, k_count, steps = history.shape[0] - 1, guide.rules.kind.shape[0], motions.shape[1]
     status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
     recall(guide.rules, past, history, signals, status, run)
     forgive(guide.rules, t, status)
     scratch = make_scratch(guide.rules, motions.shape[0])
-    if guide.wait < 0:
-        return NO_WAY
     tree = Tree(
         np.empty((most, 3)), np.empty((most, k_count), np.int8), np.empty((most, k_count), np.int64),
         np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most),
@@ -241,7 +239,7 @@ def _arrived(guide: Guide, t: int, row: int, tree: Tree, scratch: Scratch) -> bo
             continue
         if tree.status[row, k] != tree.status[0, k]:
             return True
-        waits = tree.status[row, k] == PENDING and _has_time(rules, t, tree.status[row], k)
+        waits = tree.status[row, k] == PENDING and _has_time(rules, t, tree.status[row], tree.run[row], k)
         if waits and predicate_at(rules, k, x, y, theta, scratch) > rules.margin:
             return True
     phase = tables.phase[t]
@@ -250,11 +248,11 @@ def _arrived(guide: Guide, t: int, row: int, tree: Tree, scratch: Scratch) -> bo
 
 
 @leaf
-def _has_time(rules: Rules, t: int, status: Int8s, goal: int) -> bool:
+def _has_time(rules: Rules, t: int, status: Int8s, run: Ints, goal: int) -> bool:
     """Whether no other goal is due before this one is settled by waiting for it from step t on."""
     until = rules.a[goal]
     if rules.kind[goal] == EVENTUALLY_ALWAYS:
-        until = max(until + rules.b[goal], t + rules.b[goal] - rules.c2[goal])
+        until = max(until + rules.b[goal], t + rules.b[goal] - rules.c2[goal] + 1 - run[goal])
     for k in range(status.shape[0]):
         if k != goal and rules.kind[k] != ALWAYS and status[k] == PENDING and due(rules, k) <= until:
             return False
