@@ -45,7 +45,7 @@ def check_optimal(answer, prior, values, threshold):
     assert answer @ values >= threshold - 1e-9
     numeric = solved(prior, values, threshold)
     assert abs(numeric.sum() - 1.0) < 1e-8
-    # The answer keeps the constraints, so no less is possible; the solver stops some 2e-6 short of it at times.
+    # The answer keeps the constraints, so no less is possible; the solver may stop some 2e-6 short of it.
     assert kl(answer, prior) <= kl(np.maximum(numeric, 0.0), prior) + 1e-6
     np.testing.assert_allclose(
         answer, numeric, atol=2e-4
