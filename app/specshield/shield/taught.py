@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.robot.barred import is_barred
-from specshield.robot.dynamics import Body, displacement, make_body, overlap, successors, wrap
+from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
 from specshield.shield.caution.experience import was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
 from specshield.shield.feasibility import Prefix
@@ -197,10 +197,12 @@ def doubtful(told: Shield, taught: Taught, prefix: Prefix, nexts: Floats) -> Boo
         doubts |= np.any(ends[0] != ends[1], axis=1)
     x, y, theta = pose
     if config.learn_map and (config.uncertainty is not None or len(known)):
-        for motion in np.flatnonzero(~doubts).tolist():
-            doubts[motion] = any(
-                not prefix.allows(end) for end in _farther(told.body, pose, motion, nexts[motion])
-            )
+        (far, turn), (dx, dy) = displacements(told.body), (nexts[:, :2] - pose[:2]).T
+        stopped = np.abs(np.hypot(dx, dy) - np.abs(far)) > SAME_PLACE
+        stopped |= (turn != 0.0) & (nexts[:, 2] == theta)
+        for motion in np.flatnonzero(stopped & ~doubts).tolist():
+            places = _farther(told.body, pose, motion, nexts[motion])
+            doubts[motion] = any(not prefix.allows(place) for place in places)
     if len(taught.barred):
         doubts |= [is_barred(taught.barred, x, y, theta, motion) for motion in range(motions)]
     return doubts
@@ -208,12 +210,10 @@ def doubtful(told: Shield, taught: Taught, prefix: Prefix, nexts: Floats) -> Boo
 
 def _farther(body: Body, pose: Floats, motion: int, end: Floats) -> Iterator[Floats]:
     """Where a motion from a pose (3,) may lead if what f has stop it at `end` (3,) stands farther on: every
-    cell's side, and where nothing stops it. None where nothing does.
+    cell's side, and where nothing stops it.
     """
     (far, turn), (x, y, theta) = displacement(body, motion), pose
     goes_on = far - math.copysign(math.hypot(end[0] - x, end[1] - y), far)
-    if abs(goes_on) <= SAME_PLACE and (turn == 0.0 or end[2] != theta):
-        return
     for more in np.linspace(0.0, goes_on, math.ceil(abs(goes_on) / body.resolution) + 1)[1:-1]:
         yield np.array([end[0] + more * math.cos(theta), end[1] + more * math.sin(theta), theta])
     yield np.array([x + far * math.cos(theta), y + far * math.sin(theta), wrap(theta + turn)])
