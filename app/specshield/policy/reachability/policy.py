@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -47,6 +48,7 @@ from specshield.world.occupancy import OccupancyGrid
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
 MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
 NOTHING_BARRED = np.empty((0, 6))
+MAPS = 8  # whose distances a policy keeps: with the map itself 0.7 MB each in a flat of 10 x 10 m at 5 cm
 FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
 
 
@@ -85,13 +87,13 @@ class ReachabilityPolicy:
         way around gives up, nothing else is tried then.
         """
         other = replace(self, told=False, guess=guess)
-        other.__dict__.update(_body=body, _rules=self._rules, _goals=self._goals)
+        other.__dict__.update(_body=body, _rules=self._rules, _goals=self._goals, _far=self._far)
         return other
 
     def avoiding(self, barred: Floats) -> ReachabilityPolicy:
         """The policy for a robot that some motions led nowhere. barred [n, 6]: as `Guide` has it."""
         other = replace(self, barred=barred)
-        other.__dict__.update(_body=self._body, _rules=self._rules, _goals=self._goals)
+        other.__dict__.update(_body=self._body, _rules=self._rules, _goals=self._goals, _far=self._far)
         return other
 
     @cached_property
@@ -99,8 +101,17 @@ class ReachabilityPolicy:
         return goal_cells(self._body, self._rules)
 
     @cached_property
+    def _far(self) -> deque[tuple[Body, Floats]]:
+        """The distances to the goals on the maps that were gone by last: a map changes seldom."""
+        return deque(maxlen=MAPS)
+
+    @property
     def _fields(self) -> Floats:
-        return distances(self._body, self._goals)
+        found = next((fields for body, fields in list(self._far) if body is self._body), None)
+        if found is None:
+            found = distances(self._body, self._goals)
+            self._far.append((self._body, found))
+        return found
 
     @cached_property
     def _top(self) -> Floats:
