@@ -81,7 +81,7 @@ def test_the_score_of_each_motion(visit):
 def test_a_climb_turns_goes_and_stays(visit):
     """Having turned left from west it turns on to east, whichever way; then it goes four cells and waits."""
     motions, poses, scratch = begun(visit, pose(1, WEST), WAIT)
-    outcome, n = climb(visit, 0, 1, motions, poses, scratch)
+    outcome, n = climb(visit, 0, 1, motions, poses, scratch, True)
     assert (outcome, n) == (SETTLED_ALL, 7)
     assert motions[1] == motions[2]
     assert motions[1] in (LEFT, RIGHT)
@@ -92,7 +92,7 @@ def test_a_climb_turns_goes_and_stays(visit):
 def test_a_way_is_rejoined_after_a_turn_is_undone(visit):
     """The base goes on in two cells; a left turn costs two steps, which come off its last waits."""
     base, led, scratch = begun(visit, pose(4), FORWARD)
-    climb(visit, 0, 1, base, led, scratch)
+    climb(visit, 0, 1, base, led, scratch, True)
     assert base.tolist() == [FORWARD, FORWARD] + [WAIT] * 8
     motions, poses, scratch = begun(visit, pose(3, 1), LEFT)
     assert rejoin(visit, 0, RIGHT, -1, base, led, 0, motions, poses, scratch)

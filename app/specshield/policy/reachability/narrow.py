@@ -112,7 +112,7 @@ def _go(
     for _ in range(MAX_LEGS):
         begin = n
         copy_progress(scratch.status, scratch.run, status, run)
-        outcome, n = climb(guide, t, n, motions, poses, scratch)
+        outcome, n = climb(guide, t, n, motions, poses, scratch, True)
         if outcome == SETTLED_ALL:
             return True
         if outcome == STUCK:

@@ -182,7 +182,7 @@ def _follow(
     """Climbs on from motions[:n]; where that gets stuck, a short beam leads out if `escapes` allows it.
     Whether every goal was settled.
     """
-    outcome, n = climb(guide, t, n, motions, poses, scratch)
+    outcome, n = climb(guide, t, n, motions, poses, scratch, True)
     for _ in range(MAX_ESCAPES if escapes else 0):
         if outcome != STUCK:
             break
@@ -203,7 +203,7 @@ def _follow(
             break
         copy_progress(status, run, scratch.status, scratch.run)
         n = _take(guide, t, n, way[0, : taken[0]], motions, poses, scratch)
-        outcome, n = climb(guide, t, n, motions, poses, scratch)
+        outcome, n = climb(guide, t, n, motions, poses, scratch, True)
     if outcome == STUCK:
         fill(n, guide.wait, poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2], motions, poses)
     return outcome == SETTLED_ALL

@@ -41,7 +41,7 @@ FAILED, SETTLED_ALL, STUCK = 0, 1, 2
 
 @leaf
 def climb(
-    guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: Scratch, patient: bool = True
+    guide: Guide, t: int, n: int, motions: Ints, poses: Floats, scratch: Scratch, patient: bool
 ) -> tuple[int, int]:
     """Goes on from motions[:n], n >= 1, to the horizon, by the motion with the latest feasible time.
 
@@ -106,7 +106,7 @@ def climb(
             continue
         if goal >= 0 and rules.kind[goal] == EVENTUALLY:
             before = n
-            n = _deepen(guide, t, n, goal, rules.a[goal], motions, poses, scratch)
+            n = _deepen(guide, t, n, goal, float(rules.a[goal]), motions, poses, scratch)
             if n > before:
                 x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
                 continue
