@@ -123,9 +123,9 @@ def costs_above(noise: Noise, stride: float, n: int, free: int) -> float:
     if noise.slips <= 0.0:
         return over
     lost, kept = noise.lost, noise.kept
-    share = math.exp(
-        math.lgamma(lost + kept) - math.lgamma(kept) + math.lgamma(kept + n) - math.lgamma(lost + kept + n)
-    )
+    share = 1.0  # the probability that none is lost; logarithms of Gamma are too coarse for large counts
+    for i in range(n):
+        share *= (kept + i) / (lost + kept + i)
     rest = 1.0  # the probability that more motions are lost than were counted
     for k in range(min(free + int(4.0 * sigma), n) + 1):
         over += noise.slips * share * _above(free - k, sigma)

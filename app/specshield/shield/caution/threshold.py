@@ -7,10 +7,11 @@ V(a) is a lower bound on the probability of keeping the rule after a, V* the lar
 Where V is never more than what its best successor is expected to have, d_t is expected never to fall, and
 d_t <= V*_t; so the rule is kept with probability delta or more. In an exact world V is J, 0 or 1.
 
-Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost: one
-minus, for each deadline, the probability that more steps are lost than it leaves free, and minus, for each
-step at which a G or another conjunct is to hold, the probability that a deviation is longer than its
-robustness there. docs/uncertainty.md says where that is a bound.
+Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost: the
+product, over the deadlines, of the probability that no more steps are lost than it leaves free, and, over the
+steps at which a G is to hold, of the probability that no deviation is longer than its robustness there. Both
+are at most what they stand for: that several hold together is at least as likely as if they were independent
+(slips: Harris, 1960; deviations: Sidak, 1967). docs/uncertainty.md says where that is a bound.
 """
 
 from __future__ import annotations
@@ -20,16 +21,18 @@ import math
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
-from specshield.compiled import kernel
+from specshield.compiled import kernel, leaf
+from specshield.errors import SampleError
 from specshield.portable import inner
 from specshield.rule.early import ALWAYS, EVENTUALLY, Conjuncts, conjunction_of, find_open
 from specshield.shield import shaping
 from specshield.shield.decision import Carry, Shield
-from specshield.shield.feasibility import Prefix, rho_of
+from specshield.shield.feasibility import Futures, Prefix, rho_of
 from specshield.shield.judgement import Judged
 from specshield.shield.uncertainty import Care, Noise, costs_above
-from specshield.stl import SATISFIED_ABOVE
+from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts
 from specshield.stl.tree import tree_value
+from specshield.task import Task, kept_with_task
 
 GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
@@ -46,18 +49,23 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         _, leaves = rho_of(prefix, tried)
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     find_open(parts, prefix.known, prefix.t, still)
-    sigma = math.hypot(care.noise.move, care.stride * care.noise.turn)
+    begins, noise = parts.a, care.noise
+    if noise.slips > 0.0 or noise.move > 0.0 or noise.turn > 0.0:
+        parts, leaves = _from_now_on(parts, leaves, prefix, tried)
+    sigma = math.hypot(noise.move, care.stride * noise.turn)
     _chances(
         parts,
+        begins,
         still,
         prefix.t,
-        care.noise,
+        noise,
         care.stride,
         sigma,
         care.margin,
         leaves,
         tried.rho,
         tried.motions,
+        task.robot.wait_motion,
         values,
     )
     motion_of = task.robot.motion_of
@@ -66,55 +74,97 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0)
 
 
+def _from_now_on(
+    parts: Conjuncts, leaves: Floats, prefix: Prefix, tried: Futures
+) -> tuple[Conjuncts, Floats]:
+    """The conjuncts with each G from the first step on, and their leaves: they say since when a G that has yet
+    to begin would hold. As they are where the arithmetic is not finite before it begins.
+    """
+    wide = _widened(prefix.task, prefix.formula)
+    if wide == prefix.formula:
+        return parts, leaves
+    try:
+        rho, wider = rho_of(prefix.of(wide), tried)
+    except SampleError:
+        return parts, leaves
+    if np.isneginf(rho[tried.rho > SATISFIED_ABOVE]).any():
+        return parts, leaves
+    return conjunction_of(prefix.task, wide)[1], wider
+
+
+@kept_with_task
+def _widened(task: Task, formula: Formula) -> Formula:
+    parts = tuple(Always(0, p.b, p.child) if isinstance(p, Always) else p for p in conjuncts(formula))
+    return parts[0] if len(parts) == 1 else And(parts)
+
+
 @kernel
 def _chances(
-    parts: Conjuncts, still: Bools, t: int, noise: Noise, stride: float, sigma: float, margin: float,
-    leaves: Floats, rho: Floats, motions: Ints, values: Floats,
+    parts: Conjuncts, begins: Ints, still: Bools, t: int, noise: Noise, stride: float, sigma: float,
+    margin: float, leaves: Floats, rho: Floats, motions: Ints, wait: int, values: Floats,
 ) -> None:  # fmt: skip
-    """Writes V of each motion (M,), which is zero where no future keeps the rule."""
+    """Writes V of each motion (M,), which is zero where no future keeps the rule. begins (K,): the first step
+    of each conjunct's window; a G of `parts` may begin before it.
+    """
     buffer = np.empty(leaves.shape[1])
     for f in range(rho.shape[0]):
         if not rho[f] > SATISFIED_ABOVE:
             continue
         buffer[:] = leaves[f]
         tree_value(parts.below, buffer)
-        over = 0.0
+        chance = 1.0
         for k in range(still.shape[0]):
             if still[k]:
-                over += _late(parts, k, t, noise, stride, margin, buffer)
+                chance *= 1.0 - _late(parts, begins[k], k, t, noise, stride, margin, buffer, motions[f], wait)
             if still[k] and sigma > 0.0 and parts.kind[k] == ALWAYS:
-                for step in range(max(parts.a[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
+                for step in range(max(begins[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
                     deep = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
-                    over += math.exp(-0.5 * (deep / sigma) ** 2)
-        values[motions[f, 0]] = max(values[motions[f, 0]], 1.0 - over)
+                    chance *= 1.0 - math.exp(-0.5 * (deep / sigma) ** 2)
+        values[motions[f, 0]] = max(values[motions[f, 0]], chance)
 
 
-@kernel
+@leaf
 def _late(
-    parts: Conjuncts, k: int, t: int, noise: Noise, stride: float, margin: float, buffer: Floats
-) -> float:
-    """The probability that motions cost more steps than conjunct k leaves free, or 1 where that is not known.
+    parts: Conjuncts, a: int, k: int, t: int, noise: Noise, stride: float, margin: float, buffer: Floats,
+    motions: Ints, wait: int,
+) -> float:  # fmt: skip
+    """The probability that motions cost more steps than conjunct k, whose window begins at a, leaves free; 1
+    where that is not known.
 
-    An F is first kept by `margin`, or else by as little as it is, so many steps before its window ends. A G
-    that has not begun is kept from so many steps before it begins, and from x_t on without a deadline.
+    An F is first kept by `margin`, or else by as little as it is, so many steps before its window ends. What
+    is below a G that has not begun holds from so many steps before it begins; one that has begun has no
+    deadline. A robot that is late leaves out waits that come just before it has to be there.
     """
-    first, a, b = parts.at[k] - parts.a[k], parts.a[k], parts.b[k]
+    first, b = parts.at[k] - parts.a[k], parts.b[k]
     if noise.slips <= 0.0 and noise.move <= 0.0 and noise.turn <= 0.0:
         return 0.0
     if not parts.plain[k]:
         return 1.0
+    met = -1
     if parts.kind[k] == EVENTUALLY:
-        met = -1
         for step in range(a, b + 1):
             if buffer[first + step] > SATISFIED_ABOVE + margin:
                 met = step
                 break
             if met < 0 and buffer[first + step] > SATISFIED_ABOVE:
                 met = step
-        return costs_above(noise, stride, b + parts.horizon[k] - t, b - met)
+        free = b - met + _waits_before(motions, wait, met - t)
+        return costs_above(noise, stride, b + parts.horizon[k] - t, free)
     if a <= t:
         return 0.0
-    return costs_above(noise, stride, a - t, 0)  # what is below a G is known from its first step on
+    met = a
+    while met > t and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
+        met -= 1
+    return costs_above(noise, stride, a - t, a - met + _waits_before(motions, wait, met - t))
+
+
+@leaf
+def _waits_before(motions: Ints, wait: int, n: int) -> int:
+    """How many of the first n of a future's motions (T - t,) are waits with nothing but waits after them."""
+    waits = 0
+    while waits < n and motions[n - 1 - waits] == wait:
+        waits += 1
+    return waits
 
 
 def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float:
