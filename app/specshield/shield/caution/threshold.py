@@ -77,8 +77,8 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
 def _from_now_on(
     parts: Conjuncts, leaves: Floats, prefix: Prefix, tried: Futures
 ) -> tuple[Conjuncts, Floats]:
-    """The conjuncts with each G from the first step on, and their leaves: they say since when a G that has yet
-    to begin would hold. As they are where the arithmetic is not finite before it begins.
+    """The conjuncts with each G from the first step on, and their leaves: they say since when a G that has
+    yet to begin would hold. As they are where the arithmetic is not finite before it begins.
     """
     wide = _widened(prefix.task, prefix.formula)
     if wide == prefix.formula:
