@@ -85,11 +85,40 @@ def test_the_rule_is_kept_as_often_as_was_asked(asked, slip):
     assert kept / runs <= asked + spread + 0.05
 
 
+X = Cells(RULE, None, REGIONS).pose(0, 0, 0)[0]
+SINGULAR = f"(x > 0.4 and 1 / (x - {X}) > -99)"  # 1 / 0 at step 0, else that the robot is two cells ahead
+
+
+@pytest.mark.parametrize(
+    ("formula", "forward", "wait"),
+    [
+        ("F[0,2] x > -9 and G[2,2] x > 0.4", 0.64, 0.0),
+        (f"F[0,2] x > -9 and G[2,2] {SINGULAR}", 0.64, 0.0),
+        (f"G[2,3] {SINGULAR}", 0.64, 0.0),
+        (f"G[3,3] {SINGULAR}", 0.896, 0.64),  # one of three may be lost
+        ("F[1,1] G[2,2] A", 0.896, 0.64),
+    ],
+)
+def test_v_is_never_above_what_was_computed_by_hand(formula, forward, wait):
+    """A is two cells ahead of a robot whose motions are lost with a probability of 0.2."""
+    cells = Cells(formula, None, {"A": (2, 0)})
+    known = Uncertainty(0.0, 0.0, 0.2)
+    shield = make_shield([Everything(cells)], Config(uncertainty=known, threshold_over="episode"))
+    poses = np.array([cells.pose(0, 0, 0)])
+    prefix = prefix_of(cells.task, cells.task.formula, shield.view, poses, {})
+    _, care = learn(shield, None, poses)
+    care = replace(care, noise=care.noise._replace(lost=2e8, kept=8e8))
+    judged = judge(shield, prefix, None, False, care)
+    values = chances(shield, care, prefix, judged, np.zeros(len(shield.task.robot.motions), bool))
+    assert values[0] <= forward + 1e-6
+    assert values[WAIT] <= wait + 1e-6
+    assert values[:4].max() >= 0.5  # and it is no bound that says nothing
+
+
 def test_a_g_whose_arithmetic_is_not_finite_before_it_begins_is_decided():
-    x, y, theta = Cells(RULE, None, REGIONS).pose(0, 0, 0)
-    cells = Cells(f"F[0,8] A and G[9,10] 1 / (x - {x}) > -9", None, {"A": (2, 0)})  # 1 / 0 at step 0
+    cells = Cells(f"F[0,8] A and G[9,10] {SINGULAR}", None, {"A": (2, 0)})
     config = Config(threshold=0.5, threshold_over="episode", uncertainty=Uncertainty(0.0, 0.0, 0.1))
     shield = make_shield([Everything(cells)], config)
-    found = decide(shield, [(x, y, theta)], np.zeros(len(shield.task.robot.actions)))
+    found = decide(shield, [cells.pose(0, 0, 0)], np.zeros(len(shield.task.robot.actions)))
     assert found.mode == "shaped"
     assert found.feasible_mass > 0.0

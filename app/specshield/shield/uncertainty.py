@@ -119,6 +119,8 @@ def costs_above(noise: Noise, stride: float, n: int, free: int) -> float:
     deviation that grows with the root of n.
     """
     sigma = HARDER * math.hypot(noise.move / stride, noise.turn / MENDED) * math.sqrt(n)
+    if sigma <= 0.0 and free >= n:
+        return 0.0
     over = (1.0 - noise.slips) * _above(free, sigma)
     if noise.slips <= 0.0:
         return over

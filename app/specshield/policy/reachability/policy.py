@@ -48,7 +48,7 @@ from specshield.world.occupancy import OccupancyGrid
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
 MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
 NOTHING_BARRED = np.empty((0, 6))
-MAPS = 8  # whose distances a policy keeps: with the map itself 0.7 MB each in a flat of 10 x 10 m at 5 cm
+MAPS, MAPS_BYTES = 8, 8_000_000  # whose distances a policy keeps, and the most that their clearances take
 FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
 
 
@@ -102,8 +102,8 @@ class ReachabilityPolicy:
 
     @cached_property
     def _far(self) -> deque[tuple[Body, Floats]]:
-        """The distances to the goals on the maps that were gone by last: a map changes seldom."""
-        return deque(maxlen=MAPS)
+        """The distances to the goals on the maps that were last used: a map changes seldom."""
+        return deque(maxlen=max(1, min(MAPS, MAPS_BYTES // self._body.clearance.nbytes)))
 
     @property
     def _fields(self) -> Floats:

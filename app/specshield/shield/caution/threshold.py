@@ -9,9 +9,9 @@ d_t <= V*_t; so the rule is kept with probability delta or more. In an exact wor
 
 Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost: the
 product, over the deadlines, of the probability that no more steps are lost than it leaves free, and, over the
-steps at which a G is to hold, of the probability that no deviation is longer than its robustness there. Both
-are at most what they stand for: that several hold together is at least as likely as if they were independent
-(slips: Harris, 1960; deviations: Sidak, 1967). docs/uncertainty.md says where that is a bound.
+steps at which a G is to hold, of the probability that no deviation is longer than its robustness there. With
+slips alone this is a lower bound: that all deadlines are met is at least as likely as if they were
+independent (Harris, 1960). docs/uncertainty.md says more.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     find_open(parts, prefix.known, prefix.t, still)
     begins, noise = parts.a, care.noise
-    if noise.slips > 0.0 or noise.move > 0.0 or noise.turn > 0.0:
+    later = still & (parts.kind == ALWAYS) & (begins > prefix.t)
+    if later.any() and (noise.slips > 0.0 or noise.move > 0.0 or noise.turn > 0.0):
         parts, leaves = _from_now_on(parts, leaves, prefix, tried)
     sigma = math.hypot(noise.move, care.stride * noise.turn)
     _chances(
@@ -78,10 +79,11 @@ def _from_now_on(
     parts: Conjuncts, leaves: Floats, prefix: Prefix, tried: Futures
 ) -> tuple[Conjuncts, Floats]:
     """The conjuncts with each G from the first step on, and their leaves: they say since when a G that has
-    yet to begin would hold. As they are where the arithmetic is not finite before it begins.
+    yet to begin would hold. As they are where the arithmetic is not finite before it begins, and where
+    signals are taken to change after x_t.
     """
     wide = _widened(prefix.task, prefix.formula)
-    if wide == prefix.formula:
+    if wide == prefix.formula or not np.array_equal(prefix.held, prefix.rows[-1:]):
         return parts, leaves
     try:
         rho, wider = rho_of(prefix.of(wide), tried)
@@ -132,8 +134,8 @@ def _late(
     where that is not known.
 
     An F is first kept by `margin`, or else by as little as it is, so many steps before its window ends. What
-    is below a G that has not begun holds from so many steps before it begins; one that has begun has no
-    deadline. A robot that is late leaves out waits that come just before it has to be there.
+    is below a G that has not begun holds from so many steps before it begins, and as many may be lost; one
+    that has begun has no deadline. A robot that is late leaves out waits just before it has to be there.
     """
     first, b = parts.at[k] - parts.a[k], parts.b[k]
     if noise.slips <= 0.0 and noise.move <= 0.0 and noise.turn <= 0.0:
@@ -148,12 +150,14 @@ def _late(
                 break
             if met < 0 and buffer[first + step] > SATISFIED_ABOVE:
                 met = step
-        free = b - met + _waits_before(motions, wait, met - t)
+        free = b - met
+        if parts.horizon[k] == 0:  # else the robot may have to be there only after `met`
+            free += _waits_before(motions, wait, met - t)
         return costs_above(noise, stride, b + parts.horizon[k] - t, free)
     if a <= t:
         return 0.0
     met = a
-    while met > t and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
+    while met > max(t, parts.a[k]) and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
         met -= 1
     return costs_above(noise, stride, a - t, a - met + _waits_before(motions, wait, met - t))
 
