@@ -91,7 +91,7 @@ def test_one_client_watches_many_sessions_and_still_steps(server):
 def test_a_map_that_nobody_uses_is_deleted(server):
     with (
         ShieldClient(server.url, timeout=60.0) as client,
-        httpx.Client(base_url=server.url, timeout=60.0) as raw,
+        httpx.Client(base_url=server.url, verify=False, timeout=60.0) as raw,
     ):
         used = raw.post("/v1/maps", json=grid_json()).json()["id"]
         send_policy(raw)

@@ -13,7 +13,7 @@ from tests.service.world import LOGITS, START, grid_json, send_policy
 
 @pytest.fixture
 def client(server: Any) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=server.url, timeout=None) as client:
+    with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         yield client
 
 

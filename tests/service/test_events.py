@@ -148,7 +148,7 @@ def test_two_switches_with_no_step_between_are_both_told(server, client, begin, 
 
 
 def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_its_readers_go(tmp_path):
-    with serving(tmp_path) as one, httpx.Client(base_url=one.url, timeout=None) as client:
+    with serving(tmp_path) as one, httpx.Client(base_url=one.url, verify=False, timeout=None) as client:
         body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}
         session = client.post("/v1/sessions", json=body).json()["id"]
         with serving(tmp_path) as other:
@@ -194,7 +194,7 @@ def test_the_number_of_readers_is_bounded_and_those_who_leave_make_room(tmp_path
 
     with (
         serving(tmp_path, SPECSHIELD_MAX_WATCHERS="2") as server,
-        httpx.Client(base_url=server.url, timeout=None) as client,
+        httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
     ):
         port = httpx.URL(server.url).port
         body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}

@@ -25,7 +25,7 @@ from tests.serving import serving, wait_for
 def test_a_server_that_is_told_to_stop_says_so_first_and_finishes_what_it_was_asked(tmp_path, options):
     with (
         serving(tmp_path, *options, SPECSHIELD_DRAIN="3") as server,
-        httpx.Client(base_url=server.url) as client,
+        httpx.Client(base_url=server.url, verify=False) as client,
     ):
         # The process that this connection leads to, which need not be the one that was ready first.
         wait_for(lambda: client.get("/readyz").status_code == 200, 60.0)

@@ -270,7 +270,7 @@ def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path):
 
 
 def test_its_files_are_small_tagged_and_allow_nothing_from_elsewhere(server):
-    with httpx.Client(base_url=server.url) as client:
+    with httpx.Client(base_url=server.url, verify=False) as client:
         page = client.get("/")
         assert page.headers["content-type"].startswith("text/html")
         assert page.headers["content-encoding"] == "gzip"

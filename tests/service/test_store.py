@@ -52,7 +52,7 @@ def runs(pid):
 
 
 def test_what_was_acknowledged_survives_the_kill_of_store_and_server(tmp_path):
-    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         session = begin(client)
         answers = [step(client, session, t).content for t in range(3)]
         os.kill(store_pid(tmp_path), signal.SIGKILL)
@@ -62,7 +62,7 @@ def test_what_was_acknowledged_survives_the_kill_of_store_and_server(tmp_path):
         server.kill()
         wait_for(lambda: not any(map(runs, pids)), 5.0)  # nothing is left behind
 
-    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         assert [step(client, session, t).content for t in range(4)] == answers
         assert client.get(f"/v1/sessions/{session['id']}").json()["next_t"] == 4
         assert step(client, session, 4).status_code == 200
@@ -72,10 +72,10 @@ def test_a_session_that_looks_ahead_goes_on_at_once_after_a_restart(tmp_path):
     """Projection, which is as safe, while another process prepares: seconds, for an apartment."""
     logits = np.linspace(-2.0, 2.0, 20)
     asked = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0], "shaping": "lookahead"}
-    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         session = client.post("/v1/sessions", json=asked).json()
         server.kill()
-    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         body = {"t": 0, "poses": [asked["initial_pose"]], "logits": logits.tolist()}
         answer = client.post(f"/v1/sessions/{session['id']}/steps", json=body).json()
     moves = np.arange(20) != 4
@@ -142,8 +142,8 @@ def test_two_servers_share_one_store_and_one_step_has_one_answer(tmp_path):
     with (
         serving(tmp_path) as one,
         serving(tmp_path) as other,
-        httpx.Client(base_url=one.url, timeout=None) as a,
-        httpx.Client(base_url=other.url, timeout=None) as b,
+        httpx.Client(base_url=one.url, verify=False, timeout=None) as a,
+        httpx.Client(base_url=other.url, verify=False, timeout=None) as b,
     ):
         session = begin(a)
         assert step(b, session, 0).content == step(a, session, 0).content
@@ -157,7 +157,7 @@ def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_superv
         while server.log.read_text().count(" ready\n") < 2:  # until then one of them may answer `starting`
             assert server.process.poll() is None
             time.sleep(0.05)
-        with httpx.Client(base_url=server.url, timeout=None) as client:
+        with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
             session = begin(client)
         answers = [
             httpx.post(f"{server.url}/v1/sessions/{session['id']}/steps", json=body).content
@@ -185,7 +185,7 @@ def test_a_store_that_is_away_is_said_to_be_and_nothing_hangs(tmp_path):
     dead = f"unix://{tmp_path / 'nothing'}"
     with (
         serving(tmp_path, ready=False, REDIS_URL=dead) as server,
-        httpx.Client(base_url=server.url) as client,
+        httpx.Client(base_url=server.url, verify=False) as client,
     ):
         while not alive(client) or client.get("/v1/sessions").json()["type"] == "starting":
             assert server.process.poll() is None
@@ -212,7 +212,7 @@ def test_a_store_of_ones_own_and_sessions_that_expire(tmp_path):
         ) as server:
             assert not (tmp_path / "data" / "store").exists()
             with (
-                httpx.Client(base_url=server.url, timeout=None) as client,
+                httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
                 redis.Redis(unix_socket_path=str(own.socket)) as connection,
             ):
                 session = begin(client)
@@ -267,7 +267,7 @@ def test_an_answer_that_is_late_is_not_written_into_the_next_session_of_its_name
 def test_the_key_opens_what_it_should(tmp_path):
     with (
         serving(tmp_path, SPECSHIELD_API_KEY="s3cret") as server,
-        httpx.Client(base_url=server.url) as client,
+        httpx.Client(base_url=server.url, verify=False) as client,
     ):
         for path in ("/livez", "/readyz", "/docs", "/openapi.json"):
             assert client.get(path).status_code == 200
@@ -283,7 +283,7 @@ def test_the_key_opens_what_it_should(tmp_path):
 
 
 def test_a_server_that_fails_says_no_more_than_that(tmp_path):
-    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         session = begin(client)
         with redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket")) as connection:
             connection.hset(f"specshield:v2:{{@{session['id']}}}:session", "state", "broken")
@@ -298,7 +298,7 @@ def test_a_server_that_fails_says_no_more_than_that(tmp_path):
 def test_a_store_that_hangs_holds_nobody_longer_than_the_limit(tmp_path):
     with (
         serving(tmp_path, SPECSHIELD_STORE_TIMEOUT="0.5") as server,
-        httpx.Client(base_url=server.url, timeout=None) as client,
+        httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
     ):
         session = begin(client)
         first = step(client, session, 0)

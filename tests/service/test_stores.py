@@ -246,7 +246,7 @@ def test_a_cluster_that_is_away_is_said_to_be(tmp_path):
     away = "redis+cluster://127.0.0.1:1"
     with (
         serving(tmp_path, ready=False, REDIS_URL=away, SPECSHIELD_STORE_TIMEOUT="0.5") as server,
-        httpx.Client(base_url=server.url, timeout=30.0) as client,
+        httpx.Client(base_url=server.url, verify=False, timeout=30.0) as client,
     ):
 
         def said() -> Any:

@@ -136,7 +136,7 @@ def test_a_caller_who_does_not_read_holds_up_nobody(server, begin):
 
 
 def test_a_server_that_stops_says_so_to_its_streams(tmp_path):
-    with serving(tmp_path) as server, httpx.Client(base_url=server.url, timeout=None) as client:
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         client.post("/v1/maps", json=grid_json())
         asked = {"policy_id": send_policy(client)["id"], "initial_pose": START}
         session = client.post("/v1/sessions", json=asked).json()

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Iterable
 from contextvars import ContextVar
+from functools import cache
 from ipaddress import ip_address
 from typing import Any
 from urllib.request import getproxies, proxy_bypass
@@ -159,7 +160,7 @@ class Transport(httpx.HTTPTransport):
     """httpx's own transport with the network above; an HTTP proxy of the environment is used."""
 
     def __init__(self, url: httpx.URL) -> None:
-        super().__init__()
+        super().__init__(verify=_certificates())
         _check(self)
         proxy: dict[str, Any] = _proxy(url)
         pool = httpcore.HTTPProxy if proxy else httpcore.ConnectionPool
@@ -168,7 +169,7 @@ class Transport(httpx.HTTPTransport):
 
 class AsyncTransport(httpx.AsyncHTTPTransport):
     def __init__(self, url: httpx.URL) -> None:
-        super().__init__()
+        super().__init__(verify=_certificates())
         _check(self)
         proxy: dict[str, Any] = _proxy(url)
         pool = httpcore.AsyncHTTPProxy if proxy else httpcore.AsyncConnectionPool
@@ -177,8 +178,13 @@ class AsyncTransport(httpx.AsyncHTTPTransport):
 
 def _pool(network: Network | AsyncNetwork) -> dict[str, Any]:
     """As many connections as are asked for: a step never waits until somebody stops watching."""
-    context = httpx.create_ssl_context()
-    return {"ssl_context": context, "network_backend": network, "max_connections": None}
+    return {"ssl_context": _certificates(), "network_backend": network, "max_connections": None}
+
+
+@cache
+def _certificates() -> ssl.SSLContext:
+    """Whom this machine trusts. Reading that takes 20 ms, so a process does it once and not once a client."""
+    return httpx.create_ssl_context()
 
 
 def _check(transport: httpx.HTTPTransport | httpx.AsyncHTTPTransport) -> None:
