@@ -53,9 +53,9 @@ def test_a_step_ends_by_its_deadline(ports, fault, asynchronous):
 @pytest.mark.parametrize("fault", ["drip_head", "drip_body", "endless_chunks", "silent"])
 def test_without_a_deadline_the_timeout_bounds_a_try_and_not_each_read(ports, fault, asynchronous):
     url = f"http://127.0.0.1:{ports[fault]}"
-    _, seconds = asked(url, lambda s: s.step(POSE, LOGITS), asynchronous, timeout=0.4)
+    _, seconds = asked(url, lambda s: s.step(POSE, LOGITS), asynchronous, timeout=0.2)
     assert seconds < GENEROUS
-    _, seconds = asked(url, lambda s: s.close(POSE), asynchronous, timeout=0.4)
+    _, seconds = asked(url, lambda s: s.close(POSE), asynchronous, timeout=0.2)
     assert seconds < GENEROUS
 
 
