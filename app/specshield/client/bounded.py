@@ -161,36 +161,32 @@ class Transport(httpx.HTTPTransport):
 
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
-        _check(self)
-        proxy: dict[str, Any] = _proxy(url)
-        pool = httpcore.HTTPProxy if proxy else httpcore.ConnectionPool
-        self._pool = pool(**proxy, **_pool(Network()))
+        _connect_by(self, url, Network(), httpcore.ConnectionPool, httpcore.HTTPProxy)
 
 
 class AsyncTransport(httpx.AsyncHTTPTransport):
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
-        _check(self)
-        proxy: dict[str, Any] = _proxy(url)
-        pool = httpcore.AsyncHTTPProxy if proxy else httpcore.AsyncConnectionPool
-        self._pool = pool(**proxy, **_pool(AsyncNetwork()))
+        _connect_by(self, url, AsyncNetwork(), httpcore.AsyncConnectionPool, httpcore.AsyncHTTPProxy)
 
 
-def _pool(network: Network | AsyncNetwork) -> dict[str, Any]:
-    """As many connections as are asked for: a step never waits until somebody stops watching."""
-    return {"ssl_context": _certificates(), "network_backend": network, "max_connections": None}
+def _connect_by(transport: Any, url: httpx.URL, network: object, direct: Any, through_proxy: Any) -> None:
+    """httpx takes a network only with a pool of connections, which it keeps in `_pool`.
+
+    The pool holds as many connections as are asked for: a step never waits until somebody stops watching.
+    """
+    if "_pool" not in vars(transport):
+        raise RuntimeError(f"httpx {httpx.__version__} cannot be given a network; expected 0.27 or 0.28")
+    proxy = _proxy(url)
+    pool = through_proxy if proxy else direct
+    options = {"ssl_context": _certificates(), "network_backend": network, "max_connections": None}
+    transport._pool = pool(**proxy, **options)
 
 
 @cache
 def _certificates() -> ssl.SSLContext:
     """Whom this machine trusts. Reading that takes 20 ms, so a process does it once and not once a client."""
     return httpx.create_ssl_context()
-
-
-def _check(transport: httpx.HTTPTransport | httpx.AsyncHTTPTransport) -> None:
-    """httpx takes a network only with a pool, which it keeps there."""
-    if "_pool" not in vars(transport):
-        raise RuntimeError(f"httpx {httpx.__version__} cannot be given a network; expected 0.27 or 0.28")
 
 
 def _proxy(url: httpx.URL) -> dict[str, Any]:
