@@ -171,16 +171,14 @@ class AsyncTransport(httpx.AsyncHTTPTransport):
 
 
 def _connect_by(transport: Any, url: httpx.URL, network: object, direct: Any, through_proxy: Any) -> None:
-    """httpx takes a network only with a pool of connections, which it keeps in `_pool`.
-
-    The pool holds as many connections as are asked for: a step never waits until somebody stops watching.
-    """
+    """Give it a pool with this network, as large as is asked for: a step never waits for those who watch."""
     if "_pool" not in vars(transport):
         raise RuntimeError(f"httpx {httpx.__version__} cannot be given a network; expected 0.27 or 0.28")
     proxy = _proxy(url)
     pool = through_proxy if proxy else direct
-    options = {"ssl_context": _certificates(), "network_backend": network, "max_connections": None}
-    transport._pool = pool(**proxy, **options)
+    transport._pool = pool(
+        **proxy, ssl_context=_certificates(), network_backend=network, max_connections=None
+    )
 
 
 @cache

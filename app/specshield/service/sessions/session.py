@@ -227,7 +227,10 @@ def over(session: Session, t: int) -> SessionFinished:
 def missing(key: str) -> NotFound:
     id = shown(key)
     return NotFound(
-        f"there is no session {id!r}; it may have expired", path="id", got=id, expected="an id from /v1/sessions"
+        f"there is no session {id!r}; it may have expired",
+        path="id",
+        got=id,
+        expected="an id from /v1/sessions",
     )
 
 
