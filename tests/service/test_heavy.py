@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -14,10 +15,15 @@ from specshield.service.heavy.pool import Pool, Template
 from specshield.service.heavy.queue import Turns
 
 
-def run(scenario: Callable[[Pool], Awaitable[Any]], size: int = 1, idle: float = 60.0) -> Any:
+def run(
+    scenario: Callable[[Pool], Awaitable[Any]],
+    size: int = 1,
+    idle: float = 60.0,
+    unused: Callable[[float], object] = lambda since: None,
+) -> Any:
     async def whole() -> Any:
         template = Template()
-        pool = Pool(template, size=size, memory=1 << 30, nice=1, waiting=4, idle=idle, unused=lambda: None)
+        pool = Pool(template, size=size, memory=1 << 30, nice=1, waiting=4, idle=idle, unused=unused)
         try:
             return await scenario(pool)
         finally:
@@ -71,16 +77,21 @@ def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end()
 
 
 def test_a_child_that_keeps_much_memory_or_has_nothing_to_do_ends() -> None:
+    unused = list[float]()  # since when, each time that no child was left
+
     async def scenario(pool: Pool) -> None:
         pid = await pool.run("os:getpid", seconds=60.0)
+        begun = time.monotonic()
         await pool.run("numpy:ones", 100, seconds=60.0)
+        ended = time.monotonic()
         await _ends(pid)  # idle
         assert pool.children == 0
+        assert begun < unused[0] < ended  # and not when the child ended
         pid = await pool.run("os:getpid", seconds=60.0)
         assert len(await pool.run("operator:mul", b"a", 100 << 20, seconds=60.0)) == 100 << 20
         await _ends(pid)
 
-    run(scenario, idle=0.05)
+    run(scenario, idle=0.05, unused=unused.append)
 
 
 def test_owners_take_turns() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from collections.abc import Hashable
 from typing import Any
 
@@ -18,7 +19,7 @@ DECISIONS_NICE, TASKS_NICE = 5, 10
 WAITING = 16  # calls of one owner that may wait
 DECISION_TIMEOUT = 30.0  # [s]; the slowest step known takes 1 s, its first one loads its kernels
 DECISION_MEMORY = 4 << 30  # [bytes]: tables of a few policies, and a look-ahead's
-IDLE = 60.0  # [s] that a process waits for more
+IDLE = 60.0  # [s] after its last call that a child ends, and that the template ends if no child is left
 
 
 class Heavy:
@@ -74,8 +75,8 @@ class Heavy:
             key=key,
         )
 
-    def _unused(self) -> None:
-        asyncio.get_running_loop().call_later(IDLE, self._stop_if_unused)
+    def _unused(self, since: float) -> None:
+        asyncio.get_running_loop().call_later(since + IDLE - time.monotonic(), self._stop_if_unused)
 
     def _stop_if_unused(self) -> None:
         if self.tasks.children + self.decisions.children == 0:

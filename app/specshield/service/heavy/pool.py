@@ -67,7 +67,7 @@ class Template:
 
 @dataclass(eq=False)
 class _Child:
-    """floor: the memory it held at its start [bytes]. key: of its last call. since: idle from then on [s]."""
+    """floor: the memory it held at its start [bytes]. key: of its last call. since: that call ended then [s]."""
 
     pid: int
     floor: int
@@ -92,8 +92,8 @@ class _Child:
 
 class Pool:
     """size: children at once. memory [bytes]: the most that a child may take. waiting: calls of one owner
-    that may wait. idle [s]: a child without a call ends after as long. unused: called when
-    the last child has ended.
+    that may wait. idle [s]: a child without a call ends after as long. unused: called when the last child
+    has ended, with the time of the end of its last call.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Pool:
         nice: int,
         waiting: int,
         idle: float,
-        unused: Callable[[], None],
+        unused: Callable[[float], None],
     ) -> None:
         self._template, self._size, self._memory, self._nice = template, size, memory, nice
         self._turns, self._idle_for, self._unused = Turns(size, waiting), idle, unused
@@ -140,8 +140,9 @@ class Pool:
         except (asyncio.IncompleteReadError, ConnectionError):
             raise _too_expensive("the process that worked on it ended") from None
         finally:
+            child.key, child.since = key, time.monotonic()
             if keep:
-                self._put_back(child, key)
+                self._put_back(child)
             else:
                 self._let_go(child)
         if isinstance(error, MemoryError):
@@ -189,8 +190,7 @@ class Pool:
             writer.close()
             raise
 
-    def _put_back(self, child: _Child, key: Hashable) -> None:
-        child.key, child.since = key, time.monotonic()
+    def _put_back(self, child: _Child) -> None:
         self._idle.append(child)
         if self._sweeping is None:
             self._sweeping = asyncio.get_running_loop().call_later(self._idle_for, self._sweep)
@@ -199,7 +199,7 @@ class Pool:
         child.kill()
         self.children -= 1
         if self.children == 0:
-            self._unused()
+            self._unused(child.since)
 
     def _sweep(self) -> None:
         """Ends the children that have been idle for long, and looks again when the next will have been."""
