@@ -29,7 +29,10 @@ import numpy as np
 
 LASTS = 20.0  # [s] at most, of one attack
 QUIET = 10.0  # [s] of the robot alone
-SETTLES = 75.0  # [s] after an attack until the memory is looked at: idle processes end after 60
+BACK = 1.10  # of the memory before an attack: it counts as back
+SETTLES = (
+    660.0  # [s] that this may take: a process ends after 60 without work, one of slow decisions after 600
+)
 RATE = 20.0  # steps a second that the robot asks for
 START = [5.0, 5.0, 0.0]
 ORIGIN = {"position": {"x": 0.0, "y": 0.0, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
@@ -252,7 +255,7 @@ def measure(url: str, pid: int, names: list[str]) -> Iterator[dict[str, Any]]:
                 most = max(most, _memory(pid))
             attacker.kill()
             attacker.wait()
-            time.sleep(SETTLES)
+            after, seconds = _settled(pid, before)
             yield {
                 "attack": name,
                 "steps": len(under),
@@ -261,8 +264,17 @@ def measure(url: str, pid: int, names: list[str]) -> Iterator[dict[str, Any]]:
                 "worst_ms": round(max(under), 1),
                 "memory_before_mb": before,
                 "memory_most_mb": most,
-                "memory_after_mb": _memory(pid),
+                "memory_after_mb": after,
+                "memory_after_s": seconds,
             }
+
+
+def _settled(pid: int, before: float) -> tuple[float, float]:
+    """The memory when it is back [MB] and how long that took [s]; as it is after `SETTLES` if it is not."""
+    begun = time.monotonic()
+    while (memory := _memory(pid)) > BACK * before and time.monotonic() < begun + SETTLES:
+        time.sleep(1.0)
+    return memory, round(time.monotonic() - begun, 0)
 
 
 def _memory(pid: int) -> float:

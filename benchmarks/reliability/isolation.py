@@ -17,7 +17,6 @@ from benchmarks.reliability.figures import about, read, write
 from benchmarks.reliability.plant import Service
 
 MORE_MS = 20.0  # beside twice the quiet p99
-BACK = 1.10  # of the memory before
 
 
 def run(out: Path, names: Sequence[str], resume: bool, command: str) -> int:
@@ -45,5 +44,5 @@ def judged(row: dict[str, Any]) -> dict[str, Any]:
         **row,
         "p99_limit_ms": round(limit, 1),
         "isolated": row["p99_attack_ms"] <= limit,
-        "memory_back": row["memory_after_mb"] <= BACK * row["memory_before_mb"],
+        "memory_back": row["memory_after_mb"] <= attacks.BACK * row["memory_before_mb"],
     }

@@ -179,11 +179,11 @@ def _isolation(out: Path) -> list[str]:
     rows = [
         [row["attack"].replace("_", " "), row["p99_quiet_ms"], row["p99_attack_ms"], row["p99_limit_ms"],
          "yes" if row["isolated"] else "**no**", row["memory_before_mb"], row["memory_most_mb"],
-         row["memory_after_mb"], "yes" if row["memory_back"] else "**no**"]
+         row["memory_after_mb"], row["memory_after_s"], "yes" if row["memory_back"] else "**no**"]
         for row in found["rows"]
     ]  # fmt: skip
     head = ["attack", "p99 quiet [ms]", "p99 under it [ms]", "asked: at most [ms]", "kept",
-            "memory before [MB]", "most [MB]", "after [MB]", "back within 10 %"]  # fmt: skip
+            "memory before [MB]", "most [MB]", "after [MB]", "after [s]", "back within 10 %"]  # fmt: skip
     return list(table(head, rows))
 
 
