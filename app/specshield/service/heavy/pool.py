@@ -67,7 +67,7 @@ class Template:
 
 @dataclass(eq=False)
 class _Child:
-    """floor: the memory at its start [bytes]. key: of its last call. since: the time at which that ended [s]."""
+    """floor: the memory at its start [bytes]. key: of its last call. since: that call ended then [s]."""
 
     pid: int
     floor: int
