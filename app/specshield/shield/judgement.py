@@ -63,10 +63,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         tried, best, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried)
     if care.barred is not None:
-        # Where nobody looks for ways without it, what comes back to a barred motion later still counts.
-        whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
-        goes = in_vain(care.barred, prefix.poses[-1], tried.motions, tried.poses, whole)
-        others = np.where(goes, -np.inf, kept)
+        others = _aside(shield, care.barred, prefix, tried, kept)
         vain = others.max() <= SATISFIED_ABOVE
         if not vain:
             without_it = best_of(tried, others, motions)
@@ -77,6 +74,12 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     if lowered or (care.has_slack and _some(best)):
         follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
+        if aimed.slack > 0 and not violated and (~aimed.kept & (values > SATISFIED_ABOVE)).any():
+            tried = _in_time(shield, prefix, tried, asked, aimed.slack)
+            kept = tried.rho
+            if care.barred is not None and not vain:
+                kept = _aside(shield, care.barred, prefix, tried, kept)
+            aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, aimed)
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
@@ -89,6 +92,26 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
     asked_and_had = aimed.margin, aimed.slack, aimed.lowered
     return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had, vain, left_out)
+
+
+def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:
+    """`kept` [N], and -inf for the futures that go by what led nowhere before. barred: as `Care` has it."""
+    # Where nobody looks for ways without it, what comes back to a barred motion later still counts.
+    whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
+    goes = in_vain(barred, prefix.poses[-1], tried.motions, tried.poses, whole)
+    return np.where(goes, -np.inf, kept)
+
+
+def _in_time(shield: Shield, prefix: Prefix, tried: Futures, margin: float, steps: int) -> Futures:
+    """`tried`, and the futures that policies propose for deadlines so many steps earlier: theirs may meet them
+    where a way that is only in time for the rule does not.
+    """
+    asked = [proposer.earlier(steps) for proposer in shield.proposers if hasattr(proposer, "earlier")]
+    if not asked:
+        return tried
+    return replace(
+        together(tried, futures(prefix, shield.body, asked, None, margin)), preferred=tried.preferred
+    )
 
 
 def without(judged: Judged, shield: Shield, doubtful: Bools) -> Judged:

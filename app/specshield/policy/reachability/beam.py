@@ -134,7 +134,7 @@ def _expand(
             body, rules, tables, before_x, before_y, before, t + n, here.status[w], here.run[w], wait, -1,
             scratch.scores, scratch.corners, scratch.ahead,
         )  # fmt: skip
-        lowest = max(band + t + n + 1, _lowest(scratch.scores))
+        lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         cos, sin, room = around(body, before_x, before_y, before)
         read = False  # whether the scratch holds the predicates at the place that the motions begin at
         for m in range(motion_count(body)):

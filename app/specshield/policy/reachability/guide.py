@@ -10,8 +10,9 @@ from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
 from specshield.policy.lattice import Corners
 from specshield.policy.reachability.tables import Tables, goals_settled, slack
+from specshield.policy.recall import recall
 from specshield.robot.dynamics import Body
-from specshield.rule.progress import EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
+from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
 from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
 from specshield.stl.program import VALUE, evaluate_packed
 
@@ -117,6 +118,27 @@ def fill(n: int, wait: int, x: float, y: float, theta: float, motions: Ints, pos
     for rest in range(n, motions.shape[0]):
         motions[rest] = wait
         poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
+
+
+def hurried(guide: Guide, early: int, past: float, history: Floats, signals: Floats) -> Guide:
+    """The guide for deadlines that come `early` steps earlier, though no window keeps less than half its
+    length: those of every F that is open at step t and can still be met so early.
+
+    past, history (t + 1, 3), signals (t + 1, S): as `recall` has them.
+    """
+    rules, tables = guide.rules, guide.tables
+    status, run = np.empty(len(rules.kind), np.int8), np.empty(len(rules.kind), np.int64)
+    recall(rules, past, history, signals, status, run)
+    dwells = rules.kind == EVENTUALLY_ALWAYS
+    end = np.where(dwells, rules.c1, rules.b)
+    sooner = end - np.minimum(early, (end - rules.a) // 2)
+    met = (status == PENDING) & (rules.kind != ALWAYS) & (sooner + dwells * rules.c2 >= len(history))
+    if not met.any():
+        return guide
+    rules = rules._replace(
+        b=np.where(met & ~dwells, sooner, rules.b), c1=np.where(met & dwells, sooner, rules.c1)
+    )
+    return guide._replace(rules=rules, tables=tables._replace(early=int((end - sooner)[met].min())))
 
 
 @kernel

@@ -247,4 +247,4 @@ def time_tables(
     ends = np.array([phase.end for phase in phases], np.int32)
     phase = np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32)
     none = np.empty((0, 0, 0, 0), np.uint8)
-    return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch)
+    return Tables(cell, code, table, phase, ends, bit, none, np.zeros_like(bit), np.zeros_like(bit), pitch, 0)

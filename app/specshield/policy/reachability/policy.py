@@ -24,7 +24,7 @@ from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattic
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
-from specshield.policy.reachability.guide import Guide, share_with_slack
+from specshield.policy.reachability.guide import Guide, hurried, share_with_slack
 from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
 from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.narrow import AFTER, FIRST, ON, continue_narrow
@@ -67,6 +67,7 @@ class ReachabilityPolicy:
     told: bool = True  # whether the tables were made for the map that the policy goes by
     guess: bool = False  # whether that is one of several maps that one decision tries
     barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
+    early: int = 0  # [steps] as `hurried` has it
 
     @property
     def id(self) -> str:
@@ -92,7 +93,14 @@ class ReachabilityPolicy:
 
     def avoiding(self, barred: Floats) -> ReachabilityPolicy:
         """The policy for a robot that some motions led nowhere. barred [n, 6]: as `Guide` has it."""
-        other = replace(self, barred=barred)
+        return self._alike(replace(self, barred=barred))
+
+    def earlier(self, steps: int) -> ReachabilityPolicy:
+        """The policy for deadlines that come so many steps earlier; the same for a robot that cannot wait."""
+        return self._alike(replace(self, early=steps))
+
+    def _alike(self, other: ReachabilityPolicy) -> ReachabilityPolicy:
+        """`other`, on the same map."""
         other.__dict__.update(_body=self._body, _rules=self._rules, _goals=self._goals, _far=self._far)
         return other
 
@@ -135,12 +143,13 @@ class ReachabilityPolicy:
         self, history: Floats, signals: Mapping[str, Floats], margin: float, effort: Floats
     ) -> Proposal:
         """effort: of the search for narrow predicates."""
-        body, rules = self._body, self._rules
-        rules = rules._replace(signals=rules.signals.copy(), margin=margin)
+        rules = self._rules._replace(signals=self._rules.signals.copy(), margin=margin)
         rows = signal_rows(self.task, signals, len(history))
-        guide = Guide(body, rules, self.tables, self.task.robot.wait_motion, self.barred)
         proposals = []
         for past in pasts(rules, history, rows):
+            guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
+            if self.early and guide.wait >= 0:
+                guide = hurried(guide, self.early, past, history, rows)
             motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
             poses, ways = np.empty((*motions.shape, 3)), np.empty_like(motions)
             around = NO_WAY
@@ -157,7 +166,7 @@ class ReachabilityPolicy:
             else:
                 preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
             proposals.append(Proposal(motions, int(preferred)))
-            if not self.guess and (len(self.barred) or not self.told):
+            if not (self.guess or self.early) and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
                 if guide.wait >= 0 and not is_known(guide, past, history, rows, free):
                     around = go_around(guide, past, history, rows, self._fields, poses, ways, POSES)

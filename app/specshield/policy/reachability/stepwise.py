@@ -224,4 +224,6 @@ def step_tables(rules: Rules, horizon: int, cell: Int32s, bits: Bytes, pitch: fl
     code = np.empty((0, *bits.shape[1:3]), np.uint16)
     phase, end = np.zeros(horizon + 1, np.int32), np.array([horizon], np.int32)
     bit = np.zeros(len(rules.kind), np.int64)
-    return Tables(cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch)
+    return Tables(
+        cell, code, np.full((1, 1), -1, np.int32), phase, end, bit, bits, *digits_of(rules), pitch, 0
+    )

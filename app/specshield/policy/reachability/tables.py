@@ -35,7 +35,8 @@ class Tables(NamedTuple):
     1 + STEP_CODES * L. table [phases, 2^G]: which one a set of settled goals has in a phase, -1 for none.
     phase [T + 1]: of each step; end [phases]: its last step. bit [K]: the obligation's bit in a set of
     settled goals, 0 for an `always`. bits [T + 1, cells, H, bytes], stride, dwell [K]: step by step; bits has
-    no steps where the tables are latest times.
+    no steps where the tables are latest times. early [steps]: how much earlier deadlines are to be met than
+    those that the tables, of latest times, were made for.
     """
 
     cell: Int32s
@@ -48,6 +49,7 @@ class Tables(NamedTuple):
     stride: Ints
     dwell: Ints
     pitch: float
+    early: int
 
 
 @inlined
@@ -61,8 +63,8 @@ def slack(
     body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
     run: Ints, corners: Corners,
 ) -> float:  # fmt: skip
-    """Steps to spare at (x_t, progress): L - t. SAFE once every goal is settled, HOPELESS where something
-    is broken. corners: scratch.
+    """Steps to spare at (x_t, progress): L - t - early. SAFE once every goal is settled, HOPELESS where
+    something is broken. corners: scratch.
     """
     return slack_at(body, rules, tables, x, y, theta, t, status, run, corners, UNKNOWN)
 
@@ -90,7 +92,7 @@ def slack_at(
     best = HOPELESS
     table = tables.table[tables.phase[t], mask]
     if table >= 0:
-        best = latest_at(tables, table, corners, count, h) - t
+        best = latest_at(tables, table, corners, count, h) - (t + tables.early)
     for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
         if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
             over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
@@ -150,9 +152,9 @@ def _after_dwell(
 ) -> float:
     """The slack once a dwell is over, at step t and where it was begun."""
     if mask == every and tables.phase[t] == len(tables.end) - 1:
-        return float(tables.end[-1] - t)
+        return float(tables.end[-1] - (t + tables.early))
     table = tables.table[tables.phase[t], mask]
-    return latest_at(tables, table, corners, count, h) - t if table >= 0 else HOPELESS
+    return latest_at(tables, table, corners, count, h) - (t + tables.early) if table >= 0 else HOPELESS
 
 
 @inlined
@@ -214,5 +216,5 @@ def score(
             over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
             if over < tables.phase.shape[0]:
                 spare = _after_dwell(tables, mask | tables.bit[k], every, over, corners, count, h)
-                scores[wait] = max(scores[wait], spare + t + 1.0)
+                scores[wait] = max(scores[wait], spare + (t + tables.early) + 1.0)
     return count

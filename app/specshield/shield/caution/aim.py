@@ -7,7 +7,7 @@ to the most steps with which the margin can be had, and then the margin.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,8 @@ class Aimed:
     """best: the best future of each motion. kept [M]: those that keep as much as can be had of what is asked.
 
     margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
-    than the session's settings ask for; what is asked for beside them is had where it can be.
+    than the session's settings ask for; what is asked for beside them is had where it can be. most [steps]:
+    no deadline is asked for more steps early than that.
     """
 
     best: Best
@@ -33,16 +34,19 @@ class Aimed:
     margin: float
     slack: int
     lowered: bool
+    most: int = 0
 
 
 def aim(
-    shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Floats, leaves: Floats, follows: bool
-) -> Aimed:
+    shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Floats, leaves: Floats, follows: bool,
+    before: Aimed | None = None,
+) -> Aimed:  # fmt: skip
     """The most that can be had of the margin and the slack.
 
     whole [N], leaves [N, size]: rho of the futures on the whole of `prefix.formula`, and its leaves. A future
     that does not satisfy it counts for nothing, whatever it keeps of a part. follows: whether the first
-    future is what is left of the way that the robot is on.
+    future is what is left of the way that the robot is on. before: what could be had of fewer futures, of
+    which no more is asked.
     """
     task, margin = shield.task, SATISFIED_ABOVE + care.margin
     own = prefix.formula is task.formula
@@ -75,9 +79,12 @@ def aim(
         return Best(robustness, rows), highest > margin
 
     motions = len(task.robot.motions)
+    if before is not None:
+        best, _ = at(before.most)
+        return replace(before, best=best, kept=best.robustness > margin)
     best, had = at(high)
     if had:
-        return Aimed(best, best.robustness > margin, care.margin, next_due, False)
+        return Aimed(best, best.robustness > margin, care.margin, next_due, False, high)
     low = 0  # slack `high` cannot be had
     best, had = at(low)
     if not had:
@@ -92,7 +99,8 @@ def aim(
             low, best = middle, tighter
         else:
             high = middle
-    return Aimed(best, best.robustness > margin, care.margin, min(low, next_due), low < shield.config.slack)
+    slack, lowered = min(low, next_due), low < shield.config.slack
+    return Aimed(best, best.robustness > margin, care.margin, slack, lowered, low)
 
 
 @kernel
