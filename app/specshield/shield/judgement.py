@@ -103,8 +103,8 @@ def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept:
 
 
 def _in_time(shield: Shield, prefix: Prefix, tried: Futures, margin: float, steps: int) -> Futures:
-    """`tried`, and the futures that policies propose for deadlines so many steps earlier: theirs may meet them
-    where a way that is only in time for the rule does not.
+    """`tried`, and the futures that policies propose for deadlines so many steps earlier. They may meet them
+    where a way that is just in time for the rule does not.
     """
     asked = [proposer.earlier(steps) for proposer in shield.proposers if hasattr(proposer, "earlier")]
     if not asked:

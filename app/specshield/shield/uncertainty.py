@@ -112,16 +112,22 @@ def slack_for(noise: Noise, stride: float, left: int, chance: float) -> int:
 
 
 @leaf
+def spread_of(noise: Noise, stride: float) -> float:
+    """The standard deviation of what noise costs in one motion [motions]."""
+    return HARDER * math.hypot(noise.move / stride, noise.turn / MENDED)
+
+
+@leaf
 def costs_above(noise: Noise, stride: float, n: int, free: int) -> float:
     """The probability that n motions cost more than `free` steps beside their own.
 
     A beta-binomial number of them is not executed; what noise costs is taken to be normal, of a standard
     deviation that grows with the root of n.
     """
-    sigma = HARDER * math.hypot(noise.move / stride, noise.turn / MENDED) * math.sqrt(n)
+    sigma = spread_of(noise, stride) * math.sqrt(n)
     if sigma <= 0.0 and free >= n:
         return 0.0
-    over = (1.0 - noise.slips) * _above(free, sigma)
+    over = (1.0 - noise.slips) * above(free, sigma)
     if noise.slips <= 0.0:
         return over
     lost, kept = noise.lost, noise.kept
@@ -130,7 +136,7 @@ def costs_above(noise: Noise, stride: float, n: int, free: int) -> float:
         share *= (kept + i) / (lost + kept + i)
     rest = 1.0  # the probability that more motions are lost than were counted
     for k in range(min(free + int(4.0 * sigma), n) + 1):
-        over += noise.slips * share * _above(free - k, sigma)
+        over += noise.slips * share * above(free - k, sigma)
         rest -= share
         if k < n:
             share *= (n - k) / (k + 1.0) * (lost + k) / max(kept + n - k - 1.0, 1e-9)
@@ -138,7 +144,7 @@ def costs_above(noise: Noise, stride: float, n: int, free: int) -> float:
 
 
 @leaf
-def _above(value: float, sigma: float) -> float:
+def above(value: float, sigma: float) -> float:
     """The probability that a normal deviate of standard deviation `sigma` is above a value."""
     if sigma <= 0.0:
         return 1.0 if value < 0.0 else 0.0

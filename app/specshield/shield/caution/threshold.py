@@ -8,10 +8,9 @@ Where V is never more than what its best successor is expected to have, d_t is e
 d_t <= V*_t; so the rule is kept with probability delta or more. In an exact world V is J, 0 or 1.
 
 Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost: the
-product, over the deadlines, of the probability that no more steps are lost than it leaves free, and, over the
-steps at which a G is to hold, of the probability that no deviation is longer than its robustness there. With
-slips alone this is a lower bound: that all deadlines are met is at least as likely as if they were
-independent (Harris, 1960). docs/uncertainty.md says more.
+probability that the robot, which repeats what was not executed, is in time for every deadline, times, over
+the steps at which a G is to hold, the probability that no deviation is longer than its robustness there. With
+slips alone this is a lower bound, what a robot has that keeps to this future (docs/uncertainty.md).
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from specshield.shield import shaping
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.feasibility import Futures, Prefix, rho_of
 from specshield.shield.judgement import Judged
-from specshield.shield.uncertainty import Care, Noise, costs_above
+from specshield.shield.uncertainty import Care, Noise, above, spread_of
 from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts
 from specshield.stl.tree import tree_value
 from specshield.task import Task, kept_with_task
 
-GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
+GRID = 1000  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
 
 def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: Bools) -> Floats:
@@ -108,41 +107,48 @@ def _chances(
     """Writes V of each motion (M,), which is zero where no future keeps the rule. begins (K,): the first step
     of each conjunct's window; a G of `parts` may begin before it.
     """
-    buffer = np.empty(leaves.shape[1])
+    count, spread = still.shape[0], spread_of(noise, stride)
+    buffer, late = np.empty(leaves.shape[1]), np.empty(motions.shape[1] + 2)
+    due, free, within = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
     for f in range(rho.shape[0]):
         if not rho[f] > SATISFIED_ABOVE:
             continue
         buffer[:] = leaves[f]
         tree_value(parts.below, buffer)
-        chance = 1.0
-        for k in range(still.shape[0]):
-            if still[k]:
-                chance *= 1.0 - _late(parts, begins[k], k, t, noise, stride, margin, buffer, motions[f], wait)
-            if still[k] and sigma > 0.0 and parts.kind[k] == ALWAYS:
+        chance, dwells = 1.0, 0
+        for k in range(count):
+            due[k] = 0
+            if not still[k]:
+                continue
+            due[k], free[k], within[k] = _deadline(parts, begins[k], k, t, margin, buffer)
+            if parts.kind[k] == EVENTUALLY and parts.horizon[k] > 0:
+                dwells = max(dwells, due[k])
+            if not parts.plain[k] and (noise.slips > 0.0 or spread > 0.0):
+                chance = 0.0
+            if sigma > 0.0 and parts.kind[k] == ALWAYS:
                 for step in range(max(begins[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
                     deep = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
                     chance *= 1.0 - math.exp(-0.5 * (deep / sigma) ** 2)
+        if chance > 0.0 and (noise.slips > 0.0 or spread > 0.0):
+            never = _in_time(noise, spread, False, due, free, within, motions[f], wait, dwells, late)
+            slips = _in_time(noise, spread, True, due, free, within, motions[f], wait, dwells, late)
+            chance *= (1.0 - noise.slips) * never + noise.slips * slips
         values[motions[f, 0]] = max(values[motions[f, 0]], chance)
 
 
 @leaf
-def _late(
-    parts: Conjuncts, a: int, k: int, t: int, noise: Noise, stride: float, margin: float, buffer: Floats,
-    motions: Ints, wait: int,
-) -> float:  # fmt: skip
-    """The probability that motions cost more steps than conjunct k, whose window begins at a, leaves free; 1
-    where that is not known.
+def _deadline(
+    parts: Conjuncts, a: int, k: int, t: int, margin: float, buffer: Floats
+) -> tuple[int, int, int]:
+    """What conjunct k, whose window begins at a, asks of a future: after how many of its motions the robot is
+    where it has to be, how many steps later that may be, and how many steps from t it has for it. The first
+    is 0 where nothing is asked.
 
-    An F is first kept by `margin`, or else by as little as it is, so many steps before its window ends. What
-    is below a G that has not begun holds from so many steps before it begins, and as many may be lost; one
-    that has begun has no deadline. A robot that is late leaves out waits just before it has to be there.
+    An F is first kept by `margin`, or else by as little as it is; what is below it may hold for some steps.
+    What is below a G that has yet to begin holds from some step before it begins; one that has begun has no
+    deadline.
     """
-    first, b = parts.at[k] - parts.a[k], parts.b[k]
-    if noise.slips <= 0.0 and noise.move <= 0.0 and noise.turn <= 0.0:
-        return 0.0
-    if not parts.plain[k]:
-        return 1.0
-    met = -1
+    first, b, met = parts.at[k] - parts.a[k], parts.b[k], -1
     if parts.kind[k] == EVENTUALLY:
         for step in range(a, b + 1):
             if buffer[first + step] > SATISFIED_ABOVE + margin:
@@ -150,25 +156,58 @@ def _late(
                 break
             if met < 0 and buffer[first + step] > SATISFIED_ABOVE:
                 met = step
-        free = b - met
-        if parts.horizon[k] == 0:  # else the robot may have to be there only after `met`
-            free += _waits_before(motions, wait, met - t)
-        return costs_above(noise, stride, b + parts.horizon[k] - t, free)
+        last = parts.horizon[k] - t
+        return met + last, b - met, b + last
     if a <= t:
-        return 0.0
+        return 0, 0, 0
     met = a
     while met > max(t, parts.a[k]) and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
         met -= 1
-    return costs_above(noise, stride, a - t, a - met + _waits_before(motions, wait, met - t))
+    return met - t, a - met, a - t
 
 
 @leaf
-def _waits_before(motions: Ints, wait: int, n: int) -> int:
-    """How many of the first n of a future's motions (T - t,) are waits with nothing but waits after them."""
-    waits = 0
-    while waits < n and motions[n - 1 - waits] == wait:
-        waits += 1
-    return waits
+def _in_time(
+    noise: Noise, spread: float, slips: bool, due: Ints, free: Ints, within: Ints, motions: Ints, wait: int,
+    dwells: int, late: Floats,
+) -> float:  # fmt: skip
+    """The probability that a robot which keeps to a future's motions (T - t,) is in time for all that is due.
+
+    due, free, within (K,): of `_deadline`. slips: whether motions slip. dwells: no wait among the first so
+    many motions is left out. late: scratch; the probability that the robot is so many steps late, and was in
+    time for all that was due before. It repeats what was not executed, and leaves out waits where it is late.
+    How likely the next motion is to slip follows from how often motions slipped and did not; what was made up
+    for by waits is forgotten there.
+    """
+    last, made, most = 0, 0, 1
+    for c in range(due.shape[0]):
+        if due[c] > 0:
+            last = max(last, due[c])
+            most = max(most, int(free[c] + 4.0 * spread * math.sqrt(within[c])) + 1)
+    most = min(most, late.shape[0] - 1)
+    for k in range(most + 1):
+        late[k] = 1.0 if k == 0 else 0.0
+    for n in range(1, last + 1):
+        if motions[n - 1] == wait:
+            if n > dwells:
+                late[0] += late[1]
+                for k in range(1, most):
+                    late[k] = late[k + 1]
+        elif slips:
+            again = 0.0
+            for k in range(most):
+                here = late[k] + again
+                again = here * (noise.lost + k) / (noise.lost + noise.kept + k + made)
+                late[k] = here - again
+            made += 1
+        for c in range(due.shape[0]):
+            if due[c] == n:
+                for k in range(most):
+                    late[k] *= 1.0 - above(free[c] - k, spread * math.sqrt(within[c]))
+    sure = 0.0
+    for k in range(most):
+        sure += late[k]
+    return sure
 
 
 def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float:
