@@ -130,7 +130,7 @@ def parts(shield: Shield, states: Sequence[State], repeats: int) -> dict[str, fl
     total, proposing, judging, prefixing = [], [], [], []
     for state in states:
         prefix = prefix_of(task, task.formula, shield.view, state.history, {})
-        tried = futures(prefix, shield.body, shield.proposers, None, 0.0)
+        tried = futures(prefix, shield.body, shield.proposers, None, (0.0,))
         total.append(ask(shield, state, repeats))
         proposing.append(quietest(lambda s=state: policy.propose(s.history, {}, 0.0), repeats))
         judging.append(quietest(lambda p=prefix, f=tried: simulated(p, shield.body, [f.motions], 0), repeats))

@@ -142,7 +142,7 @@ def _gather(gathered: _Gathered) -> None:
     shield, known, parts = gathered.shield, gathered.known, gathered.parts
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, known.history, known.signals)
     if prefix.steps > 0:
-        gathered.judge(futures(prefix, shield.body, shield.proposers, None, 0.0).motions)
+        gathered.judge(futures(prefix, shield.body, shield.proposers, None, (0.0,)).motions)
     gathered.judge(np.full((1, max(prefix.steps, 1)), calmest_motion(shield.body)))
     ground = make_ground(shield.task, shield.body, known.held)
     reader = Reader(known.now, known.constant)

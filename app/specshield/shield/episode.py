@@ -65,7 +65,7 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
     prefix = prefix_of(shield.task, shield.task.formula, shield.view, history, {})
     rho, warnings = np.array([prefix.low]), tuple[str, ...]()
     if shield.task.horizon > 0:  # else the first state says it all
-        tried = futures(prefix, shield.body, shield.proposers, way, shield.config.margin)
+        tried = futures(prefix, shield.body, shield.proposers, way, (shield.config.margin, 0.0))
         rho, warnings = tried.rho, tried.warnings
     best = float(rho.max(initial=-np.inf))
     if not best > SATISFIED_ABOVE:
@@ -135,7 +135,8 @@ def decide(
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
-    care = wary(shield.config, care, taught)
+    on_way = tail is not None and residual is not None and max(residual) <= SAME_POSE
+    care = replace(wary(shield.config, care, taught), on_way=on_way)
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin

@@ -110,21 +110,20 @@ class Futures:
 
 
 def futures(
-    prefix: Prefix, body: Body, proposers: Sequence[Proposer], tail: bytes | None, margin: float
+    prefix: Prefix, body: Body, proposers: Sequence[Proposer], tail: bytes | None, margins: Sequence[float]
 ) -> Futures:
     """Every future worth trying from x_t, t < T: the witness's tail, then what each proposer proposes.
 
     tail: motions from x_t to the horizon, one a byte, T - t of them, simulated anew from the pose there is.
+    margins: each proposer is asked for ways with each of them.
     """
     count, rows, warnings = len(prefix.task.robot.motions), list[Ints](), list[str]()
     if tail is not None and len(tail) == prefix.steps:
         rows.append(np.frombuffer(tail, np.uint8).astype(np.int64)[None])
     preferred = None
-    for each in (
-        (margin, 0.0) if margin > 0.0 else (0.0,)
-    ):  # what cannot be had with the margin may be without
+    for margin in dict.fromkeys(margins):  # what cannot be had with a margin may be without
         for proposer in proposers:
-            proposal, wrong = ask(proposer, prefix.poses, prefix.signals, each, count, prefix.steps)
+            proposal, wrong = ask(proposer, prefix.poses, prefix.signals, margin, count, prefix.steps)
             if proposal is None:
                 warnings.append(str(wrong))
                 continue

@@ -55,7 +55,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     """
     robot, asked = shield.task.robot, care.margin
     motions = len(robot.motions)
-    tried = futures(prefix, shield.body, shield.proposers, tail, asked)
+    tried = futures(prefix, shield.body, shield.proposers, tail, (asked, 0.0))
     kept, leaves = tried.rho, tried.leaves
     best, part, vain = best_of(tried, kept, motions), prefix, False
     left_out = np.zeros(motions, np.bool_)
@@ -74,7 +74,8 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     if lowered or (care.has_slack and _some(best)):
         follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
-        if aimed.slack > 0 and not violated and (~aimed.kept & (values > SATISFIED_ABOVE)).any():
+        left = ~aimed.kept & (values > SATISFIED_ABOVE)
+        if aimed.slack > 0 and care.on_way and not violated and True in left.tolist():
             tried = _in_time(shield, prefix, tried, asked, aimed.slack)
             kept = tried.rho
             if care.barred is not None and not vain:
@@ -110,7 +111,7 @@ def _in_time(shield: Shield, prefix: Prefix, tried: Futures, margin: float, step
     if not asked:
         return tried
     return replace(
-        together(tried, futures(prefix, shield.body, asked, None, margin)), preferred=tried.preferred
+        together(tried, futures(prefix, shield.body, asked, None, (margin,))), preferred=tried.preferred
     )
 
 

@@ -78,6 +78,7 @@ class Care:
     margin [m]; least [steps]: the slack of every deadline. noise: because of which more of it is asked for.
     stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice. barred
     [n, 6]: what no future goes by where another keeps the rule (robot/barred.py); None where nothing is.
+    on_way: whether the robot is where the last answer had it, on a way that keeps what was asked for then.
     """
 
     margin: float
@@ -86,6 +87,7 @@ class Care:
     stride: float = 1.0
     chance: float = CHANCE
     barred: Floats | None = None
+    on_way: bool = False
 
     @property
     def has_slack(self) -> bool:
