@@ -1,5 +1,7 @@
 """Margin and slack, worked out by hand on cells of 0.2 m (tests/shield/test_episode.py has the map)."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -160,3 +162,26 @@ def test_a_learned_policy_shares_a_way_that_keeps_the_margin_of_what_is_open():
     found = decide(make_shield([policy], Config(margin=0.05)), [cells.pose(2, 0, 1)], EVEN)
     assert (found.mode, found.reason) == ("shaped", None)
     assert list(found.j_values[:4]) == [1, 1, 1, 1]
+
+
+@pytest.mark.parametrize("slack", [1, 3])
+def test_on_its_way_a_robot_may_do_all_that_keeps_the_slack(slack):
+    """Every action after which some future of all there are meets the deadline as early as is answered."""
+
+    def early(steps):
+        return Cells("F[0,8] A", lambda inside: inside["A"][..., : 9 - steps].any(-1), {"A": (2, 2)})
+
+    worlds = [early(steps) for steps in range(slack + 1)]
+    shield = make_shield([reachability.synthesise(worlds[0].task)], Config(slack=slack))
+    random, allowed = np.random.default_rng(0), Counter()
+    for start in [(0, 0, 0), (0, 0, 1), (0, 2, 2), (2, 0, 3)] * 4:
+        history, carry = [worlds[0].pose(*start)], None
+        while len(history) < 9 and worlds[0].state(history[-1])[:2] != (2, 2):
+            found = decide(shield, history, EVEN, carry=carry)
+            if carry is not None:
+                expected = worlds[found.slack].feasible(history)
+                assert list(found.j_values[:4]) == expected.tolist()
+                allowed[expected.sum()] += 1
+            motion = int(random.choice(np.flatnonzero(found.j_values[:4])))
+            history, carry = [*history, found.next_poses[motion]], found.carry
+    assert min(allowed[1], sum(allowed.values()) - allowed[1]) > 5

@@ -135,8 +135,8 @@ def decide(
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
-    on_way = tail is not None and residual is not None and max(residual) <= SAME_POSE
-    care = replace(wary(shield.config, care, taught), on_way=on_way)
+    foreseen = residual is not None and max(residual) <= SAME_POSE
+    care = wary(shield.config, care, taught, foreseen and tail is not None)
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
@@ -154,9 +154,9 @@ def decide(
             taught, (shield, prefix, judged, withstands) = believed
             said = (*said, "no other way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
-        doubts = doubtful(told, taught, judged.part, nexts) | judged.left_out
+        doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)
         judged = recovered(told, shield, taught, judged, prefix, tail, spec_status, care)
-        judged = without(judged, shield, doubts)
+        judged = without(judged, shield, doubts, risky)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             before = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)

@@ -115,17 +115,26 @@ def _in_time(shield: Shield, prefix: Prefix, tried: Futures, margin: float, step
     )
 
 
-def without(judged: Judged, shield: Shield, doubtful: Bools) -> Judged:
-    """Without the motions [M] that are doubtful, unless no other is feasible."""
+def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Judged:
+    """Without the motions [M] that are doubtful, unless no other is feasible; then without those of them that
+    are risky, unless no other keeps the rule, with however little slack and margin.
+    """
     if True not in doubtful.tolist():
         return judged
     robot, sure = shield.task.robot, judged.feasible_motion & ~doubtful
-    if not sure.any() or sure.sum() == judged.feasible_motion.sum():
+    if not sure.any():
+        sure = judged.feasible_motion & ~risky
+    if not sure.any() and judged.part.formula is shield.task.formula:
+        keeps = best_of(judged.tried, judged.tried.rho, len(risky))
+        sure = (keeps.robustness > SATISFIED_ABOVE) & ~doubtful
+        if sure.any():
+            judged = replace(judged, best=keeps, margin=0.0, slack=0)
+    if not sure.any() or np.array_equal(sure, judged.feasible_motion):
         return judged
     completion = judged.completion
     if not sure[robot.motion_of[completion]]:
         completion = int(robot.representative[np.argmax(np.where(sure, judged.best.robustness, -np.inf))])
-    feasible = judged.feasible & np.append(sure, False)[robot.motion_of]
+    feasible = (robot.motion_of >= 0) & sure[robot.motion_of]
     return replace(judged, feasible_motion=sure, feasible=feasible, completion=completion)
 
 

@@ -167,8 +167,11 @@ def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tupl
     return half, overlap(body, after[0], after[1], after[2]) > UNDER
 
 
-def wary(config: Config, care: Care, taught: Taught) -> Care:
-    """What J asks for where the map may be wrong: time for a way around, and not by what led nowhere."""
+def wary(config: Config, care: Care, taught: Taught, on_way: bool) -> Care:
+    """What J asks for where the map may be wrong: time for a way around, and not by what led nowhere. on_way:
+    as `Care` has it.
+    """
+    care = replace(care, on_way=on_way)
     if not config.learn_map:
         return care
     least = care.least if config.uncertainty is None else max(care.least, AROUND)
@@ -180,16 +183,19 @@ def changes_map(learned: bytes | None) -> bool:
     return learned is not None and len(learned) > HEAD.size
 
 
-def doubtful(told: Shield, taught: Taught, prefix: Prefix, nexts: Floats) -> Bools:
-    """[M]: the motions from x_t that lead elsewhere if contacts are believed than if they are not, those that
-    would break what the prefix asks for if nothing stopped them short, and those that led nowhere before.
+def doubtful(
+    told: Shield, taught: Taught, prefix: Prefix, nexts: Floats, left_out: Bools
+) -> tuple[Bools, Bools]:
+    """The motions [M] from x_t that lead elsewhere if contacts are believed than if they are not, those that
+    would break what the prefix asks for if nothing stopped them short, those that led nowhere before, and
+    those left out [M] already; and of all these the ones that would break it [M].
 
     told: the shield on the policy's map. nexts [M, 3]: where f leads on the session's own. A motion that only
     a mark stops may go on in truth; and what is on the map may stand a little elsewhere, so no motion is kept
     out of a forbidden place by that alone.
     """
     known, motions, pose = taught.map, len(nexts), prefix.poses[-1]
-    doubts, config = np.zeros(motions, np.bool_), told.config
+    doubts, risky, config = left_out.copy(), np.zeros(motions, np.bool_), told.config
     if len(known) and (marks := known.occupied & (known.by != SENT)).any():
         ends = np.empty((2, motions, 3))
         for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
@@ -200,12 +206,13 @@ def doubtful(told: Shield, taught: Taught, prefix: Prefix, nexts: Floats) -> Boo
         (far, turn), (dx, dy) = displacements(told.body), (nexts[:, :2] - pose[:2]).T
         stopped = np.abs(np.hypot(dx, dy) - np.abs(far)) > SAME_PLACE
         stopped |= (turn != 0.0) & (nexts[:, 2] == theta)
-        for motion in np.flatnonzero(stopped & ~doubts).tolist():
+        for motion in np.flatnonzero(stopped).tolist():
             places = _farther(told.body, pose, motion, nexts[motion])
-            doubts[motion] = any(not prefix.allows(place) for place in places)
+            risky[motion] = any(not prefix.allows(place) for place in places)
+        doubts |= risky
     if len(taught.barred):
         doubts |= [is_barred(taught.barred, x, y, theta, motion) for motion in range(motions)]
-    return doubts
+    return doubts, risky
 
 
 def _farther(body: Body, pose: Floats, motion: int, end: Floats) -> Iterator[Floats]:

@@ -87,21 +87,20 @@ class ReachabilityPolicy:
         guess: whether the map is one of several that are tried in one decision. Where a short search for a
         way around gives up, nothing else is tried then.
         """
-        other = replace(self, told=False, guess=guess)
-        other.__dict__.update(_body=body, _rules=self._rules, _goals=self._goals, _far=self._far)
-        return other
+        return self._but(body, told=False, guess=guess)
 
     def avoiding(self, barred: Floats) -> ReachabilityPolicy:
         """The policy for a robot that some motions led nowhere. barred [n, 6]: as `Guide` has it."""
-        return self._alike(replace(self, barred=barred))
+        return self._but(self._body, barred=barred)
 
     def earlier(self, steps: int) -> ReachabilityPolicy:
         """The policy for deadlines that come so many steps earlier; the same for a robot that cannot wait."""
-        return self._alike(replace(self, early=steps))
+        return self._but(self._body, early=steps)
 
-    def _alike(self, other: ReachabilityPolicy) -> ReachabilityPolicy:
-        """`other`, on the same map."""
-        other.__dict__.update(_body=self._body, _rules=self._rules, _goals=self._goals, _far=self._far)
+    def _but(self, body: Body, **changed: Any) -> ReachabilityPolicy:
+        """The policy with these fields changed, on this map."""
+        other = replace(self, **changed)
+        other.__dict__.update(_body=body, _rules=self._rules, _goals=self._goals, _far=self._far)
         return other
 
     @cached_property
