@@ -33,7 +33,7 @@ from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts
 from specshield.stl.tree import tree_value
 from specshield.task import Task, kept_with_task
 
-GRID = 1000  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
+GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
 
 def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: Bools) -> Floats:
