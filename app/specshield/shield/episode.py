@@ -39,6 +39,7 @@ from specshield.shield.judgement import (
 )
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.doubt import recovered, tried_again
+from specshield.shield.surprise.slip import with_begun
 from specshield.shield.taught import doubtful, handed_on, on_map, teach, wary
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
@@ -132,11 +133,12 @@ def decide(
     nexts = np.empty((len(robot.motions), 3))
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses, task.horizon - t, len(robot.motions))
+    before, shield = shield, with_begun(shield, carry, poses)
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
     foreseen = residual is not None and max(residual) <= SAME_POSE
-    care = wary(shield.config, care, taught, foreseen and tail is not None)
+    care = wary(shield.config, care, taught, shield is not before or (foreseen and tail is not None))
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = _verdict(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin

@@ -1,0 +1,47 @@
+"""What a robot that has slipped goes on with: the way that it had begun, from its beginning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from specshield.arrays import Floats, Ints
+from specshield.shield.decision import Carry, Shield
+from specshield.shield.proposal import Proposal
+from specshield.task import Task
+
+SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Proposes one way, motions [T - t]."""
+
+    task: Task
+    motions: Ints
+    id = "the way that was begun"
+
+    def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
+        return Proposal(self.motions[None], int(self.motions[0]))
+
+
+def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:
+    """The shield with what proposes the certified way of the action that was drawn last, where the robot
+    stands where it stood though that action leads elsewhere. The same shield where it has moved, or its
+    motions are taken to be exact. poses [t + 1, 3].
+    """
+    task, uncertain = shield.task, shield.config.uncertainty is not None
+    if not uncertain or carry is None or carry.t != len(poses) - 2 or carry.action is None:
+        return shield
+    motion = int(task.robot.motion_of[carry.action])
+    way = carry.witnesses[motion] if motion >= 0 else None
+    if not way or not _is_at(poses[-1], poses[-2]) or _is_at(poses[-1], carry.next_poses[motion]):
+        return shield
+    again = Begun(task, np.frombuffer(bytes([motion]) + way[:-1], np.uint8).astype(np.int64))
+    return replace(shield, proposers=(*shield.proposers, again))
+
+
+def _is_at(one: Floats, other: Floats) -> bool:
+    return bool(np.abs(one - other).max() <= SAME_POSE)
