@@ -322,7 +322,7 @@ def test_a_motion_that_goes_on_where_f_stops_it_is_no_noise_and_is_not_relied_on
     assert [len(each.carry.stuck) for each in found] == [1, 0, 1]
     assert found[0].carry.stuck[0] == (*START, motion)
     seen = [Seen(*FORMAT.unpack(each.carry.residuals)) for each in found]
-    assert [(each.moved, each.lost) for each in seen] == [(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)]
+    assert [(each.noisy, each.lost) for each in seen] == [(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)]
     bars = barred_by(found[0].carry.stuck, (0.0, 0.0))
     near = [is_barred(bars, START[0] + off, 1.0, math.radians(turn), motion) for off, turn in
             [(0.04, 10.0), (0.06, 0.0), (0.0, 14.0)]]  # fmt: skip

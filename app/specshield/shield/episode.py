@@ -160,8 +160,8 @@ def decide(
         judged = recovered(told, shield, taught, judged, prefix, tail, spec_status, care)
         judged = without(judged, shield, doubts, risky)
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
-            before = shield.preference.begin() if memory is None else memory
-            memory, weights = shield.preference.step(before, poses, signals, log_prior, judged.feasible)
+            known = shield.preference.begin() if memory is None else memory
+            memory, weights = shield.preference.step(known, poses, signals, log_prior, judged.feasible)
         if shield.config.threshold_over == "episode" and spec_status == "pending":
             chance = chances(shield, care, prefix, judged, doubts)
             left = left_of(shield, carry, chance)
@@ -179,7 +179,9 @@ def decide(
     margin, slack = (care.margin, care.least) if judged is None else (judged.margin, judged.slack)
     remembered = None
     if seen is not None:
-        remembered = remember(shield, seen, answer.distribution, moved, nexts, poses[-1])
+        follows = shield.config.learn_map and taught.followed.follows
+        done = np.eye(len(robot.actions))[action] if follows else answer.distribution
+        remembered = remember(shield, seen, done, moved, nexts, poses[-1])
     return Decision(
         t=t,
         mode=answer.mode,

@@ -78,9 +78,10 @@ def learn(
     seen = Seen() if carry is None or carry.residuals is None else Seen(*FORMAT.unpack(carry.residuals))
     if carry is not None and carry.t == t - 1 and not contact:
         found = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
-        lost = config.learn_map and found.lost > seen.lost
-        if lost and in_collision(shield.body._replace(radius=shield.body.radius + BESIDE), *poses[-1]):
-            found = seen._replace(slipping=found.slipping)  # it may have met what it stands beside
+        beside = shield.body._replace(radius=shield.body.radius + BESIDE)
+        if config.learn_map and found.moved > seen.moved and in_collision(beside, *poses[-2]):
+            # It may have met what it stood beside: there, neither what failed nor what worked counts.
+            found = found._replace(moved=seen.moved, lost=seen.lost, odds=seen.odds)
         seen = found
     noise = noise_of(told, seen)
     stride, deadlines = _measures(shield.task)
@@ -128,8 +129,8 @@ def _measures(task: Task) -> tuple[float, int]:
 def remember(
     shield: Shield, seen: Seen, distribution: Floats, moved: int, nexts: Floats, pose: Floats
 ) -> bytes:
-    """What is handed on. distribution [A]: the answer; moved: what is executed for a terminal action; nexts
-    [M, 3]: where f leads from the pose (3,).
+    """What is handed on. distribution [A]: of what the robot does, as far as that is known; moved: what is
+    executed for a terminal action; nexts [M, 3]: where f leads from the pose (3,).
     """
     standing = _standing(
         shield.task.robot.motion_of, distribution, int(shield.task.robot.motion_of[moved]), nexts, pose
