@@ -66,13 +66,16 @@ class Watchers:
         """Looks at the sessions that are watched, until it is cancelled."""
         for number in itertools.count():
             feeds = list(self._feeds.values())
-            for part in range(PARTS):
-                await asyncio.sleep(EVERY / PARTS)
+            parts = min(PARTS, len(feeds))
+            if not parts:  # a process that wakes between steps makes them dearer
+                await asyncio.sleep(EVERY)
+            for part in range(parts):
+                await asyncio.sleep(EVERY / parts)
                 all = (number + part) % SELDOM == 0
                 await self._idle()
                 elsewhere = time.monotonic() - HERE
                 try:
-                    await self._look([feed for feed in feeds[part::PARTS] if all or feed.here < elsewhere])
+                    await self._look([feed for feed in feeds[part::parts] if all or feed.here < elsewhere])
                 except SpecshieldError:
                     pass  # the store is away: what is missed is read when it is back
                 except Exception:
