@@ -66,7 +66,7 @@ class Application:
 
     def __init__(self, routes: FastAPI, settings: Settings) -> None:
         self.routes = routes
-        steps = StreamRoute(StepRoute(routes), settings.max_body_bytes)
+        steps = StepRoute(StreamRoute(routes, settings.max_body_bytes))
         # Nothing is read for who may not ask.
         self._around = Observe(Guard(Bodies(steps, settings), settings.hosts))
 
@@ -130,20 +130,9 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     own = None if settings.api_key is None else settings.api_key.get_secret_value()
     keys, gauges = Keys(store.redis, own), Gauges(store, jobs)
     server = Server(
-        settings,
-        store,
-        library,
-        known,
-        sessions,
-        jobs,
-        gauges,
-        watchers,
-        worker,
-        startup,
-        heavy,
-        keys,
+        settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy, keys,
         claims,
-    )
+    )  # fmt: skip
     body.clear(settings.data_dir / "incoming")
     app.state.server = server
     server.streams.close_at_stop()  # which comes when what follows has drained

@@ -24,10 +24,13 @@ from specshield import compiled
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
-KERNELS = 217  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
+KERNELS = 223  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 85  # [s] that a first start took on two quiet cores: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
+# [objects] more than there were, at which a collection looks for cycles among them. With Python's 700 it took
+# 18 us of a step and found none, with this 4 (gc.callbacks under `benchmarks.step_cost --robots 16`).
+YOUNG = 7_000
 log = logging.getLogger("specshield")
 
 
@@ -87,6 +90,8 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
             await _compile(startup, mark)
         for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here
             await asyncio.to_thread(warmup.warm_up, part)
+        gc.freeze()  # what the kernels brought stays too
+        gc.set_threshold(YOUNG, 10, 10)
         while not await asyncio.to_thread(_passes, check):
             await asyncio.sleep(CHECK_EVERY)
         startup.ready = True

@@ -27,6 +27,7 @@ from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, motion_count
 from specshield.rule.progress import make_rules
+from specshield.service.sessions import record
 from specshield.shield import episode
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.surprise.contact import cells_met
@@ -68,6 +69,7 @@ def _decide(task: Task) -> None:
         shield = make_shield([policy], config)
         episode.start(shield, START)
         first = episode.decide(shield, [START], logits)
+        record.make(first, np.array(START), b"", START, logits, False, {}, (), False)
         second = [START, first.next_poses[0].tolist()]
         carry = replace(first.carry, stuck=((*START, 0),))
         episode.decide(shield, second, logits, carry=carry, occupied=[[1.9, 0.5]], explain=explanations)

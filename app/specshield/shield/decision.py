@@ -9,6 +9,7 @@ from typing import Literal
 
 from specshield.arrays import Floats
 from specshield.errors import InputError, PolicyError
+from specshield.quick import quick
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.early import Conjuncts, conjunction_of
 from specshield.rule.view import View, view_of
@@ -55,11 +56,9 @@ class Config:
     def __post_init__(self) -> None:
         if self.evaluation not in ("feasibility", "robustness"):
             raise InputError(
-                "unknown evaluation",
-                path="evaluation",
-                got=self.evaluation,
+                "unknown evaluation", path="evaluation", got=self.evaluation,
                 expected="'feasibility' or 'robustness'",
-            )
+            )  # fmt: skip
         binary = self.evaluation == "feasibility"
         if not math.isfinite(self.threshold) or (binary and not 0.0 < self.threshold <= 1.0):
             raise InputError(
@@ -81,13 +80,12 @@ class Config:
             )  # fmt: skip
         if self.map_memory is not None and self.map_memory < 1:
             raise InputError(
-                "the map's memory is out of range",
-                path="map_memory",
-                got=self.map_memory,
+                "the map's memory is out of range", path="map_memory", got=self.map_memory,
                 expected="1 or more steps, or null for ever",
-            )
+            )  # fmt: skip
 
 
+@quick
 @dataclass(frozen=True)
 class Shield:
     """A task, the policies that propose futures for it and a session's settings, prepared once.
@@ -139,20 +137,16 @@ def make_shield(
                 got=policy.task.content_hash, expected=f"task {task.content_hash}, as policy_ids[0]",
             )  # fmt: skip
     return Shield(
-        task,
-        tuple(proposers),
-        config or Config(),
-        make_body(task.robot, task.grid),
-        view_of(task, task.formula),
-        conjunction_of(task, task.formula),
-        preference,
-    )
+        task, tuple(proposers), config or Config(), make_body(task.robot, task.grid),
+        view_of(task, task.formula), conjunction_of(task, task.formula), preference,
+    )  # fmt: skip
 
 
 # A pose, and a motion that led nowhere from it; ~motion where it did nothing and may only have slipped.
 Stuck = tuple[float, float, float, int]
 
 
+@quick
 @dataclass(frozen=True)
 class Carry:
     """What one decision hands to the next: each motion's next pose and its certified continuation.
@@ -192,6 +186,7 @@ class Explanation:
     detail: str | None = None
 
 
+@quick
 @dataclass(frozen=True)
 class Decision:
     """The answer to one step; A actions. The fields are those of the HTTP contract.

@@ -20,6 +20,7 @@ from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.portable import exp
+from specshield.quick import quick
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
 from specshield.robot.oddity import oddities
 from specshield.shield import shaping
@@ -104,17 +105,10 @@ def close(
 
 
 def decide(
-    shield: Shield,
-    history: ArrayLike,
-    logits: ArrayLike | None,
-    main_task_done: bool = False,
-    signals: Signals | None = None,
-    carry: Carry | None = None,
-    witnesses: bool = False,
-    occupied: ArrayLike | None = None,
-    free: ArrayLike | None = None,
-    explain: Explainer | None = None,
-) -> Decision:
+    shield: Shield, history: ArrayLike, logits: ArrayLike | None, main_task_done: bool = False,
+    signals: Signals | None = None, carry: Carry | None = None, witnesses: bool = False,
+    occupied: ArrayLike | None = None, free: ArrayLike | None = None, explain: Explainer | None = None,
+) -> Decision:  # fmt: skip
     """One decision of Algorithm 1, at t = len(history) - 1.
 
     history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main
@@ -130,7 +124,8 @@ def decide(
     taught, said = teach(shield, carry, poses, occupied, free)
     said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)), *said)
     told, shield = shield, on_map(shield, taught.map, barred=taught.barred)
-    nexts = np.empty((len(robot.motions), 3))
+    places = np.empty((len(robot.motions) + 1, 3))  # where each motion leads, and x_t, where what ends does
+    nexts, places[-1] = places[:-1], poses[-1]
     touches = _look_around(shield.body, poses[-1], nexts)
     tail, residual = _follow(carry, poses, task.horizon - t, len(robot.motions))
     before, shield = shield, with_begun(shield, carry, poses)
@@ -196,7 +191,7 @@ def decide(
         kl=None if log_prior is None else shaping.divergence(answer.distribution, log_prior),
         reason=answer.reason,
         finished=(spec_status != "pending" and main_task_done) or t >= shield.max_steps,
-        next_poses=np.where(robot.terminal[:, None], poses[-1], nexts[robot.motion_of]),
+        next_poses=places[robot.motion_of],
         residual=residual,
         in_collision=touches,
         witness=as_actions(shield, certified, moved),
@@ -211,19 +206,15 @@ def decide(
         any_signal=withstands if shield.config.any_signal and task.signals else None,
         explanations=explain(shield, prefix, judged, doubts) if explain is not None else (),
         carry=Carry(
-            t,
-            nexts,
-            certified,
-            memory,
-            residuals=remembered,
+            t, nexts, certified, memory, residuals=remembered,
             threshold_left=left if shield.config.threshold_over == "episode" else None,
-            learned=handed_on(shield, taught, int(robot.motion_of[moved])),
-            action=action,
+            learned=handed_on(shield, taught, int(robot.motion_of[moved])), action=action,
             stuck=taught.stuck,
         ),
-    )
+    )  # fmt: skip
 
 
+@quick
 @dataclass(frozen=True)
 class _Answer:
     """conditional [A]: the model's log-probabilities given that it does not end, None where it does."""
@@ -252,10 +243,9 @@ def _answer(
     if main_task_done or log_prior is None:
         mode: Mode = "completion" if any_feasible else "fallback"
         return _Answer(certified, mode, said if any_feasible else "infeasible", conditional)
-    prior = exp(log_prior)
     mode = "shaped" if any_feasible else "fallback"
     if conditional is None:  # the model ends for certain
-        return _Answer(prior, mode, None if any_feasible else "infeasible")
+        return _Answer(exp(log_prior), mode, None if any_feasible else "infeasible")
     config, attainable = shield.config, any_feasible
     if config.evaluation == "robustness":
         shaped = shaping.tilt(conditional, judged.values, config.threshold)
@@ -272,7 +262,7 @@ def _answer(
         reason = "zero_prior_mass" if attainable else "infeasible"
     mode = "fallback" if shaped is None else "shaped"
     body = certified if shaped is None else shaped
-    return _Answer(np.where(terminal, prior, (1.0 - ending) * body), mode, reason, conditional)
+    return _Answer(shaping.with_ending(body, log_prior, ending, terminal), mode, reason, conditional)
 
 
 def _unmodified(shield: Shield, log_prior: Floats | None) -> _Answer:
@@ -325,10 +315,11 @@ def _follow(
         return way, None
     gap = np.empty(len(carry.next_poses))
     off = _gaps(carry.next_poses, poses[-1], gap)
-    near = gap.min() + SAME_POSE  # a blocked move leads where waiting does
-    fits = zip(carry.witnesses, gap.tolist(), strict=True)
-    tail = next((witness for witness, far in fits if far <= near and witness is not None), None)
-    return way or tail or None, off
+    near = off[0] + off[1] + SAME_POSE  # a blocked move leads where waiting does
+    for witness, far in zip(carry.witnesses, gap.tolist(), strict=True):
+        if far <= near and witness:
+            return way or witness, off
+    return way or None, off
 
 
 @leaf
@@ -352,4 +343,5 @@ def _draw(distribution: Floats, seed: int, t: int) -> int:
     shares = distribution.tolist()
     edges = list(accumulate(shares))
     point = int.from_bytes(drawn, "big") / 2.0**64 * edges[-1]
-    return min(bisect_right(edges, point), max(a for a, share in enumerate(shares) if share != 0.0))
+    found = bisect_right(edges, point)
+    return found if found < len(edges) else max(a for a, share in enumerate(shares) if share != 0.0)

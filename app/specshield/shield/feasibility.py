@@ -15,6 +15,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, kernel
+from specshield.quick import quick
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
 from specshield.rule.progress import signal_rows
 from specshield.rule.view import View, look, rate, read_step, recall_prefix, value_count, view_of
@@ -29,6 +30,7 @@ SLOTS = 8  # remembered motions for each step of a future: enough that few share
 NOT_FINITE = "the formula's arithmetic is not finite along some futures; these certify nothing"
 
 
+@quick
 @dataclass(frozen=True)
 class Prefix:
     """What was driven, and what it says of a formula: rho lies in [low, high] however it goes on.
@@ -91,6 +93,7 @@ def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: 
     return Prefix(task, formula, poses, signals, rows, view, known, low, high, rows[-1:])
 
 
+@quick
 @dataclass(frozen=True)
 class Futures:
     """The futures that were tried at one step, several a motion, as the shield itself simulated them.
@@ -141,7 +144,7 @@ def simulated(
     prefix: Prefix, body: Body, rows: Sequence[Ints], preferred: int, warnings: Sequence[str] = ()
 ) -> Futures:
     """The futures of these motions, [n, T - t] each, all within range: simulated and judged in one pass."""
-    motions = np.concatenate([np.empty((0, prefix.steps), np.int64), *rows]) if len(rows) != 1 else rows[0]
+    motions = np.concatenate(rows) if len(rows) > 1 else [*rows, np.empty((0, prefix.steps), np.int64)][0]
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
     leaves = np.empty((len(motions), prefix.view.tree.size))
     violated = (
@@ -158,13 +161,10 @@ def simulated(
 def together(tried: Futures, more: Futures) -> Futures:
     """Both, as `more` prefers."""
     return Futures(
-        np.concatenate([tried.motions, more.motions]),
-        np.concatenate([tried.poses, more.poses]),
-        np.concatenate([tried.rho, more.rho]),
-        np.concatenate([tried.leaves, more.leaves]),
-        more.preferred,
+        np.concatenate([tried.motions, more.motions]), np.concatenate([tried.poses, more.poses]),
+        np.concatenate([tried.rho, more.rho]), np.concatenate([tried.leaves, more.leaves]), more.preferred,
         tuple(dict.fromkeys([*tried.warnings, *more.warnings])),
-    )
+    )  # fmt: skip
 
 
 def rho_of(prefix: Prefix, tried: Futures) -> tuple[Floats, Floats]:
@@ -178,19 +178,9 @@ def rho_of(prefix: Prefix, tried: Futures) -> tuple[Floats, Floats]:
 
 @kernel
 def _simulate_and_rate(
-    body: Body,
-    view: View,
-    known: Floats,
-    t: int,
-    pose: Floats,
-    held: Floats,
-    wait: int,
-    gives_up: bool,
-    motions: Ints,
-    poses: Floats,
-    rho: Floats,
-    leaves: Floats,
-) -> bool:
+    body: Body, view: View, known: Floats, t: int, pose: Floats, held: Floats, wait: int, gives_up: bool,
+    motions: Ints, poses: Floats, rho: Floats, leaves: Floats,
+) -> bool:  # fmt: skip
     """Simulates each row of motions (N, T - t) from x_t, pose (3,), and computes rho (N,) of the joint
     trajectory; poses (N, T - t, 3) and leaves (N, tree.size) are written. False where the arithmetic was not
     finite on some row.
@@ -249,6 +239,7 @@ def _is_pose(pose: Floats, x: float, y: float, theta: float) -> bool:
     return bool(pose[0] == x and pose[1] == y and pose[2] == theta)
 
 
+@quick
 @dataclass(frozen=True)
 class Best:
     """The most robust future of each motion.

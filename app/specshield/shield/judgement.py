@@ -9,8 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from specshield.arrays import Bools, Floats, Ints
-from specshield.compiled import kernel
+from specshield.arrays import Bools, Bytes, Floats, Ints
+from specshield.compiled import kernel, leaf
+from specshield.quick import quick
 from specshield.robot.barred import in_vain
 from specshield.rule.residual import again, joined, left_over
 from specshield.shield import shaping
@@ -23,6 +24,7 @@ from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
 
 
+@quick
 @dataclass(frozen=True)
 class Judged:
     """The actions' futures at one step."""
@@ -233,9 +235,19 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
     """Each motion's certified continuation, as the motions that follow it."""
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
-    rows = judged.tried.motions[judged.best.row, 1:].astype(np.uint8)
-    content, n, feasible = rows.tobytes(), rows.shape[1], judged.feasible_motion.tolist()
+    motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()
+    rows, n = np.empty((len(feasible), motions.shape[1] - 1), np.uint8), motions.shape[1] - 1
+    _take_rests(motions, judged.best.row, rows)
+    content = rows.tobytes()
     return tuple([content[m * n : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
+
+
+@leaf
+def _take_rests(motions: Ints, row: Ints, rests: Bytes) -> None:
+    """Writes rows [M] of motions [N, T - t] into rests [M, T - t - 1], without the first motion of each."""
+    for m in range(rests.shape[0]):
+        for k in range(rests.shape[1]):
+            rests[m, k] = motions[row[m], k + 1]
 
 
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
@@ -250,9 +262,19 @@ def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ..
     if judged is None:
         return (None,) * len(robot.actions)
     if shield.config.evaluation == "feasibility":
-        highest = 1.0 if judged.some else 0.0
-        return tuple(np.where(robot.terminal, highest, judged.feasible).tolist())
+        values = np.empty(len(robot.actions))
+        _write_j(robot.terminal, judged.feasible, values)
+        return tuple(values.tolist())
     return _as_numbers(np.where(robot.terminal, judged.values.max(), judged.values))
+
+
+@leaf
+def _write_j(terminal: Bools, feasible: Bools, values: Floats) -> None:
+    some = False
+    for a in range(values.shape[0]):
+        some = some or feasible[a]
+    for a in range(values.shape[0]):
+        values[a] = 1.0 if feasible[a] or (terminal[a] and some) else 0.0
 
 
 def robustness_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:

@@ -16,12 +16,14 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel
+from specshield.quick import quick
 from specshield.task import Task
 
 MAX_MOTIONS = 1_000_000  # in one proposal, all rows together: 32 MB while they are simulated
 log = logging.getLogger("specshield")
 
 
+@quick
 @dataclass(frozen=True)
 class Proposal:
     """Futures to the horizon, usually one after each first motion.

@@ -36,11 +36,9 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
         if main_task_done:
             return None
         raise LogitsError(
-            "logits are missing",
-            path="logits",
-            got=None,
+            "logits are missing", path="logits", got=None,
             expected=f"{n} numbers; null once main_task_done is true",
-        )
+        )  # fmt: skip
     array = np.asarray(logits, dtype=np.float64)
     if array.shape != (n,):
         raise LogitsError(
@@ -49,14 +47,12 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
             expected=f"{n}, one for each of {', '.join(robot.action_names)}",
         )  # fmt: skip
     i = _wrong(array)
-    if i >= 0:
+    if 0 <= i < n:
         raise LogitsError(
-            "a logit is NaN or +infinity",
-            path=f"logits[{i}]",
-            got=str(array[i]),
+            "a logit is NaN or +infinity", path=f"logits[{i}]", got=str(array[i]),
             expected="a number, or null for -inf",
-        )
-    if array.max() == -np.inf:
+        )  # fmt: skip
+    if i == n:
         raise LogitsError(
             "every logit is null", path="logits", got="all null", expected="at least one finite logit"
         )
@@ -65,11 +61,13 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
 
 @leaf
 def _wrong(logits: Floats) -> int:
-    """The first that is NaN or +infinity, -1 where none is."""
+    """The first that is NaN or +infinity, else -1, or how many there are where all are -infinity."""
+    ruled_out = 0
     for i in range(logits.shape[0]):
         if math.isnan(logits[i]) or logits[i] == math.inf:
             return i
-    return -1
+        ruled_out += logits[i] == -math.inf
+    return ruled_out if ruled_out == logits.shape[0] else -1
 
 
 @kernel
@@ -86,6 +84,16 @@ def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats | None, float]:
     if np.max(kept) == -np.inf:
         return None, ending
     return log_softmax(kept), ending
+
+
+@kernel
+def with_ending(body: Floats, log_prior: Floats, ending: float, terminal: Bools) -> Floats:
+    """`body`, for if the model does not end, with the prior's own mass on what ends its task. Shapes (A,)."""
+    whole = (1.0 - ending) * body
+    for a in range(len(whole)):
+        if terminal[a]:
+            whole[a] = np.exp(log_prior[a])
+    return whole
 
 
 @kernel

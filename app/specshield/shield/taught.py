@@ -10,8 +10,7 @@ import math
 import struct
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
 from threading import Lock
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
+from specshield.quick import quick
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
 from specshield.shield.caution.experience import was_stopped, went_on, within_noise
@@ -39,6 +39,7 @@ from specshield.shield.uncertainty import Care
 from specshield.world.learned import (
     BEHIND,
     CONTACT,
+    NONE,
     SENT,
     LearnedMap,
     applied,
@@ -59,8 +60,10 @@ KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 
 
 HEAD = struct.Struct("<h?hB")  # what `Followed` holds
 MOST_MET = 255  # contacts at one pose that HEAD can hold
+NOTHING_BARRED, NEVER_DRAWN = np.empty((0, 6)), Followed()
 
 
+@quick
 @dataclass(frozen=True)
 class Taught:
     """What a session has learned: its map, and how its caller follows what is drawn.
@@ -70,20 +73,21 @@ class Taught:
     handed on beside the bytes. near: how far apart two poses are that may be one.
     """
 
-    map: LearnedMap = field(default_factory=LearnedMap)
-    followed: Followed = field(default_factory=Followed)
+    map: LearnedMap = NONE
+    followed: Followed = NEVER_DRAWN
     contact: bool = False
     stuck: tuple[Stuck, ...] = ()
     near: Near = NEAR
 
-    @cached_property
+    @property
     def barred(self) -> Floats:
         """[n, 6]: what no future goes by where another keeps the rule."""
-        return barred_by(self.stuck, self.near)
+        return barred_by(self.stuck, self.near) if self.stuck else NOTHING_BARRED
 
-    def to_bytes(self) -> bytes:
-        known = self.followed
-        head = HEAD.pack(known.drawn, known.follows, known.halted, min(known.met, MOST_MET))
+    def to_bytes(self, drawn: int | None = None) -> bytes:
+        """drawn: the motion that was drawn since; None: none was."""
+        known, met = self.followed, min(self.followed.met, MOST_MET)
+        head = HEAD.pack(known.drawn if drawn is None else drawn, known.follows, known.halted, met)
         return head + self.map.to_bytes()
 
     @staticmethod
@@ -120,7 +124,7 @@ def teach(
         motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, halts > 0)
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses, halts):
             motion, followed = -1, replace(followed, halted=motion, met=0)
-        if motion < 0:
+        if motion < 0 and not (drawn >= 0 and is_near(carry.next_poses[drawn : drawn + 1], poses[-1], near)):
             on = went_on(body, poses[-2], carry.next_poses, poses[-1], near)
         if motion >= 0 or (halts > 0 and came_back and followed.halted == drawn):
             # Slips come in a row; what does nothing, and again once the robot is back, did not slip.
@@ -175,7 +179,8 @@ def wary(config: Config, care: Care, taught: Taught, on_way: bool) -> Care:
     if not config.learn_map:
         return care
     least = care.least if config.uncertainty is None else max(care.least, AROUND)
-    return replace(care, least=least, barred=taught.barred if len(taught.barred) else None)
+    barred = taught.barred
+    return Care(care.margin, least, care.noise, care.stride, care.chance, barred if len(barred) else None)
 
 
 def changes_map(learned: bytes | None) -> bool:
@@ -201,18 +206,30 @@ def doubtful(
         for end, believed in zip(ends, (known, forget(known, marks)), strict=True):
             successors(body_on(told, believed), pose, end)
         doubts |= np.any(ends[0] != ends[1], axis=1)
-    x, y, theta = pose
-    if config.learn_map and (config.uncertainty is not None or len(known)):
-        (far, turn), (dx, dy) = displacements(told.body), (nexts[:, :2] - pose[:2]).T
-        stopped = np.abs(np.hypot(dx, dy) - np.abs(far)) > SAME_PLACE
-        stopped |= (turn != 0.0) & (nexts[:, 2] == theta)
+    stopped = np.zeros(motions, np.bool_)
+    learns = config.learn_map and (config.uncertainty is not None or len(known))
+    if learns and _stop_short(*displacements(told.body), pose, nexts, stopped):
         for motion in np.flatnonzero(stopped).tolist():
             places = _farther(told.body, pose, motion, nexts[motion])
             risky[motion] = any(not prefix.allows(place) for place in places)
         doubts |= risky
-    if len(taught.barred):
-        doubts |= [is_barred(taught.barred, x, y, theta, motion) for motion in range(motions)]
+    if len(barred := taught.barred):
+        doubts |= [is_barred(barred, pose[0], pose[1], pose[2], motion) for motion in range(motions)]
     return doubts, risky
+
+
+@leaf
+def _stop_short(far: Floats, turn: Floats, pose: Floats, nexts: Floats, stopped: Bools) -> bool:
+    """Marks the motions [M] that end at `nexts` [M, 3], short of their displacements [M] from a pose (3,), in
+    `stopped`; whether some do.
+    """
+    some = False
+    for m in range(nexts.shape[0]):
+        gone = math.hypot(nexts[m, 0] - pose[0], nexts[m, 1] - pose[1])
+        short = abs(gone - abs(far[m])) > SAME_PLACE
+        stopped[m] = short or (turn[m] != 0.0 and nexts[m, 2] == pose[2])
+        some = some or bool(stopped[m])
+    return some
 
 
 def _farther(body: Body, pose: Floats, motion: int, end: Floats) -> Iterator[Floats]:
@@ -246,7 +263,7 @@ def handed_on(shield: Shield, taught: Taught, drawn: int) -> bytes | None:
     """
     if not shield.config.learn_map and not taught.map.revision:
         return None
-    return Taught(taught.map, replace(taught.followed, drawn=drawn)).to_bytes()
+    return taught.to_bytes(drawn)
 
 
 _bodies: OrderedDict[tuple[str, bytes], Body] = OrderedDict()

@@ -50,7 +50,7 @@ class BoundedProtocol(HttpToolsProtocol):
     waiting: dict[BoundedProtocol, None] = {}  # noqa: RUF012  (of the whole process, the oldest first)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        self._head = 0
+        self._head, self._most = 0, _settings().max_header_bytes
         self._in_head = self._upgraded = False
         self._late: asyncio.TimerHandle | None = None
         super().connection_made(transport)
@@ -72,7 +72,7 @@ class BoundedProtocol(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         if self._in_head:  # of a head that came in one piece, `on_header` counts what is in it
             self._head += len(data)
-            if self._head > _settings().max_header_bytes:
+            if self._head > self._most:
                 self._refuse_head()
                 return
         super().data_received(data)
@@ -86,7 +86,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def on_header(self, name: bytes, value: bytes) -> None:
         self._head += len(name) + len(value)
-        if self._head > 2 * _settings().max_header_bytes:  # a byte may have been counted as it came, too
+        if self._head > 2 * self._most:  # a byte may have been counted as it came, too
             raise ValueError("the head is too large")  # ends the parsing: `send_400_response` comes next
         super().on_header(name, value)
 
@@ -108,7 +108,7 @@ class BoundedProtocol(HttpToolsProtocol):
             self._refuse(InputError("the request cannot open a WebSocket", expected=expected))
 
     def send_400_response(self, msg: str) -> None:
-        if self._in_head and self._head > _settings().max_header_bytes:
+        if self._in_head and self._head > self._most:
             self._refuse_head()
         else:
             super().send_400_response(msg)
@@ -124,7 +124,7 @@ class BoundedProtocol(HttpToolsProtocol):
             self.transport.close()
 
     def _refuse_head(self) -> None:
-        expected = f"at most {_settings().max_header_bytes} bytes"
+        expected = f"at most {self._most} bytes"
         self._refuse(HeadersTooLarge("the request's head is too large", expected=expected))
 
     def _stop_waiting(self) -> None:

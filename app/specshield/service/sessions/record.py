@@ -22,7 +22,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from specshield.arrays import Floats
+from specshield.arrays import Bytes, Codes, Floats
+from specshield.compiled import kernel
 from specshield.service.schemas.answers import Explanation, Residual, StepAnswer
 from specshield.shield.decision import Decision
 
@@ -138,20 +139,11 @@ def link(last: bytes, rows: Floats) -> bytes:
 
 
 def make(
-    decision: Decision,
-    row: Floats,
-    before: bytes,
-    pose: Sequence[float],
-    logits: Floats | None,
-    main_task_done: bool,
-    signals: Mapping[str, float],
-    names: Sequence[str],
-    all_witnesses: bool,
-    occupied: Floats | None = None,
-    free: Floats | None = None,
-    explain: bool = False,
+    decision: Decision, row: Floats, before: bytes, pose: Sequence[float], logits: Floats | None,
+    main_task_done: bool, signals: Mapping[str, float], names: Sequence[str], all_witnesses: bool,
+    occupied: Floats | None = None, free: Floats | None = None, explain: bool = False,
     tables: bytes | None = None,
-) -> StepRecord:
+) -> StepRecord:  # fmt: skip
     """The record of `decision`, made at step t and its stored `row` for a caller who sent what follows.
 
     logits [A], -inf for null. names: of the rows' signals, by column.
@@ -163,56 +155,32 @@ def make(
     actions[:, 2:] = decision.next_poses
     rows, table, pool = _pack_table(actions, row)
     return StepRecord(
-        format=FORMAT,
-        before=before,
-        t=decision.t,
-        pose=None if sent == row[:3].tobytes() else sent,
-        logits=None if logits is None else _pack_logits(logits),
-        main_task_done=main_task_done,
-        signals=sum(1 << i for i, name in enumerate(names) if name in signals),
-        all_witnesses=all_witnesses,
-        mode=decision.mode,
-        distribution=_sparse(decision.distribution),
-        rows=rows,
-        table=table,
-        pool=pool,
-        action=decision.action,
-        completion_action=decision.completion_action,
-        spec_status=decision.spec_status,
-        feasible_mass=decision.feasible_mass,
-        kl=decision.kl,
-        reason=decision.reason,
-        finished=decision.finished,
-        residual=decision.residual,
+        format=FORMAT, before=before, t=decision.t, pose=None if sent == row[:3].tobytes() else sent,
+        logits=None if logits is None else _pack_logits(logits), main_task_done=main_task_done,
+        signals=sum(1 << i for i, name in enumerate(names) if name in signals), all_witnesses=all_witnesses,
+        mode=decision.mode, distribution=_sparse(decision.distribution), rows=rows, table=table, pool=pool,
+        action=decision.action, completion_action=decision.completion_action,
+        spec_status=decision.spec_status, feasible_mass=decision.feasible_mass, kl=decision.kl,
+        reason=decision.reason, finished=decision.finished, residual=decision.residual,
         in_collision=decision.in_collision,
         witness=None if decision.witness is None else bytes(decision.witness),
         witnesses=tuple(None if w is None else bytes(w) for w in decision.witnesses),
-        warnings=decision.warnings,
-        margin=decision.margin,
-        slack=decision.slack,
-        threshold_left=decision.threshold_left,
-        map_revision=decision.map_revision,
+        warnings=decision.warnings, margin=decision.margin, slack=decision.slack,
+        threshold_left=decision.threshold_left, map_revision=decision.map_revision,
         occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
-        free=None if free is None else free.astype("<f8").tobytes(),
-        explain=explain,
-        explanations=_explained(decision),
-        tables=tables,
-        any_signal=decision.any_signal,
-    )
+        free=None if free is None else free.astype("<f8").tobytes(), explain=explain,
+        explanations=_explained(decision), tables=tables, any_signal=decision.any_signal,
+    )  # fmt: skip
 
 
 def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
     """What the caller is answered: to the byte as `answer` has it of the record, in a third of the time."""
     return _answer(
-        decision,
-        action_name=decision.action_name,
-        distribution=decision.distribution,
-        j_values=list(decision.j_values),
-        robustness=list(decision.robustness),
-        next_poses=decision.next_poses,
-        explanations=_explained(decision) if explain else None,
+        decision, action_name=decision.action_name, distribution=decision.distribution,
+        j_values=list(decision.j_values), robustness=list(decision.robustness),
+        next_poses=decision.next_poses, explanations=_explained(decision) if explain else None,
         all_witnesses=all_witnesses,
-    )
+    )  # fmt: skip
 
 
 def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
@@ -226,27 +194,19 @@ def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
     """What the caller was answered. row: the stored one of this step; names: of the actions."""
     table = _unpack_table(record, row)
     return _answer(
-        record,
-        action_name=names[record.action],
-        distribution=_full(record.distribution, len(record.rows)),
+        record, action_name=names[record.action], distribution=_full(record.distribution, len(record.rows)),
         j_values=[None if value != value else value for value in table[:, 0].tolist()],
         robustness=[None if value != value else value for value in table[:, 1].tolist()],
-        next_poses=table[:, 2:],
-        explanations=record.explanations if record.explain else None,
+        next_poses=table[:, 2:], explanations=record.explanations if record.explain else None,
         all_witnesses=record.all_witnesses,
-    )
+    )  # fmt: skip
 
 
 def _answer(
-    made: Decision | StepRecord,
-    action_name: str,
-    distribution: Floats,
-    j_values: list[float | None],
-    robustness: list[float | None],
-    next_poses: Floats,
-    explanations: tuple[Explanation | None, ...] | None,
+    made: Decision | StepRecord, action_name: str, distribution: Floats, j_values: list[float | None],
+    robustness: list[float | None], next_poses: Floats, explanations: tuple[Explanation | None, ...] | None,
     all_witnesses: bool,
-) -> StepAnswer:
+) -> StepAnswer:  # fmt: skip
     """Of a decision or its record; what follows `made` are the members that the two hold in different forms.
 
     distribution [A], next_poses [A, 3]; explanations: None where they were not asked for.
@@ -257,30 +217,15 @@ def _answer(
     if all_witnesses:
         asked["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
     return StepAnswer(
-        t=made.t,
-        mode=made.mode,
-        distribution=distribution.tolist(),
-        j_values=j_values,
-        robustness=robustness,
-        action=made.action,
-        action_name=action_name,
-        completion_action=made.completion_action,
-        spec_status=made.spec_status,
-        feasible_mass=made.feasible_mass,
-        kl=made.kl,
-        reason=made.reason,
-        finished=made.finished,
-        next_poses=next_poses.tolist(),
-        residual=None if made.residual is None else Residual(*made.residual),
-        in_collision=made.in_collision,
-        witness=None if made.witness is None else list(made.witness),
-        warnings=made.warnings,
-        margin=made.margin,
-        slack=made.slack,
-        threshold_left=made.threshold_left,
-        map_revision=made.map_revision,
-        **asked,
-    )
+        t=made.t, mode=made.mode, distribution=distribution.tolist(), j_values=j_values,
+        robustness=robustness, action=made.action, action_name=action_name,
+        completion_action=made.completion_action, spec_status=made.spec_status,
+        feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason, finished=made.finished,
+        next_poses=next_poses.tolist(), residual=None if made.residual is None else Residual(*made.residual),
+        in_collision=made.in_collision, witness=None if made.witness is None else list(made.witness),
+        warnings=made.warnings, margin=made.margin, slack=made.slack, threshold_left=made.threshold_left,
+        map_revision=made.map_revision, **asked,
+    )  # fmt: skip
 
 
 def _finite(value: float) -> float | None:
@@ -294,16 +239,43 @@ def _known(row: Floats) -> Floats:
 
 def _pack_table(actions: Floats, row: Floats) -> tuple[bytes, bytes, bytes]:
     """`rows`, `table` and `pool` of a record. actions [A, 5]; NaN stands for null."""
-    content, width, distinct = actions.astype("<f8", copy=False).tobytes(), 8 * COLUMNS, dict[bytes, int]()
-    rows = bytes(
-        distinct.setdefault(content[i : i + width], len(distinct)) for i in range(0, len(content), width)
-    )
-    words, known = np.frombuffer(b"".join(distinct), "<i8").tolist(), _known(row).view("<i8").tolist()
-    place = dict(zip(reversed(known), reversed(range(len(known))), strict=True))
-    pool = [word for word in dict.fromkeys(words) if word not in place]
-    place.update(zip(pool, range(len(known), len(known) + len(pool)), strict=True))
-    wide = "<u1" if len(known) + len(pool) <= 256 else "<u2"
-    return rows, np.array([place[word] for word in words], wide).tobytes(), np.array(pool, "<i8").tobytes()
+    known, size = _known(row), actions.size
+    rows, table, pool = np.empty(len(actions), np.uint8), np.empty(size, np.uint16), np.empty(size)
+    distinct, fresh = _take_apart(actions, known, rows, table, pool)
+    wide = np.uint8 if len(known) + fresh <= 256 else np.uint16
+    return rows.tobytes(), table[: distinct * COLUMNS].astype(wide).tobytes(), pool[:fresh].tobytes()
+
+
+@kernel
+def _take_apart(actions: Floats, known: Floats, rows: Bytes, table: Codes, pool: Floats) -> tuple[int, int]:
+    """Writes rows [A], table and pool as `StepRecord` has them; how many distinct rows, and numbers in the
+    pool, there are. Numbers are told apart by their bits.
+    """
+    words, seen, fresh = actions.view(np.int64), known.view(np.int64), pool.view(np.int64)
+    firsts, distinct, count = np.empty(len(words), np.int64), 0, 0
+    for a in range(len(words)):
+        at, same = 0, 0
+        while at < distinct and same < COLUMNS:
+            first, same = firsts[at], 0
+            while same < COLUMNS and words[first, same] == words[a, same]:
+                same += 1
+            at += same < COLUMNS
+        rows[a] = at
+        if at < distinct:
+            continue
+        firsts[distinct] = a
+        distinct += 1
+        for column in range(COLUMNS):
+            word, place = words[a, column], 0
+            while place < len(seen) and seen[place] != word:
+                place += 1
+            while len(seen) <= place < len(seen) + count and fresh[place - len(seen)] != word:
+                place += 1
+            if place == len(seen) + count:
+                fresh[count] = word
+                count += 1
+            table[at * COLUMNS + column] = place
+    return distinct, count
 
 
 def _unpack_table(record: StepRecord, row: Floats) -> Floats:
@@ -317,9 +289,24 @@ def _unpack_table(record: StepRecord, row: Floats) -> Floats:
 
 def _sparse(values: Floats) -> bytes:
     """float64 with the zeros left out: a bit for each value, then those whose bit is set."""
-    content = np.ascontiguousarray(values, "<f8")
-    there = content.view("<i8") != 0
-    return bytes(np.packbits(there)) + bytes(content[there])
+    bits, kept = np.zeros((len(values) + 7) // 8, np.uint8), np.empty(len(values))
+    count, _ = _keep(values, 0.0, bits, kept)
+    return bits.tobytes() + kept[:count].tobytes()
+
+
+@kernel
+def _keep(values: Floats, absent: float, bits: Bytes, kept: Floats) -> tuple[int, bool]:
+    """Sets the bits of the values that are not `absent`, and writes those into `kept`; how many there are,
+    and whether float32 holds them all.
+    """
+    count, short = 0, True
+    for i in range(len(values)):
+        if values[i] != absent or np.signbit(values[i]) != np.signbit(absent):
+            bits[i >> 3] |= 128 >> (i & 7)
+            kept[count] = values[i]
+            count += 1
+            short = short and float(np.float32(values[i])) == values[i]
+    return count, short
 
 
 def _full(content: bytes, size: int) -> Floats:
@@ -332,12 +319,9 @@ def _full(content: bytes, size: int) -> Floats:
 
 def _pack_logits(logits: Floats) -> bytes:
     """A bit for each that is finite, then those: as float32 where that loses nothing, else as float64."""
-    finite = logits != -np.inf
-    values = np.ascontiguousarray(logits[finite], "<f8")
-    with np.errstate(over="ignore"):
-        short = values.astype("<f4")
-    exact = short.astype("<f8").tobytes() == values.tobytes()
-    return np.packbits(finite).tobytes() + (short if exact else values).tobytes()
+    bits, kept = np.zeros((len(logits) + 7) // 8, np.uint8), np.empty(len(logits))
+    count, short = _keep(logits, -math.inf, bits, kept)
+    return bits.tobytes() + kept[:count].astype("<f4" if short else "<f8").tobytes()
 
 
 def _unpack_logits(content: bytes, size: int) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -11,6 +11,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
+from specshield.quick import quick
 from specshield.robot import robot_from_json
 from specshield.service.access.owners import shown
 from specshield.service.library import files
@@ -30,12 +31,13 @@ RACES = 10  # writes lost to others before a caller is told so
 OBJECTS, PARSED = 3_000, 10
 
 
+@quick
 @dataclass(frozen=True)
 class Session:
     """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held.
 
     rules: the config of each rule that it has had, the one in force last. settings: of that one.
-    signal_names: as in the rows. weight: of the rules, as they are stored [bytes].
+    signal_names: as in the rows. weight: of the rules, held: of the state, as they are stored [bytes].
     """
 
     rules: Sequence[Mapping[str, Any]]
@@ -45,6 +47,7 @@ class Session:
     rows: Floats
     signal_names: list[str]
     weight: int
+    held: int
 
     @staticmethod
     def of(stored: Record | Dump) -> Session:
@@ -52,13 +55,13 @@ class Session:
         names = ruled.columns_of(rules)
         width = 3 + len(names)
         rows = np.frombuffer(stored.rows, "<f8", state.length * width).reshape(-1, width)
-        settings, weight = settings_of(rules[-1]), len(stored.config)
-        return Session(rules, settings, state, stored.version, rows, names, weight)
+        settings, sizes = settings_of(rules[-1]), (len(stored.config), len(stored.state))
+        return Session(rules, settings, state, stored.version, rows, names, *sizes)
 
     @property
     def size(self) -> int:
         """Bytes of memory, about."""
-        return OBJECTS + PARSED * self.weight + len(self.state.packed()) + self.rows.nbytes
+        return OBJECTS + PARSED * self.weight + self.held + self.rows.nbytes
 
     @property
     def config(self) -> Mapping[str, Any]:
@@ -83,10 +86,13 @@ class Session:
         added = history.join(self.poses, t, poses)
         known, width = self.rows.shape
         rows = np.empty((known + len(added), width))
-        rows[:known], rows[known:, :3], rows[known:, 3:] = self.rows, added, self.rows[-1, 3:]
+        rows[:known], rows[known:, :3] = self.rows, added
+        if width > 3:
+            rows[known:, 3:] = self.rows[-1, 3:]
         for name, value in signals.items():
             rows[t, 3 + self.signal_names.index(name)] = value
-        return replace(self, rows=rows)
+        same = self.rules, self.settings, self.state, self.version
+        return Session(*same, rows, self.signal_names, self.weight, self.held)
 
     def added(self) -> tuple[bytes, int]:
         """The rows that a change has to write, and the byte where they begin: only what is new, and row 0
@@ -130,19 +136,14 @@ def check_step(session: Session, request: StepBody) -> None:
     check_last(t, session.config["max_steps"])
     if t < state.next_t:
         raise StepConflict(
-            f"step {t} was passed over and can no longer be decided",
-            path="t",
-            got=t,
-            expected=f"{state.next_t} or later",
-            expected_t=state.next_t,
-        )
+            f"step {t} was passed over and can no longer be decided", path="t", got=t,
+            expected=f"{state.next_t} or later", expected_t=state.next_t,
+        )  # fmt: skip
     if state.main_task_done and not request.main_task_done:
         raise StepConflict(
             "an earlier step said that the main task is done, which cannot be taken back",
-            path="main_task_done",
-            got=False,
-            expected="true",
-        )
+            path="main_task_done", got=False, expected="true",
+        )  # fmt: skip
 
 
 def check_last(t: int, last: int) -> None:
@@ -217,21 +218,17 @@ def pack(rows: Floats) -> bytes:
 
 def over(session: Session, t: int) -> SessionFinished:
     return SessionFinished(
-        f"session {session.id!r} is over: no further step is decided",
-        path="t",
-        got=t,
+        f"session {session.id!r} is over: no further step is decided", path="t", got=t,
         expected="a step already decided, to read it again",
-    )
+    )  # fmt: skip
 
 
 def missing(key: str) -> NotFound:
     id = shown(key)
     return NotFound(
-        f"there is no session {id!r}; it may have expired",
-        path="id",
-        got=id,
+        f"there is no session {id!r}; it may have expired", path="id", got=id,
         expected="an id from /v1/sessions",
-    )
+    )  # fmt: skip
 
 
 def contended(key: str) -> Conflict:

@@ -14,6 +14,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import SpecshieldError
+from specshield.quick import quick
 from specshield.reasons.explanation import explanations
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
@@ -52,6 +53,7 @@ SEVERAL = 4  # decisions; one or two may be long because kernels are loaded
 Tell = Callable[[str, bytes, bytes, State, Floats, StepRecord, StepAnswer], None]
 
 
+@quick
 @dataclass(frozen=True)
 class Decided:
     """A step decided on `session`, before it is written."""
@@ -163,7 +165,8 @@ class Steps:
                 if state.finished:  # nobody goes on with it
                     self.recent.drop(id)
                 else:
-                    self.recent.put(id, replace(decided.session, state=state, version=written))
+                    held = len(change.state)
+                    self.recent.put(id, replace(decided.session, state=state, version=written, held=held))
                 metrics.decided(decided.decision, told_later, timing)
                 return answer
             self.recent.drop(id)
@@ -175,16 +178,11 @@ class Steps:
     def _change(self, decided: Decided, request: StepBody) -> tuple[Change, State]:
         session, decision, content = decided.session, decided.decision, record.encode(decided.record)
         state = msgspec.structs.replace(
-            session.state,
-            length=len(session.rows),
-            next_t=len(session.rows),
-            spec_status=decision.spec_status,
-            expires_at=time.time() + self._ttl,
-            head=record.digest(content),
-            main_task_done=request.main_task_done,
-            finished=decision.finished,
+            session.state, length=len(session.rows), next_t=len(session.rows),
+            spec_status=decision.spec_status, expires_at=time.time() + self._ttl,
+            head=record.digest(content), main_task_done=request.main_task_done, finished=decision.finished,
             carry=pack_carry(decision.carry),
-        )
+        )  # fmt: skip
         return Change(state.packed(), *session.added(), request.t, content), state
 
     async def _decide(self, session: Session, request: StepBody, timing: dict[str, float]) -> Decided:
@@ -237,34 +235,16 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
         shield, tables = shields.tables.of(session.config["nonce"], shield, known)
     since = session.since
     decision = episode.decide(
-        shield,
-        since[:, :3],
-        logits,
-        request.main_task_done,
-        columns(since, session.signal_names),
-        carry,
-        request.witnesses,
-        occupied,
-        free,
-        explanations if request.explain else None,
-    )
+        shield, since[:, :3], logits, request.main_task_done, columns(since, session.signal_names), carry,
+        request.witnesses, occupied, free, explanations if request.explain else None,
+    )  # fmt: skip
     if len(since) < len(session.rows):  # the rule's clock began after the session
         decision = replace(decision, t=request.t)
     made = record.make(
-        decision,
-        session.rows[-1],
-        record.link(state.head, session.rows[state.next_t :]),
-        request.poses[-1],
-        logits,
-        request.main_task_done,
-        signals,
-        session.signal_names,
-        request.witnesses,
-        occupied,
-        free,
-        request.explain,
-        tables,
-    )
+        decision, session.rows[-1], record.link(state.head, session.rows[state.next_t :]), request.poses[-1],
+        logits, request.main_task_done, signals, session.signal_names, request.witnesses, occupied, free,
+        request.explain, tables,
+    )  # fmt: skip
     return session, decision, made
 
 

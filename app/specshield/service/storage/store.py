@@ -17,6 +17,7 @@ from typing import Any
 import anyio
 
 from specshield.errors import SessionExists, StoreError
+from specshield.quick import quick
 from specshield.service.access.owners import between, shown
 from specshield.service.storage.connect import FAILURES, connect, is_cluster
 from specshield.service.storage.wire import PART, Script, Wire, too_few
@@ -62,6 +63,7 @@ class News:
     steps: list[bytes]
 
 
+@quick
 @dataclass(frozen=True)
 class Change:
     """What one write adds: `rows` from byte `offset` on, what step `t` left, the state after it. config: the

@@ -66,13 +66,16 @@ class Watchers:
         """Looks at the sessions that are watched, until it is cancelled."""
         for number in itertools.count():
             feeds = list(self._feeds.values())
-            for part in range(PARTS):
-                await asyncio.sleep(EVERY / PARTS)
+            parts = min(PARTS, len(feeds))
+            if not parts:  # a process that wakes between steps makes them dearer
+                await asyncio.sleep(EVERY)
+            for part in range(parts):
+                await asyncio.sleep(EVERY / parts)
                 all = (number + part) % SELDOM == 0
                 await self._idle()
                 elsewhere = time.monotonic() - HERE
                 try:
-                    await self._look([feed for feed in feeds[part::PARTS] if all or feed.here < elsewhere])
+                    await self._look([feed for feed in feeds[part::parts] if all or feed.here < elsewhere])
                 except SpecshieldError:
                     pass  # the store is away: what is missed is read when it is back
                 except Exception:
@@ -82,15 +85,9 @@ class Watchers:
                     feed.wake()
 
     def decided(
-        self,
-        id: str,
-        before: bytes,
-        after: bytes,
-        state: State,
-        row: Floats,
-        made: StepRecord,
+        self, id: str, before: bytes, after: bytes, state: State, row: Floats, made: StepRecord,
         answered: StepAnswer,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Notes a step that this process has decided and stored, see `steps.Tell`. Where more is new
         to the watchers, they read it from the store; so they do of a rule's first step, with its switch.
         """

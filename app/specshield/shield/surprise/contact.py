@@ -16,6 +16,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.portable import arctan2
+from specshield.quick import quick
 from specshield.robot.body import centre
 from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
@@ -31,6 +32,7 @@ THING = 0.3  # [m] how wide and deep a thing is taken to be that is on no map; c
 UNDER = 0.03  # [m] a footprint that covers a cell by more than this shows it free: three times the noise
 
 
+@quick
 @dataclass(frozen=True)
 class Followed:
     """What is known of how the caller follows: the motion drawn last (-1: none), whether all steps so far can
@@ -45,14 +47,9 @@ class Followed:
 
 
 def contact_of(
-    body: Body,
-    followed: Followed,
-    before: Floats,
-    after: Floats,
-    foreseen: Floats,
-    near: Near = NEAR,
+    body: Body, followed: Followed, before: Floats, after: Floats, foreseen: Floats, near: Near = NEAR,
     again: bool = False,
-) -> tuple[int, Followed]:
+) -> tuple[int, Followed]:  # fmt: skip
     """The motion that stopped short between two poses (3,), -1 for none, and what is known of the caller now.
 
     foreseen [M, 3]: where f leads from `before`. near: what noise explains. again: whether the drawn motion
