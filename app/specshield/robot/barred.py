@@ -13,6 +13,8 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.robot.dynamics import wrap
 
+NOTHING_BARRED = np.empty((0, 6))
+
 
 @leaf
 def is_barred(barred: Floats, x: float, y: float, theta: float, motion: int) -> bool:

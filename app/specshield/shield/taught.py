@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.quick import quick
-from specshield.robot.barred import is_barred
+from specshield.robot.barred import NOTHING_BARRED, is_barred
 from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
 from specshield.shield.caution.experience import was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
@@ -60,7 +60,7 @@ KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 
 
 HEAD = struct.Struct("<h?hB")  # what `Followed` holds
 MOST_MET = 255  # contacts at one pose that HEAD can hold
-NOTHING_BARRED, NEVER_DRAWN = np.empty((0, 6)), Followed()
+NEVER_DRAWN = Followed()
 
 
 @quick

@@ -35,7 +35,7 @@ from specshield.policy.reachability.tables import Tables
 from specshield.policy.recall import pasts
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
-from specshield.robot.barred import in_vain
+from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, make_body, simulate
 from specshield.rule.progress import ALWAYS, Rules, make_rules, signal_rows
 from specshield.rule.values import initial_signals
@@ -47,7 +47,6 @@ from specshield.world.occupancy import OccupancyGrid
 
 MAX_ENTRIES = 100_000_000  # of float32: 400 MB while the tables are made
 MANY, FEW = 1000, 64  # poses that a new policy is tried from: by its tables, by what it proposes
-NOTHING_BARRED = np.empty((0, 6))
 MAPS, MAPS_BYTES = 8, 8_000_000  # whose distances a policy keeps, and the most that their clearances take
 FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs no more than this
 
