@@ -22,11 +22,13 @@ OUTER = (
 
 @pytest.fixture
 def package(tmp_path):
-    """A package of this name with one kernel that calls another, and with the true compiled.py."""
+    """A package of this name with one kernel that calls another, and with the true
+    compiled.py and linking.py."""
     package = tmp_path / "first" / "specshield"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("")
-    (package / "compiled.py").write_text(Path(compiled.__file__).read_text())
+    for name in ("compiled.py", "linking.py"):
+        (package / name).write_text(Path(compiled.__file__).with_name(name).read_text())
     (package / "outer.py").write_text(OUTER)
     (package / "inner.py").write_text(INNER.format(1))
     return package
