@@ -79,14 +79,6 @@ def inlined(function: F) -> F:
     return _leaf(function, forceinline=True)
 
 
-def merged(function: F) -> F:
-    """A kernel that is written into the one that calls it: each that is compiled by itself, with all that it
-    calls, costs seconds.
-    """
-    compiled: F = njit(inline="always")(function)
-    return compiled
-
-
 def mark(name: str) -> Path | None:
     """A file to be made once everything called `name` is compiled: another where the sources, the processor
     or numba are others. None where no kernel can be kept.
@@ -127,7 +119,7 @@ def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """
     compiled = called = _kept(njit(cache=True, pipeline_class=linking.Entry, **options)(function))
     if linking.POSSIBLE and function.__closure__ is None:
-        linking.load_all_that_is_called(compiled)
+        linking.load_whole(compiled)
         called = linking.callee(function, options, _kept)
     template = called.get_call_template
     compiled.get_call_template = lambda args, kws: template([unliteral(arg) for arg in args], kws)

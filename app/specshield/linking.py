@@ -1,9 +1,8 @@
 """Kernels as other kernels call them: each is compiled once, however many call it.
 
-numba writes every kernel into all that call it, where it is optimised and made machine code again, and gives
-it what Python needs to call it. That was three quarters of what LLVM had to do. Here a long kernel stays on
-its own: those that call it name its symbol, as with functions of C. So the symbol has to be the same in every
-process, and what is taken from the disk first loads all that it calls.
+numba writes every kernel into all that call it, optimises it there again, and gives it what Python needs to
+call it: three quarters of what LLVM had to do. Here a long kernel stays on its own, and those that call it
+name its symbol. It is the same in every process, and what comes from the disk first loads all that it calls.
 """
 
 from __future__ import annotations
@@ -16,57 +15,56 @@ from typing import Any, NamedTuple
 
 import numba
 from llvmlite.binding import parse_assembly
-from numba.core.caching import IndexDataCacheFile
-from numba.core.compiler import CompileResult, Compiler
-from numba.core.funcdesc import qualifying_prefix
-from numba.core.sigutils import normalize_signature
+from numba.core import compiler
 
-njit: Any = numba.njit  # its types leave out the option below
+njit: Any = numba.njit  # its types leave out the options
+Base: Any = compiler.Compiler
+Function = Callable[..., Any]
 # [instructions of LLVM, optimised] A kernel of no more is still written into those that call it. With 250 the
 # first start took as long, and decisions 1.013 times (`python -m benchmarks.episodes --against`).
 LONG = 700
-# Whether this numba has what it takes, which its manual does not tell of. Where it is gone, kernels are
-# compiled as numba does it: in twice the time, and they are the same.
-POSSIBLE = "reload_init" in getattr(CompileResult, "_fields", ())
-_callees: dict[tuple[str, str], Any] = {}
-_symbols: dict[str, tuple[Any, ...]] = {}  # and the types of arguments that each stands for
+# Whether this numba has what it takes, of which its manual says nothing. Otherwise the kernels are compiled
+# as numba does it, in twice the time.
+POSSIBLE = "reload_init" in getattr(compiler.CompileResult, "_fields", ())
+_callees: dict[tuple[str, str], Any] = {}  # by module and name
+_symbols: dict[str, tuple[Any, ...]] = {}  # the types of arguments that each stands for
 
 
-class Entry(Compiler):  # type: ignore[misc]
-    """Compiles what Python calls. Nothing calls it from C."""
+class Entry(Base):  # type: ignore[misc]
+    """Compiles what Python calls: C does not."""
 
-    def compile_extra(self, function: Callable[..., Any]) -> Any:
+    def compile_extra(self, function: Function) -> Any:
         self.state.flags.no_cfunc_wrapper = True
         return super().compile_extra(function)
 
 
 class _Callee(Entry):
-    """Compiles what only kernels call, with a symbol that is the same in every process."""
+    """Compiles what only kernels call, by a name that is the same in every process."""
 
-    def compile_extra(self, function: Callable[..., Any]) -> Any:
+    def compile_extra(self, function: Function) -> Any:
         self.state.flags.no_cpython_wrapper = True
-        own = qualifying_prefix(function.__module__, function.__qualname__)
-        stamp = _callees[function.__module__, function.__qualname__]._cache._impl.locator.get_source_stamp()
+        place = function.__module__, function.__qualname__
+        source = _source(_callees[place])
         mangle = self.state.targetctx.mangler
 
-        def symbol(name: str, types: Any, *, abi_tags: Any = (), uid: Any = None) -> Any:
-            if name.removeprefix(".NumbaEnv.") == own:
-                described = " ".join([stamp, *abi_tags, *map(str, types)])
-                found = mangle(name, (), uid=hashlib.sha256(described.encode()).hexdigest()[:32])
-                if _symbols.setdefault(found, tuple(types)) == tuple(types):
-                    return found
-            return mangle(name, types, abi_tags=abi_tags, uid=uid)
+        def name(whole: str, types: Any, *, abi_tags: Any = (), uid: Any = None) -> Any:
+            if whole.removeprefix(".NumbaEnv.") == ".".join(place):
+                described = " ".join([source, *abi_tags, *map(str, types)])
+                symbol = mangle(whole, (), uid=hashlib.sha256(described.encode()).hexdigest()[:32])
+                if _symbols.setdefault(symbol, tuple(types)) == tuple(types):
+                    return symbol
+            return mangle(whole, types, abi_tags=abi_tags, uid=uid)
 
-        self.state.targetctx.mangler = symbol
+        self.state.targetctx.mangler = name
         return super().compile_extra(function)
 
 
 class _GoneError(Exception):
-    """What a kernel on the disk calls is not there any more."""
+    """What a kernel on the disk calls is not to be had any more."""
 
 
 class _Needed(NamedTuple):
-    """Loads or compiles a kernel that another one on the disk calls, so that its symbol is there."""
+    """Sees to it that a symbol is there which a kernel from the disk calls."""
 
     module: str
     name: str
@@ -76,65 +74,60 @@ class _Needed(NamedTuple):
     def __call__(self) -> None:
         importlib.import_module(self.module)
         callee = _callees.get((self.module, self.name))
-        if callee is None:
-            raise _GoneError
-        callee.compile(self.types)
-        if self.types not in callee.overloads or self.symbol != _symbol(callee.overloads[self.types]):
+        if callee is not None:
+            callee.compile(self.types)  # or loads it
+        if callee is None or self != _needed(callee.overloads.get(self.types)):
             raise _GoneError
 
 
-def callee(function: Callable[..., Any], options: dict[str, Any], kept: Callable[[Any], Any]) -> Any:
-    """The function as kernels call it."""
+def callee(function: Function, options: dict[str, Any], kept: Callable[[Any], Any]) -> Any:
+    """The function as kernels call it; `kept` sees to its cache."""
     compiled = kept(njit(cache=True, pipeline_class=_Callee, **options)(function))
     _callees[function.__module__, function.__qualname__] = compiled
     cache = compiled._cache
-    cache._cache_file = IndexDataCacheFile(
-        cache_path=cache.cache_path,
-        filename_base=f"{cache._impl.filename_base}.callee",
-        source_stamp=cache._impl.locator.get_source_stamp(),
-    )
-    save = cache.save_overload
+    files, save = cache._cache_file, cache.save_overload
+    name = cache._impl.filename_base + ".callee"  # besides what Python calls
+    cache._cache_file = type(files)(cache.cache_path, name, _source(compiled))
 
     def link_and_save(types: Any, kernel: Any) -> None:
-        code = kernel.library._final_module.get_function(_symbol(kernel))
-        if not options.get("forceinline") and _is_long(code):
-            kernel.library._shared_module = parse_assembly("")
-            kernel.library._reload_init.add(_needed(function, kernel))
+        code = kernel.library._final_module.get_function(kernel.fndesc.mangled_name)
+        instructions = (instruction for block in code.blocks for instruction in block.instructions)
+        if not options.get("forceinline") and any(True for _ in islice(instructions, LONG, None)):
+            kernel.library._shared_module = parse_assembly("")  # what callers are given to write into them
+            kernel.library._reload_init.add(_needed(kernel))
         save(types, kernel)
 
     cache.save_overload = link_and_save
-    load_all_that_is_called(compiled)
+    load_whole(compiled)
     return compiled
 
 
-def load_all_that_is_called(compiled: Any) -> None:
-    """What this takes from the disk finds all that it calls, or is compiled anew."""
+def load_whole(compiled: Any) -> None:
+    """From now on, what this takes from the disk loads all that it calls, or is compiled anew."""
     load = compiled._cache.load_overload
 
-    def load_whole(types: Any, context: Any) -> Any:
+    def load_with_callees(types: Any, context: Any) -> Any:
         try:
             kernel = load(types, context)
         except _GoneError:
             return None
-        if kernel is None or tuple(kernel.signature.args) != normalize_signature(types)[0]:
-            return None  # two processes may have written the same file
-        kernel.library._reload_init.update(kernel.reload_init)
+        if kernel is None or kernel.signature.args != getattr(types, "args", types):
+            return None  # two processes wrote the same file
+        inherited = kernel.library._reload_init
+        inherited.update(kernel.reload_init)
         if not any(True for _ in kernel.library._get_module_for_linking().functions):
-            kernel.library._reload_init.add(_needed(compiled.py_func, kernel))
+            inherited.add(_needed(kernel))
         return kernel
 
-    compiled._cache.load_overload = load_whole
+    compiled._cache.load_overload = load_with_callees
 
 
-def _needed(function: Callable[..., Any], kernel: Any) -> _Needed:
-    types = tuple(kernel.signature.args)
-    return _Needed(function.__module__, function.__qualname__, types, _symbol(kernel))
+def _needed(kernel: Any) -> _Needed | None:
+    if kernel is None:
+        return None
+    made = kernel.fndesc
+    return _Needed(made.modname, made.qualname, kernel.signature.args, made.mangled_name)
 
 
-def _symbol(kernel: Any) -> str:
-    return str(kernel.fndesc.mangled_name)
-
-
-def _is_long(code: Any) -> bool:
-    instructions = (True for block in code.blocks for _ in block.instructions)
-    return next(islice(instructions, LONG, None), False)
+def _source(compiled: Any) -> str:
+    return str(compiled._cache._impl.locator.get_source_stamp())

@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from llvmlite.binding import ffi
@@ -119,11 +120,12 @@ def _weights(task: Task) -> dict[str, np.ndarray]:
 def _hasten() -> None:
     """Takes a tenth off the time that compiling takes in this process."""
     gc.set_threshold(100_000, 50, 50)  # compiling makes millions of small objects
+    flags: Any = Flags
     with contextlib.suppress(AttributeError):  # a numba that does it otherwise
         ffi.lib._lock._cblist.clear()  # each call of LLVM is told to clocks that nobody reads
-        defaults = {name: option.default for name, option in Flags.options.items()}
-        if Flags()._values == {}:  # otherwise a hundred thousand comparisons ask for each option by itself
-            Flags.values = lambda flags: {**defaults, **flags._values}
+        defaults = {name: option.default for name, option in flags.options.items()}
+        if flags()._values == {}:  # otherwise a hundred thousand comparisons ask for each option by itself
+            flags.values = lambda flags: {**defaults, **flags._values}
 
 
 def _end_with_parent() -> None:
