@@ -110,7 +110,7 @@ def continue_all(
         if starts.settled[m] and base < 0:
             base = int(m)
     small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
-    for attempt in range(3):  # one call of the beam in a loop, since each call is compiled by itself
+    for attempt in range(3):
         share, band = width, BAND if waits else 0.0
         if attempt == 0:
             share = NARROW_SHARE
