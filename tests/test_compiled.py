@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -18,15 +19,25 @@ OUTER = (
     "@leaf\ndef outer(x: int) -> int:\n    return inner(x)\n\n"
     "print(outer(1), sum(outer.stats.cache_hits.values()))\n"
 )
+CALLEE = "from specshield.compiled import leaf\n\n@leaf\ndef inner(x: int) -> int:\n    return x + {}\n"
+CALLER = (
+    "from specshield import linking\nfrom specshield.compiled import leaf\n"
+    "from specshield.inner import inner\n\nlinking.LONG = 0\n\n"
+    "@leaf\ndef outer(x: int) -> int:\n    return inner(x)\n\n"
+    "found = [outer, *(callee for place, callee in linking._callees.items() if 'inner' in place)]\n"
+    "print(outer(1), sum(sum(kernel.stats.cache_hits.values()) for kernel in found))\n"
+)
 
 
 @pytest.fixture
 def package(tmp_path):
-    """A package of this name with one kernel that calls another, and with the true compiled.py."""
+    """A package of this name with one kernel that calls another, and with the true
+    compiled.py and linking.py."""
     package = tmp_path / "first" / "specshield"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("")
-    (package / "compiled.py").write_text(Path(compiled.__file__).read_text())
+    for name in ("compiled.py", "linking.py"):
+        (package / name).write_text(Path(compiled.__file__).with_name(name).read_text())
     (package / "outer.py").write_text(OUTER)
     (package / "inner.py").write_text(INNER.format(1))
     return package
@@ -69,3 +80,40 @@ def test_kernels_are_for_a_processor_that_nearly_all_machines_have(package, tmp_
     assert run(package, kept, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="") == (2, 0)
     assert run(package, kept, NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="") == (2, 1)
     assert run(package, kept) == (2, 0)  # others, for another processor
+
+
+@pytest.fixture
+def linked(package):
+    """The same with a kernel that the other does not contain, but names."""
+    (package / "outer.py").write_text(CALLER)
+    (package / "inner.py").write_text(CALLEE.format(1))
+    return package
+
+
+@pytest.mark.parametrize("lost", ["*.nbc", "*.nb?", "*"])
+def test_a_kernel_from_the_disk_finds_what_it_calls_even_where_that_is_gone(linked, tmp_path, lost):
+    kept = tmp_path / "kept"
+    assert run(linked, kept) == (2, 0)
+    assert run(linked, kept) == (2, 2)  # the caller loads what it calls
+    for file in [*(kept / "specshield.inner").rglob(lost)]:
+        shutil.rmtree(file) if file.is_dir() else file.unlink(missing_ok=True)
+    assert run(linked, kept) == (2, 1)
+    assert run(linked, kept) == (2, 2)
+    (linked / "inner.py").write_text(CALLEE.format(5))
+    assert run(linked, kept) == (6, 0)
+
+
+def test_processes_that_compile_at_the_same_time_call_what_any_of_them_compiled(linked, tmp_path):
+    kept = tmp_path / "kept"
+    with ThreadPoolExecutor() as threads:
+        answers = [threads.submit(run, linked, kept) for _ in range(4)]
+    assert {answer.result()[0] for answer in answers} == {2}
+    assert run(linked, kept) == (2, 2)
+
+
+def test_a_numba_that_cannot_link_compiles_the_same_kernels(linked, tmp_path):
+    gone = "from numba.core import compiler\n\ncompiler.CompileResult._fields = ()\n"
+    (linked / "__init__.py").write_text(gone)
+    assert run(linked, tmp_path) == (2, 0)
+    assert run(linked, tmp_path) == (2, 1)
+    assert not list(tmp_path.rglob("*.callee*"))

@@ -25,6 +25,8 @@ import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from numba.core.caching import CacheImpl, _CacheLocator
 
+from specshield import linking
+
 njit: Any = numba.njit  # its types leave out the option below
 config: Any = numba.config
 unliteral: Any = numba.types.unliteral
@@ -77,14 +79,6 @@ def inlined(function: F) -> F:
     return _leaf(function, forceinline=True)
 
 
-def merged(function: F) -> F:
-    """A kernel that is written into the one that calls it: each that is compiled by itself, with all that it
-    calls, costs seconds.
-    """
-    compiled: F = njit(inline="always")(function)
-    return compiled
-
-
 def mark(name: str) -> Path | None:
     """A file to be made once everything called `name` is compiled: another where the sources, the processor
     or numba are others. None where no kernel can be kept.
@@ -117,12 +111,23 @@ def _leaf(function: F, **options: bool) -> F:
 
 
 def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Compiles a function once for each combination of types it is called with.
+    """Compiles a function once for each combination of types it is called with, once more where Python calls
+    it and kernels do too.
 
     A number that is written in a call counts as any other of its type. Left alone, numba compiles the callee
     once more for each such number, which took a sixth of all the time that compiling takes.
     """
-    compiled = njit(cache=True, **options)(function)
+    compiled = called = _kept(njit(cache=True, pipeline_class=linking.Entry, **options)(function))
+    if linking.POSSIBLE and function.__closure__ is None:
+        linking.load_whole(compiled)
+        called = linking.callee(function, options, _kept)
+    template = called.get_call_template
+    compiled.get_call_template = lambda args, kws: template([unliteral(arg) for arg in args], kws)
+    compiled.get_overload = called.get_overload
+    return compiled
+
+
+def _kept(compiled: Any) -> Any:
     save = compiled._cache.save_overload
 
     def save_where_possible(*kernel: Any) -> None:
@@ -130,8 +135,6 @@ def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
             save(*kernel)
 
     compiled._cache.save_overload = save_where_possible
-    template = compiled.get_call_template
-    compiled.get_call_template = lambda args, kws: template([unliteral(arg) for arg in args], kws)
     return compiled
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Bools, Floats, Ints
+from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.rule.values import places
 from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts
@@ -101,7 +101,7 @@ def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Float
     """
     buffer, some = np.empty(leaves.shape[1]), still.any()
     for f in range(leaves.shape[0]):
-        buffer[:] = leaves[f]
+        copy_row(leaves[f], buffer)
         tree_value(parts.below, buffer)
         least = np.inf
         for k in range(still.shape[0]):

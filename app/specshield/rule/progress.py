@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Floats, Int8s, Ints
+from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.errors import FragmentError
 from specshield.rule.values import REGIONS, fill_place, fill_signals, initial_signals, places, regions_of
@@ -143,7 +143,7 @@ def replay_by(rules: Rules, past: float, poses: Floats, signals: Floats, status:
     status[:] = PENDING
     run[:] = 0
     for t in range(poses.shape[0]):
-        rules.signals[:] = signals[t]
+        copy_row(signals[t], rules.signals)
         read_predicates(rules, poses[t, 0], poses[t, 1], poses[t, 2], values, stack, predicates)
         if past != rules.margin:  # which `advance` goes by
             for k in range(predicates.shape[0]):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Bools, Floats, Ints
+from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import inlined, kernel
 from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
 from specshield.stl import Always, And, Formula, Node, Until
@@ -166,5 +166,5 @@ def rate(view: View, known: Floats, t: int, poses: Floats, held: Floats, rho: Fl
     for f in range(poses.shape[0]):
         recall_prefix(view, known, t, buffer)
         sound = _read(view, poses[f], held, t + 1, values, stack, buffer)
-        leaves[f] = buffer
+        copy_row(buffer, leaves[f])
         rho[f] = tree_value(tree, buffer) if sound else math.nan

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from specshield.arrays import Floats, Ints
+from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import inlined, kernel
 from specshield.quick import quick
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
@@ -220,7 +220,7 @@ def _simulate_and_rate(
             k += 1
         for rest in range(k, steps):
             row[rest, 0], row[rest, 1], row[rest, 2] = x, y, theta
-        leaves[f] = buffer
+        copy_row(buffer, leaves[f])
         rho[f] = tree_value(tree, buffer) if whole else -np.inf
         best[first] = max(best[first], rho[f])
     return finite

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.arrays import Floats, Ints
-from specshield.compiled import leaf, merged
+from specshield.compiled import inlined, leaf
 from specshield.policy.lattice import SHORTEST_MOVE
 from specshield.policy.planner.due_dates import read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
@@ -27,7 +27,7 @@ BEAM_LENGTH = 64  # [steps] of a beam, at most
 SAME_POSE = 0.05  # [m + rad] poses that differ by less than this count once in a beam
 
 
-@merged
+@inlined
 def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: int, need: Ints) -> int:
     """Goes on from motions[:n] down field f to where literal k holds; how many motions there are then.
 

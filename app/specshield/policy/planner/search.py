@@ -17,7 +17,7 @@ import math
 from typing import NamedTuple
 
 from specshield.arrays import Ints
-from specshield.compiled import leaf, merged
+from specshield.compiled import inlined, leaf
 from specshield.policy.planner.approach import BEAM_LENGTH, descend, descend_by_beam, linger
 from specshield.policy.planner.due_dates import NO_DATE, due_date, foresee, is_open, needed_until, stay_for
 from specshield.policy.planner.fields import to_go_at
@@ -112,7 +112,7 @@ def guard(world: World, way: Way, k: int, n: int, stop: int, need: Ints) -> bool
     return guarding
 
 
-@merged
+@inlined
 def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> bool:
     """Makes the node at depth d, of motions[:n]. Whether staying here satisfies the formula."""
     literals, steps, s, need = world.literals, way.motions.shape[0], way.t + n, nodes.need[d]
@@ -168,7 +168,7 @@ def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> 
     return False
 
 
-@merged
+@inlined
 def _serve(world: World, way: Way, nodes: Nodes, d: int, c: int) -> int:
     """Makes child c of the node at depth d: how many motions there are then, -1 where it leads nowhere."""
     literals, steps, need = world.literals, way.motions.shape[0], nodes.need[d]

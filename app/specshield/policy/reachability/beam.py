@@ -85,8 +85,9 @@ def beam_search(
         slots *= 2
     table, place, kept = np.empty(slots, np.int32), np.empty(room, np.int64), np.empty(roots, np.int64)
     heap = Heap(np.empty(room, np.int64), np.empty(room))
-    here.pose[:roots], here.status[:roots], here.run[:roots] = pose, status, run
-    here.tag[:roots] = 1 << np.arange(roots)
+    for r in range(roots):
+        _put(here, r, pose[r, 0], pose[r, 1], pose[r, 2], status[r], run[r])
+        here.tag[r] = 1 << r
     taken[:] = 0
     open_roots, count = (1 << roots) - 1, roots
     for n in range(steps):

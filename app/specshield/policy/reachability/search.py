@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
-from specshield.compiled import kernel, leaf, merged
+from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_way, find_sibling, find_twins
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search
 from specshield.policy.reachability.guide import (
@@ -110,7 +110,7 @@ def continue_all(
         if starts.settled[m] and base < 0:
             base = int(m)
     small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
-    for attempt in range(3):  # one call of the beam in a loop, since each call is compiled by itself
+    for attempt in range(3):
         share, band = width, BAND if waits else 0.0
         if attempt == 0:
             share = NARROW_SHARE
@@ -175,7 +175,7 @@ def _join(
     )
 
 
-@merged
+@kernel
 def _follow(
     guide: Guide, width: int, t: int, n: int, escapes: bool, motions: Ints, poses: Floats, scratch: Scratch
 ) -> bool:
@@ -222,7 +222,7 @@ def _take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats,
     return n
 
 
-@merged
+@kernel
 def _beam_out(
     guide: Guide, t: int, share: int, width: int, band: float, order: Ints, twin: Ints, starts: Starts,
     motions: Ints, poses: Floats, scratch: Scratch,

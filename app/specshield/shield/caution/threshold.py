@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from specshield.arrays import Bools, Floats, Ints
+from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.errors import SampleError
 from specshield.portable import inner
@@ -113,7 +113,7 @@ def _chances(
     for f in range(rho.shape[0]):
         if not rho[f] > SATISFIED_ABOVE:
             continue
-        buffer[:] = leaves[f]
+        copy_row(leaves[f], buffer)
         tree_value(parts.below, buffer)
         chance, dwells = 1.0, 0
         for k in range(count):

@@ -1,0 +1,133 @@
+"""Kernels as other kernels call them: each is compiled once, however many call it.
+
+numba writes every kernel into all that call it, optimises it there again, and gives it what Python needs to
+call it: three quarters of what LLVM had to do. Here a long kernel stays on its own, and those that call it
+name its symbol. It is the same in every process, and what comes from the disk first loads all that it calls.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+from collections.abc import Callable
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numba
+from llvmlite.binding import parse_assembly
+from numba.core import compiler
+
+njit: Any = numba.njit  # its types leave out the options
+Base: Any = compiler.Compiler
+Function = Callable[..., Any]
+# [instructions of LLVM, optimised] A kernel of no more is still written into those that call it. With 250 the
+# first start took as long, and decisions 1.013 times (`python -m benchmarks.episodes --against`).
+LONG = 700
+# Whether this numba has what it takes, of which its manual says nothing. Otherwise the kernels are compiled
+# as numba does it, in twice the time.
+POSSIBLE = "reload_init" in getattr(compiler.CompileResult, "_fields", ())
+_callees: dict[tuple[str, str], Any] = {}  # by module and name
+_symbols: dict[str, tuple[Any, ...]] = {}  # the types of arguments that each stands for
+
+
+class Entry(Base):  # type: ignore[misc]
+    """Compiles what Python calls: C does not."""
+
+    def compile_extra(self, function: Function) -> Any:
+        self.state.flags.no_cfunc_wrapper = True
+        return super().compile_extra(function)
+
+
+class _Callee(Entry):
+    """Compiles what only kernels call, by a name that is the same in every process."""
+
+    def compile_extra(self, function: Function) -> Any:
+        self.state.flags.no_cpython_wrapper = True
+        place = function.__module__, function.__qualname__
+        source = _source(_callees[place])
+        mangle = self.state.targetctx.mangler
+
+        def name(whole: str, types: Any, *, abi_tags: Any = (), uid: Any = None) -> Any:
+            if whole.removeprefix(".NumbaEnv.") == ".".join(place):
+                described = " ".join([source, *abi_tags, *map(str, types)])
+                symbol = mangle(whole, (), uid=hashlib.sha256(described.encode()).hexdigest()[:32])
+                if _symbols.setdefault(symbol, tuple(types)) == tuple(types):
+                    return symbol
+            return mangle(whole, types, abi_tags=abi_tags, uid=uid)
+
+        self.state.targetctx.mangler = name
+        return super().compile_extra(function)
+
+
+class _GoneError(Exception):
+    """What a kernel on the disk calls is not to be had any more."""
+
+
+class _Needed(NamedTuple):
+    """Sees to it that a symbol is there which a kernel from the disk calls."""
+
+    module: str
+    name: str
+    types: tuple[Any, ...]
+    symbol: str
+
+    def __call__(self) -> None:
+        importlib.import_module(self.module)
+        callee = _callees.get((self.module, self.name))
+        if callee is not None:
+            callee.compile(self.types)  # or loads it
+        if callee is None or self != _needed(callee.overloads.get(self.types)):
+            raise _GoneError
+
+
+def callee(function: Function, options: dict[str, Any], kept: Callable[[Any], Any]) -> Any:
+    """The function as kernels call it; `kept` sees to its cache."""
+    compiled = kept(njit(cache=True, pipeline_class=_Callee, **options)(function))
+    _callees[function.__module__, function.__qualname__] = compiled
+    cache = compiled._cache
+    files, save = cache._cache_file, cache.save_overload
+    name = cache._impl.filename_base + ".callee"  # besides what Python calls
+    cache._cache_file = type(files)(cache.cache_path, name, _source(compiled))
+
+    def link_and_save(types: Any, kernel: Any) -> None:
+        code = kernel.library._final_module.get_function(kernel.fndesc.mangled_name)
+        instructions = (instruction for block in code.blocks for instruction in block.instructions)
+        if not options.get("forceinline") and any(True for _ in islice(instructions, LONG, None)):
+            kernel.library._shared_module = parse_assembly("")  # what callers are given to write into them
+            kernel.library._reload_init.add(_needed(kernel))
+        save(types, kernel)
+
+    cache.save_overload = link_and_save
+    load_whole(compiled)
+    return compiled
+
+
+def load_whole(compiled: Any) -> None:
+    """From now on, what this takes from the disk loads all that it calls, or is compiled anew."""
+    load = compiled._cache.load_overload
+
+    def load_with_callees(types: Any, context: Any) -> Any:
+        try:
+            kernel = load(types, context)
+        except _GoneError:
+            return None
+        if kernel is None or kernel.signature.args != getattr(types, "args", types):
+            return None  # two processes wrote the same file
+        inherited = kernel.library._reload_init
+        inherited.update(kernel.reload_init)
+        if not any(True for _ in kernel.library._get_module_for_linking().functions):
+            inherited.add(_needed(kernel))
+        return kernel
+
+    compiled._cache.load_overload = load_with_callees
+
+
+def _needed(kernel: Any) -> _Needed | None:
+    if kernel is None:
+        return None
+    made = kernel.fndesc
+    return _Needed(made.modname, made.qualname, kernel.signature.args, made.mangled_name)
+
+
+def _source(compiled: Any) -> str:
+    return str(compiled._cache._impl.locator.get_source_stamp())
