@@ -23,6 +23,8 @@ from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
 
+LESS = 4  # [steps] of slack, down to which V has ways asked for. Chosen by hand.
+
 
 @quick
 @dataclass(frozen=True)
@@ -77,8 +79,10 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
-        if aimed.slack > 0 and care.on_way and not violated and True in left.tolist():
-            tried = _in_time(shield, prefix, tried, asked, aimed.slack)
+        by_chance = shield.config.threshold_over == "episode"  # then all slacks count, not the most alone
+        if aimed.slack > 0 and (care.on_way or by_chance) and not violated and True in left.tolist():
+            for steps in range(aimed.slack, max(aimed.slack - LESS, 0) if by_chance else aimed.slack - 1, -1):
+                tried = _in_time(shield, prefix, tried, asked, steps)
             kept = tried.rho
             if care.barred is not None and not vain:
                 kept = _aside(shield, care.barred, prefix, tried, kept)

@@ -175,12 +175,10 @@ def wary(config: Config, care: Care, taught: Taught, on_way: bool) -> Care:
     """What J asks for where the map may be wrong: time for a way around, and not by what led nowhere. on_way:
     as `Care` has it.
     """
-    care = replace(care, on_way=on_way)
-    if not config.learn_map:
-        return care
-    least = care.least if config.uncertainty is None else max(care.least, AROUND)
-    barred = taught.barred
-    return Care(care.margin, least, care.noise, care.stride, care.chance, barred if len(barred) else None)
+    least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
+    if config.learn_map and config.uncertainty is not None:
+        least = max(least, AROUND)
+    return Care(care.margin, least, care.noise, care.stride, care.chance, barred, on_way)
 
 
 def changes_map(learned: bytes | None) -> bool:
