@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import betabinom, binom, norm
 
+from specshield.policy.reachability.policy import synthesise
+from specshield.robot import STRETCH as ROBOT
 from specshield.shield.caution.experience import FORMAT, Seen, noise_of, observe, was_stopped
 from specshield.shield.episode import Carry, Config, decide, make_shield
 from specshield.shield.uncertainty import HARDER, MENDED, Noise, Uncertainty, margin_for, slack_for
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT, Cells, Scripted
 
 STRETCH = (0.01, math.radians(0.5), 0.05, True)  # what is assumed
@@ -129,3 +133,44 @@ def test_a_robot_that_slips_is_not_taken_to_be_held(loss, stands, stopped):
     nexts = np.array([world.pose(*world.after((0, 0, 0), m)) for m in range(4)])
     carry = Carry(0, nexts, (None,) * 4, residuals=FORMAT.pack(*seen))
     assert was_stopped(shield, carry, np.array([pose, pose])) == stopped
+
+
+@pytest.mark.parametrize(("width", "counted"), [(3.0, True), (0.5, False)])
+def test_slips_are_learned_as_often_as_they_occur(width, counted):
+    """Beside the walls of a narrow corridor nothing says whether a motion slipped or met something."""
+    free = np.ones((80, 80), bool)
+    free[40 - round(10 * width) : 40 + round(10 * width), 2:-2] = False
+    task = make_task(OccupancyGrid(free, 0.05), ROBOT, "F[0,400] x > 3.4")
+    shield = make_shield([synthesise(task)], Config(uncertainty=Uncertainty(), learn_map=True))
+    random, history, carry = np.random.default_rng(0), [(2.0, 2.0, 0.0)], None
+    logits = np.where(np.isin(ROBOT.action_names, ["m", "b", "zm"]), 0.0, -np.inf)
+    for _ in range(300):
+        found = decide(shield, history, logits, carry=carry)
+        slips = random.random() < 0.05
+        history.append(history[-1] if slips else tuple(found.next_poses[found.action]))
+        carry = found.carry
+    seen = Seen(*FORMAT.unpack(carry.residuals))
+    assert (seen.moved > 100.0) == counted
+    assert not counted or 0.02 < seen.lost / seen.moved < 0.09
+
+
+def test_a_robot_that_slipped_may_go_on_with_the_way_that_it_had_begun():
+    """The policy knows ways at the first step alone, and what is left of the way for waiting waits."""
+    world = Cells("F[0,5] A", None, {"A": (2, 0)})
+
+    class Once(Scripted):
+        def propose(self, history, signals, margin):
+            ways = {WAIT: [WAIT, FORWARD, FORWARD], FORWARD: [FORWARD], LEFT: [], RIGHT: []}
+            return Scripted(world, lambda t, motion: ways[motion] if len(history) == 1 else []).propose(
+                history, signals, margin
+            )
+
+    start, logits = world.pose(0, 0, 0), np.array([9.0, -9.0, -9.0, -9.0, -np.inf])
+    found = []
+    for uncertainty in (Uncertainty(0.0, 0.0, 0.1), None):
+        shield = make_shield([Once(world, lambda t, motion: [])], Config(uncertainty=uncertainty))
+        first = decide(shield, [start], logits)
+        assert first.action == FORWARD
+        found.append(decide(shield, [start, start], logits, carry=first.carry))
+    assert [each.j_values[FORWARD] for each in found] == [1.0, 0.0]
+    assert found[1].j_values[WAIT] == 1.0
