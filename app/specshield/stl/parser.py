@@ -76,8 +76,11 @@ _BINDING = {
     **dict.fromkeys("+-", SUM),
     **dict.fromkeys("*/", PRODUCT),
 }
-_COMPARE = "a comparison (< <= > >=)"
-_OPERAND = "a formula, a name or a number"
+_NO_CHAIN = {
+    IMPLIES: ("implications", "parentheses around one of them"),
+    UNTIL: ("untils", "parentheses around one of them"),
+    COMPARISON: ("comparisons", "'and' between two of them"),
+}
 
 _N = TypeVar("_N", bound=Node)
 
@@ -127,6 +130,9 @@ class _Parser:
         left = self._operand()
         while (level := _BINDING.get(self._token.kind, 0)) >= binding:
             left = self._infix(left, start, level)
+            if level in _NO_CHAIN and _BINDING.get(self._token.kind) == level:
+                problem, expected = _NO_CHAIN[level]
+                raise self._error(f"{problem} do not chain", self._token, expected)
         self._nesting -= 1
         return left
 
@@ -158,7 +164,7 @@ class _Parser:
                 return self._made(make(a, b, self._subformula(PREFIX)), token)
             case _:
                 self._index -= 1
-                raise self._unexpected(_OPERAND)
+                raise self._unexpected("a formula, a name or a number")
 
     def _infix(self, left: Node, start: int, level: int) -> Node:
         token = self._token
@@ -172,22 +178,16 @@ class _Parser:
             case "implies":
                 condition = self._as_formula(left)
                 self._next()
-                implied = self._made(Implies(condition, self._subformula(level + 1)), token)
-                self._refuse_chain(level, "implications do not chain", "parentheses around one of them")
-                return implied
+                return self._made(Implies(condition, self._subformula(level + 1)), token)
             case "U":
                 before = self._as_formula(left)
                 self._next()
                 a, b = self._window(token)
-                until = self._made(Until(a, b, before, self._subformula(level + 1)), token)
-                self._refuse_chain(level, "untils do not chain", "parentheses around one of them")
-                return until
+                return self._made(Until(a, b, before, self._subformula(level + 1)), token)
             case "<" | "<=" | ">" | ">=" as op:
                 lesser = self._as_term(left, start)
                 self._next()
-                comparison = self._made(Comparison(op, lesser, self._term(level + 1)), token)
-                self._refuse_chain(level, "comparisons do not chain", "'and' between two of them")
-                return comparison
+                return self._made(Comparison(op, lesser, self._term(level + 1)), token)
             case "+" | "-" | "*" | "/" as op:
                 first = self._as_term(left, start)
                 self._next()
@@ -206,7 +206,7 @@ class _Parser:
             return Atom(node.name)
         if not isinstance(node, Formula):
             problem = f"'{_clip(str(node))}' is a number, not true or false"
-            raise self._error(problem, self._token, _COMPARE)
+            raise self._error(problem, self._token, "a comparison (< <= > >=)")
         return node
 
     def _as_term(self, node: Node, start: int) -> Term:
@@ -274,10 +274,6 @@ class _Parser:
             problem = f"a horizon of {node.horizon} steps"
             raise self._error(problem, token, f"at most {limit} steps", HorizonError, got=node.horizon)
         return node
-
-    def _refuse_chain(self, level: int, problem: str, expected: str) -> None:
-        if _BINDING.get(self._token.kind) == level:
-            raise self._error(problem, self._token, expected)
 
     def _too_deep(self, token: Token) -> FormulaError:
         return self._error("the nesting is too deep", token, f"at most {MAX_DEPTH} levels")
