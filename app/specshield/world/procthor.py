@@ -63,8 +63,7 @@ def _polygons(house: Any) -> list[tuple[str, Polygon]]:
         try:
             found.append((kind, Polygon(tuple(outline))))
         except MapError as error:
-            error.at(f"{path}.floorPolygon")
-            raise
+            raise error.at(f"{path}.floorPolygon") from None
     return found
 
 
