@@ -9,24 +9,12 @@ import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from dataclasses import replace
 from types import TracebackType
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Concatenate,
-    Generic,
-    Literal,
-    ParamSpec,
-    Protocol,
-    TypeVar,
-    cast,
-    overload,
-)
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, cast, overload
 
 import httpx
 
 from specshield.client import bounded, calls
-from specshield.client.away import OnFailure
-from specshield.client.core import Feed, Flow, More, Wait, looks_like, page_of
+from specshield.client.core import D, Feed, Flow, More, P, T, Wait, looks_like, page_of
 from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.stream import AsyncStreams, packed
@@ -35,17 +23,9 @@ from specshield.client.wire import TRIES, Failure, Logits, Numbers, Points, Repl
 from specshield.errors import NotFound, SpecshieldError
 
 if TYPE_CHECKING:
-    from typing_extensions import TypeVar as Defaulted
     from typing_extensions import Unpack
 
     from specshield.client.models import Beginning
-
-    D = Defaulted("D", default=Decision)
-else:
-    D = TypeVar("D")
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 
 class Run(Protocol):
@@ -229,15 +209,7 @@ def pages(cls: type[T], resource: str) -> Callable[[Resource], AsyncIterator[T]]
 class AsyncSession(SessionState, Generic[D]):
     """`Session` for asyncio."""
 
-    def __init__(
-        self,
-        run: Run,
-        info: SessionInfo,
-        initial_pose: Numbers | None = None,
-        on_failure: OnFailure = "raise",
-    ) -> None:
-        super().__init__(info, initial_pose, on_failure)
-        self._run = run
+    _run: Run
 
     async def __aenter__(self) -> AsyncSession[D]:
         return self

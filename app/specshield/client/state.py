@@ -55,8 +55,14 @@ class SessionState:
     """
 
     def __init__(
-        self, info: SessionInfo, initial_pose: Numbers | None = None, on_failure: OnFailure = "raise"
+        self,
+        run: Any,
+        info: SessionInfo,
+        initial_pose: Numbers | None = None,
+        on_failure: OnFailure = "raise",
     ) -> None:
+        """run: performs a call, as the shell does."""
+        self._run = run
         self.info = info
         self.on_failure = on_failure
         self.t = info.next_t
