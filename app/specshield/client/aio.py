@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, cast, overload
@@ -19,7 +19,7 @@ from specshield.client.models import Decision, LocalDecision, Map, Policy, Sessi
 from specshield.client.state import SessionState
 from specshield.client.stream import AsyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Logits, Numbers, Points, Reply, Request
+from specshield.client.wire import TRIES, Failure, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
 if TYPE_CHECKING:
@@ -172,6 +172,13 @@ def awaiting_step(
     return method
 
 
+def deciding(
+    flow: Callable[Concatenate[AsyncSession[Any], P], Flow[Any]],
+) -> Callable[Concatenate[AsyncSession[D], P], Coroutine[Any, Any, D]]:
+    """As `awaiting_step`, of the call whose answer is what this session's steps give."""
+    return awaiting_step(flow)
+
+
 def opening(
     flow: Callable[P, Flow[SessionInfo]],
 ) -> Callable[Concatenate[Resource, P], Coroutine[Any, Any, AsyncSession]]:
@@ -222,23 +229,7 @@ class AsyncSession(SessionState, Generic[D]):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             await self._run(self._close(None, TRIES if error is None else 1))
 
-    if TYPE_CHECKING:
-
-        def step(
-            self,
-            pose: Numbers,
-            logits: Logits | None = None,
-            *,
-            main_task_done: bool | None = None,
-            signals: Mapping[str, float] | None = None,
-            witnesses: bool = False,
-            occupied: Points | None = None,
-            free: Points | None = None,
-            explain: bool = False,
-            deadline: float | None = None,
-        ) -> Coroutine[Any, Any, D]: ...
-    else:
-        step = awaiting_step(SessionState._step)
+    step = deciding(SessionState._step)
     switch = awaiting_step(SessionState._switch)
     trajectory = awaiting_step(SessionState._trajectory)
     save_record = awaiting_step(SessionState._save_record)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, cast, overload
@@ -18,7 +18,7 @@ from specshield.client.models import Decision, LocalDecision, Map, Policy, Sessi
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Logits, Numbers, Points, Reply, Request
+from specshield.client.wire import TRIES, Failure, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
 if TYPE_CHECKING:
@@ -175,6 +175,13 @@ def blocking_step(
     return method
 
 
+def deciding(
+    flow: Callable[Concatenate[Session[Any], P], Flow[Any]],
+) -> Callable[Concatenate[Session[D], P], D]:
+    """As `blocking_step`, of the call whose answer is what this session's steps give."""
+    return blocking_step(flow)
+
+
 def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resource, P], Session]:
     """The method that makes this call and gives the session that it tells of."""
 
@@ -220,23 +227,7 @@ class Session(SessionState, Generic[D]):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             self._run(self._close(None, TRIES if error is None else 1))
 
-    if TYPE_CHECKING:
-
-        def step(
-            self,
-            pose: Numbers,
-            logits: Logits | None = None,
-            *,
-            main_task_done: bool | None = None,
-            signals: Mapping[str, float] | None = None,
-            witnesses: bool = False,
-            occupied: Points | None = None,
-            free: Points | None = None,
-            explain: bool = False,
-            deadline: float | None = None,
-        ) -> D: ...
-    else:
-        step = blocking_step(SessionState._step)
+    step = deciding(SessionState._step)
     switch = blocking_step(SessionState._switch)
     trajectory = blocking_step(SessionState._trajectory)
     save_record = blocking_step(SessionState._save_record)
