@@ -102,14 +102,9 @@ class Policies(Claimed):
             raise error.at("robot") from None
         spec = about.spec
         try:
+            regions, signals = spec.get("regions"), spec.get("signals")
             return make_task(
-                world.grid,
-                robot,
-                spec["formula"],
-                spec.get("regions"),
-                world.rooms,
-                spec.get("signals"),
-                self._max_horizon,
+                world.grid, robot, spec["formula"], regions, world.rooms, signals, self._max_horizon
             )
         except FormulaError as error:
             raise error.at("formula").at("spec") if error.path is None else error.at("spec") from None

@@ -72,13 +72,12 @@ class Jobs:
         logs.tell("policy queued", policy_id=id, method=method)
 
     def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
+        settings = self._settings
         Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer).enqueue(
             "specshield.service.training.worker.train",
             id,
             attempt,
-            job_timeout=(
-                self._settings.training_timeout if learns(method) else self._settings.synthesis_timeout
-            ),
+            job_timeout=settings.training_timeout if learns(method) else settings.synthesis_timeout,
             result_ttl=0,
             failure_ttl=24 * 3600,
             at_front=at_front,
@@ -92,10 +91,8 @@ class Jobs:
         if status == "failed" and not state:
             error = "the store knows nothing of its training any more; ask for it again"
         if status == "training" and not alive:
-            status, error = (
-                "failed",
-                "its worker is gone; ask for it again, and the training goes on from its last checkpoint",
-            )
+            status = "failed"
+            error = "its worker is gone; ask for it again, and the training goes on from its last checkpoint"
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 
