@@ -58,11 +58,8 @@ def run(
         ids = [f"{case.name}-{i}-{how}" if named else None for how in ("shielded", "alone")]
         session, start, refused = begin(client, case, case.name, own, ids[0])
         model = load_learned(case.instruction)
-        return (
-            with_shield(session, case, model, start, own),
-            without_shield(client, case, model, start, own, id=ids[1]),
-            refused,
-        )
+        shielded = with_shield(session, case, model, start, own)
+        return shielded, without_shield(client, case, model, start, own, id=ids[1]), refused
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as robots:
         futures = [robots.submit(pair, i) for i in range(runs)]
