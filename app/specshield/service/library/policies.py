@@ -9,7 +9,6 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -276,20 +275,15 @@ class Policies(Claimed):
 
     def _shipped(self) -> Iterator[Record]:
         for path in sorted(self._models.glob("*/card.json")):
-            with _left_out(path.parent):
+            try:
                 card = files.read_json(path)
                 about = describe(card)
                 about = replace(about, map_id=self._maps.get(about.map_id).id)
-                yield Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)
-
-
-@contextmanager
-def _left_out(folder: Path) -> Iterator[None]:
-    """Logs why a policy cannot be loaded, and goes on: one broken folder must not stop the whole server."""
-    try:
-        yield
-    except (SpecshieldError, KeyError, ValueError) as error:
-        log.warning("policy %s is left out: %s", folder, error)
+                record = Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)
+            except (SpecshieldError, KeyError, ValueError) as error:
+                log.warning("policy %s is left out: %s", path.parent, error)
+                continue  # one broken folder must not stop the whole server
+            yield record
 
 
 def describe(card: Mapping[str, Any]) -> Description:
