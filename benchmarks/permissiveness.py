@@ -113,7 +113,7 @@ class Slack:
         self.values, self.stack = np.empty(value_count(self.rules)), np.empty(STACK)
 
     def here(self, history: Floats) -> float:
-        replay(self.rules, history, np.empty((len(history), 0)), self.status, self.run)
+        replay(self.rules, self.rules.margin, history, np.empty((len(history), 0)), self.status, self.run)
         t = len(history) - 1
         return float(
             slack(self.body, self.rules, self.tables, *history[-1].tolist(), t, self.status, self.run)
@@ -121,7 +121,7 @@ class Slack:
 
     def after(self, history: Floats) -> Floats:
         """[M]: after each motion from x_t."""
-        replay(self.rules, history, np.empty((len(history), 0)), self.status, self.run)
+        replay(self.rules, self.rules.margin, history, np.empty((len(history), 0)), self.status, self.run)
         out, t = np.empty(motion_count(self.body)), len(history)
         for m in range(len(out)):
             pose = step(self.body, *history[-1].tolist(), m)

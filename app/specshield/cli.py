@@ -83,15 +83,11 @@ def _commands() -> Iterator[Callable[..., None]]:
 
     yield from (serve, demo, policy, run_policy, watch, doctor, train, worker, verify, openapi)
     yield from (export, check_drive)
-    yield _keys()
+    from specshield.service.access.commands import app as keys
+
+    yield keys
     for registered in entry_points(group="specshield.commands"):
         yield registered.load()
-
-
-def _keys() -> Any:
-    from specshield.service.access.commands import app
-
-    return app
 
 
 def serve(

@@ -15,6 +15,7 @@ LOGITS = [0.0, 0.0, 0.0]
 
 def session(initial_pose=(0, 0, 0), **members):
     return SessionState(
+        None,
         build(SessionInfo, {**SESSION, "actions": ["m", "b", "end"], "terminal_actions": [END], **members}),
         initial_pose,
     )

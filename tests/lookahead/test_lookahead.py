@@ -206,6 +206,12 @@ TASK = flat("F[0,30] West and F[30,60] East and G[0,60] not Hole")
 ALL = np.ones(len(TASK.robot.actions), bool)
 
 
+def advance(ahead, belief, *seen):
+    """`LookAhead.step`, with what is believed in place of the memory."""
+    memory, added = ahead.step(belief.to_bytes(), *seen)
+    return Belief.from_bytes(memory, len(TASK.robot.motions)), added
+
+
 def drive(speak, steps=25, start=(-0.4, 2.4, 0.2), forced=FORCED):
     """Beliefs and additions along the way of a model that is let go where it wants to.
 
@@ -218,7 +224,7 @@ def drive(speak, steps=25, start=(-0.4, 2.4, 0.2), forced=FORCED):
     random = np.random.default_rng(0)
     for t in range(steps):
         log_prior = log_softmax(speak(t, history[-1], random))
-        belief, added = ahead.advance(belief, np.array(history), {}, log_prior, ALL)
+        belief, added = advance(ahead, belief, np.array(history), {}, log_prior, ALL)
         given.append((belief, added))
         weights = np.where(TASK.robot.terminal, 0.0, np.exp(log_prior))
         action = random.choice(len(weights), p=weights / weights.sum())
@@ -287,8 +293,8 @@ def test_it_is_pure_and_its_memory_travels_as_bytes():
     assert len(memory) < 8_000
     log_prior = log_softmax(seeks(0)(11, history[11], None))
     again = ahead.step(memory, history[:12], {}, log_prior, ALL)
-    once, added_once = ahead.advance(belief, history[:12], {}, log_prior, ALL)
-    assert again[0] == once.to_bytes()
+    once, added_once = ahead.step(bytes(memory), history[:12], {}, log_prior, ALL)
+    assert again[0] == once
     older = ahead.step(memory[:-8], history[:12], {}, log_prior, ALL)  # written by another version
     assert older[0] == ahead.step(ahead.begin(), history[:12], {}, log_prior, ALL)[0]
     np.testing.assert_array_equal(again[1], added_once)
@@ -304,7 +310,7 @@ def test_it_learns_but_prefers_nothing_until_the_rule_has_cost_enough():
     going_on = np.where(TASK.robot.terminal, 0.0, np.exp(log_prior))
     likeliest = int(np.argmax(going_on))
     for feasible in (~TASK.robot.terminal & (np.arange(len(going_on)) != likeliest), going_on == 0.0):
-        after, added = ahead.advance(belief, history[:12], {}, log_prior, feasible)
+        after, added = advance(ahead, belief, history[:12], {}, log_prior, feasible)
         kept = going_on[feasible].sum() / going_on.sum()
         forced = -going_on.sum() * math.log(kept) if kept > 0.0 else FORCED
         assert after.forced == pytest.approx(forced)

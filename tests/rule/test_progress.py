@@ -46,7 +46,7 @@ def status_of(rules, xs, signals=()):
     rows = np.reshape(signals, (len(xs), -1)).astype(float)
     k = len(rules.kind)
     status, run = np.full(k, 9, np.int8), np.full(k, 9)
-    replay(rules, poses, rows, status, run)
+    replay(rules, rules.margin, poses, rows, status, run)
     return status
 
 

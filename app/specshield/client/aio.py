@@ -6,46 +6,26 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import replace
 from types import TracebackType
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Concatenate,
-    Generic,
-    Literal,
-    ParamSpec,
-    Protocol,
-    TypeVar,
-    cast,
-    overload,
-)
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, cast, overload
 
 import httpx
 
 from specshield.client import bounded, calls
-from specshield.client.away import OnFailure
-from specshield.client.core import Feed, Flow, More, Wait, looks_like, page_of
+from specshield.client.core import D, Feed, Flow, More, P, T, Wait, looks_like, page_of
 from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.stream import AsyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Logits, Numbers, Points, Reply, Request
+from specshield.client.wire import TRIES, Failure, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
 if TYPE_CHECKING:
-    from typing_extensions import TypeVar as Defaulted
     from typing_extensions import Unpack
 
     from specshield.client.models import Beginning
-
-    D = Defaulted("D", default=Decision)
-else:
-    D = TypeVar("D")
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 
 class Run(Protocol):
@@ -192,6 +172,13 @@ def awaiting_step(
     return method
 
 
+def deciding(
+    flow: Callable[Concatenate[AsyncSession[Any], P], Flow[Any]],
+) -> Callable[Concatenate[AsyncSession[D], P], Coroutine[Any, Any, D]]:
+    """As `awaiting_step`, of the call whose answer is what this session's steps give."""
+    return awaiting_step(flow)
+
+
 def opening(
     flow: Callable[P, Flow[SessionInfo]],
 ) -> Callable[Concatenate[Resource, P], Coroutine[Any, Any, AsyncSession]]:
@@ -229,15 +216,7 @@ def pages(cls: type[T], resource: str) -> Callable[[Resource], AsyncIterator[T]]
 class AsyncSession(SessionState, Generic[D]):
     """`Session` for asyncio."""
 
-    def __init__(
-        self,
-        run: Run,
-        info: SessionInfo,
-        initial_pose: Numbers | None = None,
-        on_failure: OnFailure = "raise",
-    ) -> None:
-        super().__init__(info, initial_pose, on_failure)
-        self._run = run
+    _run: Run
 
     async def __aenter__(self) -> AsyncSession[D]:
         return self
@@ -250,23 +229,7 @@ class AsyncSession(SessionState, Generic[D]):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             await self._run(self._close(None, TRIES if error is None else 1))
 
-    if TYPE_CHECKING:
-
-        def step(
-            self,
-            pose: Numbers,
-            logits: Logits | None = None,
-            *,
-            main_task_done: bool | None = None,
-            signals: Mapping[str, float] | None = None,
-            witnesses: bool = False,
-            occupied: Points | None = None,
-            free: Points | None = None,
-            explain: bool = False,
-            deadline: float | None = None,
-        ) -> Coroutine[Any, Any, D]: ...
-    else:
-        step = awaiting_step(SessionState._step)
+    step = deciding(SessionState._step)
     switch = awaiting_step(SessionState._switch)
     trajectory = awaiting_step(SessionState._trajectory)
     save_record = awaiting_step(SessionState._save_record)

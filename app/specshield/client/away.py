@@ -104,9 +104,8 @@ class Continuation:
                 f"the robot is {math.hypot(x, y):.2f} m and {abs(turn):.2f} rad from where the certified "
                 "continuation leads"
             )
-        return (
-            branch if branch.plan else "the certified continuation has ended: the rule's last step is reached"
-        )
+        ended = "the certified continuation has ended: the rule's last step is reached"
+        return branch if branch.plan else ended
 
     def follow(self, pose: Pose) -> None:
         """From `pose` the next action is run: what leads on is where that ends, or nothing from elsewhere."""

@@ -10,25 +10,11 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
+from specshield.client import wire
 from specshield.client.away import OnFailure, on_failure_value
 from specshield.client.core import Flow, Wait, call, deliver, erase
 from specshield.client.models import Map, Policy, SessionInfo, Spec, build
-from specshield.client.wire import (
-    Content,
-    Failure,
-    Numbers,
-    Reply,
-    Request,
-    check,
-    content,
-    encode,
-    error_of,
-    get,
-    json_object,
-    path,
-    pose_values,
-    post,
-)
+from specshield.client.wire import Content, Failure, Numbers, Reply, Request
 from specshield.errors import InputError, SessionExists, StoreError, TransportError, TransportTimeout
 
 log = logging.getLogger("specshield")
@@ -42,8 +28,8 @@ def wait_until_ready(timeout: float) -> Flow[None]:
         outcome = yield Request("GET", "/readyz")
         seconds += outcome.seconds
         if isinstance(outcome, Reply) and outcome.status not in (502, 503, 504):
-            return check(outcome)
-        error = outcome.error if isinstance(outcome, Failure) else error_of(outcome)
+            return wire.check(outcome)
+        error = outcome.error if isinstance(outcome, Failure) else wire.error_of(outcome)
         if seconds + READY_EVERY > timeout:
             raise TransportTimeout(f"not ready after {seconds:.0f} s: {error}") from error
         yield Wait(READY_EVERY)
@@ -63,7 +49,7 @@ def validate(
     """
     optional = {"regions": regions, "signals": signals, "map_id": map_id}
     body = {"formula": formula, **{name: value for name, value in optional.items() if value is not None}}
-    return build(Spec, (yield from call(post("specs", "validate", body=body))))
+    return build(Spec, (yield from call(wire.post("specs", "validate", body=body))))
 
 
 def create_map(format: str, **members: Any) -> Flow[Map]:
@@ -74,15 +60,18 @@ def create_map(format: str, **members: Any) -> Flow[Map]:
     A member that is bytes or the path object of a file makes all of them go as files, as `map_server` wants.
     """
     if not any(isinstance(member, bytes | os.PathLike) for member in members.values()):
-        return build(Map, (yield from call(post("maps", body={"format": format, **members}, slow=True))))
-    parts = {name: content(member, name) for name, member in {"format": format, **members}.items()}
+        return build(Map, (yield from call(wire.post("maps", body={"format": format, **members}, slow=True))))
+    parts = {name: wire.content(member, name) for name, member in {"format": format, **members}.items()}
     files = {name: (name, part, "application/octet-stream") for name, part in parts.items()}
-    return build(Map, (yield from call(Request("POST", path("maps"), files=files, slow=True))))
+    return build(Map, (yield from call(Request("POST", wire.path("maps"), files=files, slow=True))))
 
 
 def upload_map(metadata: Content, image: Content, *, name: str | None = None) -> Flow[Map]:
     """A ROS map_server map: YAML and PGM or PNG, each its content or the path object of a file."""
-    read: dict[str, Content] = {"metadata": content(metadata, "metadata"), "image": content(image, "image")}
+    read: dict[str, Content] = {
+        "metadata": wire.content(metadata, "metadata"),
+        "image": wire.content(image, "image"),
+    }
     return (yield from create_map("map_server", **read, **_named(name)))
 
 
@@ -109,18 +98,18 @@ def _named(name: str | None) -> dict[str, str]:
 
 def get_map(id: str) -> Flow[Map]:
     """A map by its id, or by its name if it came with the server."""
-    return build(Map, (yield from call(get("maps", id))))
+    return build(Map, (yield from call(wire.get("maps", id))))
 
 
 def delete_map(id: str) -> Flow[None]:
     """Remove a map. InUse while a policy is for it."""
-    return (yield from erase(Request("DELETE", path("maps", id))))
+    return (yield from erase(Request("DELETE", wire.path("maps", id))))
 
 
 def map_image(id: str) -> Flow[bytes]:
     """The map as PNG: white is free, black occupied."""
-    delivery = yield from deliver(get("maps", id, "image.png", slow=True))
-    check(delivery.reply)
+    delivery = yield from deliver(wire.get("maps", id, "image.png", slow=True))
+    wire.check(delivery.reply)
     return delivery.reply.content
 
 
@@ -152,29 +141,29 @@ def create_policy(
         "options": options or {},
         **_named(name),
     }
-    return build(Policy, (yield from call(post("policies", body=body, slow=True))))
+    return build(Policy, (yield from call(wire.post("policies", body=body, slow=True))))
 
 
 def upload_policy(weights: Content, card: Content | Mapping[str, Any]) -> Flow[Policy]:
     """A policy made elsewhere: safetensors and its card, each the content or a path object."""
-    told = encode(card) if isinstance(card, Mapping) else content(card, "card")
+    told = wire.encode(card) if isinstance(card, Mapping) else wire.content(card, "card")
     files = {
-        "weights": ("policy.safetensors", content(weights, "weights"), "application/octet-stream"),
+        "weights": ("policy.safetensors", wire.content(weights, "weights"), "application/octet-stream"),
         "card": ("card.json", told, "application/json"),
     }
-    return build(Policy, (yield from call(Request("POST", path("policies"), files=files, slow=True))))
+    return build(Policy, (yield from call(Request("POST", wire.path("policies"), files=files, slow=True))))
 
 
 def policy_image(id: str) -> Flow[bytes]:
     """The floor as SVG, and from where the policy can keep the rule."""
-    delivery = yield from deliver(get("policies", id, "image.svg", slow=True))
-    check(delivery.reply)
+    delivery = yield from deliver(wire.get("policies", id, "image.svg", slow=True))
+    wire.check(delivery.reply)
     return delivery.reply.content
 
 
 def get_policy(id: str) -> Flow[Policy]:
     """A policy by its id, or by its name if it came with the server: how far it is, what was measured."""
-    return build(Policy, (yield from call(get("policies", id))))
+    return build(Policy, (yield from call(wire.get("policies", id))))
 
 
 def delete_policy(id: str) -> Flow[None]:
@@ -182,7 +171,7 @@ def delete_policy(id: str) -> Flow[None]:
 
     Sent once: the first DELETE cancels a training, a second one would remove what is left of it.
     """
-    return (yield from erase(Request("DELETE", path("policies", id), tries=1)))
+    return (yield from erase(Request("DELETE", wire.path("policies", id), tries=1)))
 
 
 def wait_policy(
@@ -200,9 +189,9 @@ def wait_policy(
     seconds, policy = 0.0, None
     while True:
         try:
-            delivery = yield from deliver(get("policies", id))
+            delivery = yield from deliver(wire.get("policies", id))
             seconds += delivery.seconds
-            policy = build(Policy, json_object(delivery.reply))
+            policy = build(Policy, wire.json_object(delivery.reply))
         except (TransportError, StoreError) as error:
             if policy is None:
                 raise
@@ -265,7 +254,7 @@ def create_session(
     key = str(uuid.uuid4()) if id is None else id
     body: dict[str, Any] = {
         "id": key,
-        "initial_pose": pose_values(initial_pose, "initial_pose"),
+        "initial_pose": wire.pose_values(initial_pose, "initial_pose"),
         "seed": seed,
         "threshold": threshold,
         "margin": margin,
@@ -280,13 +269,13 @@ def create_session(
         **asked,
     }
     body.update({} if max_steps is None else {"max_steps": max_steps})
-    delivery = yield from deliver(post("sessions", body=body, slow=True))
+    delivery = yield from deliver(wire.post("sessions", body=body, slow=True))
     try:
-        return build(SessionInfo, json_object(delivery.reply))
+        return build(SessionInfo, wire.json_object(delivery.reply))
     except SessionExists:  # after a lost answer of our own it is this very session, which is read back
         if delivery.tries == 1:
             raise
-        told = yield from call(get("sessions", key))
+        told = yield from call(wire.get("sessions", key))
         if id is not None and not (yield from _begins(body, told)):  # the caller's id was in use before
             raise
         return build(SessionInfo, told)
@@ -326,9 +315,9 @@ def get_session(id: str, *, on_failure: OnFailure = "raise") -> Flow[SessionInfo
     the rule's clock falls behind.
     """
     on_failure_value(on_failure)
-    return build(SessionInfo, (yield from call(get("sessions", id))))
+    return build(SessionInfo, (yield from call(wire.get("sessions", id))))
 
 
 def delete_session(id: str) -> Flow[None]:
     """Erase it with its trajectory."""
-    return (yield from erase(Request("DELETE", path("sessions", id))))
+    return (yield from erase(Request("DELETE", wire.path("sessions", id))))

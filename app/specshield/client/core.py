@@ -18,12 +18,22 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from specshield.client.models import Page, build
 from specshield.client.wire import Failure, Reply, Request, check, error_of, get, json_object
 from specshield.errors import NotFound, SpecshieldError, Starting, TrainingUnavailable
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar as Defaulted
+
+    from specshield.client.models import Decision
+
+    D = Defaulted("D", default=Decision)  # what a step of a session gives
+else:
+    D = TypeVar("D")
+
+P = ParamSpec("P")
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 BACKOFF = 0.05  # s before the second try, doubled for each that follows

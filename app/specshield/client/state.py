@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from specshield.client import wire
 from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
 from specshield.client.calls import policies_asked
 from specshield.client.core import Flow, Within, call, deliver
@@ -26,23 +27,7 @@ from specshield.client.models import (
     build,
     execute_of,
 )
-from specshield.client.wire import (
-    TRIES,
-    Logits,
-    Numbers,
-    Points,
-    Reply,
-    check,
-    deadline_value,
-    get,
-    json_object,
-    logit_values,
-    point_values,
-    pose_values,
-    post,
-    signal_values,
-    timings,
-)
+from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
 from specshield.errors import HistoryConflict, HistoryGap, SpecshieldError, StepConflict
 
 
@@ -55,8 +40,14 @@ class SessionState:
     """
 
     def __init__(
-        self, info: SessionInfo, initial_pose: Numbers | None = None, on_failure: OnFailure = "raise"
+        self,
+        run: Any,
+        info: SessionInfo,
+        initial_pose: Numbers | None = None,
+        on_failure: OnFailure = "raise",
     ) -> None:
+        """run: performs a call, as the shell does."""
+        self._run = run
         self.info = info
         self.on_failure = on_failure
         self.t = info.next_t
@@ -65,7 +56,7 @@ class SessionState:
         self.main_task_done = info.main_task_done
         self.closed = False
         self._stored = info.next_t  # poses the server has, as far as is known
-        self._poses: dict[int, Pose] = {} if initial_pose is None else {0: pose_values(initial_pose)}
+        self._poses: dict[int, Pose] = {} if initial_pose is None else {0: wire.pose_values(initial_pose)}
         self._continuation = Continuation(info.margin)
         self._circuit = Circuit()
         self._unanswered = -1  # the step that was asked for last without an answer, and not passed over
@@ -88,7 +79,7 @@ class SessionState:
 
         Where x_t is on the certified continuation, its next action is taken to be the one that is run.
         """
-        self._poses[self.t] = pose_values(pose)
+        self._poses[self.t] = wire.pose_values(pose)
         self._continuation.follow(self._poses[self.t])
         self.t += 1
 
@@ -119,18 +110,18 @@ class SessionState:
         there is remembered; signals sent there are lost. While the service is known to be away, it is asked
         again at pauses of 0.25 to 4 s, once, and steps in between cost nothing.
         """
-        yield Within(None if deadline is None else deadline_value(deadline))
-        x_t = pose_values(pose)
+        yield Within(None if deadline is None else wire.deadline_value(deadline))
+        x_t = wire.pose_values(pose)
         body: dict[str, Any] = {
-            "logits": None if logits is None else logit_values(logits),
+            "logits": None if logits is None else wire.logit_values(logits),
             "main_task_done": self.main_task_done if main_task_done is None else main_task_done,
             "witnesses": witnesses,
         }
         if signals is not None:
-            body["signals"] = signal_values(signals)
+            body["signals"] = wire.signal_values(signals)
         for name, points in (("occupied", occupied), ("free", free)):
             if points is not None:
-                body[name] = point_values(points, name)
+                body[name] = wire.point_values(points, name)
         if explain:
             body["explain"] = True
         own = main_task_done is None
@@ -183,7 +174,7 @@ class SessionState:
     def _decided(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
         t, over, poses = self.t, body["main_task_done"], {**self._poses, self.t: x_t}
         reply = yield from self._send("steps", poses, t, body, tries)
-        decision = _decision(json_object(reply), self.info, over, timings(reply))
+        decision = _decision(wire.json_object(reply), self.info, over, wire.timings(reply))
         self._poses, self._stored, self.t, self._unanswered = poses, t + 1, t + 1, -1
         self.spec_status = decision.spec_status
         ends = own and decision.action in self.info.terminal_actions
@@ -222,13 +213,13 @@ class SessionState:
         """
         yield Within(None)
         body = {**policies_asked(policy_id, policy_ids), "clock": clock}
-        poses = self._poses if pose is None else {**self._poses, self.t: pose_values(pose)}
+        poses = self._poses if pose is None else {**self._poses, self.t: wire.pose_values(pose)}
         if pose is None:
-            told = post("sessions", self.id, "switch", body={"t": self.t, **body}, slow=True)
+            told = wire.post("sessions", self.id, "switch", body={"t": self.t, **body}, slow=True)
             reply = (yield from deliver(told)).reply
         else:
             reply = yield from self._send("switch", poses, self.t, body, slow=True)
-        info = build(SessionInfo, json_object(reply))
+        info = build(SessionInfo, wire.json_object(reply))
         self.info, self.spec_status, self.finished = info, info.spec_status, info.finished
         self._poses, self._continuation = poses, Continuation(info.margin)
         self._stored = max(self._stored, self.t + (pose is not None))
@@ -241,12 +232,12 @@ class SessionState:
     def _close(self, pose: Numbers | None, tries: int) -> Flow[Verdict]:
         """With no pose at hand (a session read back, not stepped) it closes on what the server has."""
         yield Within(None)
-        poses = self._poses if pose is None else {**self._poses, self.t: pose_values(pose)}
+        poses = self._poses if pose is None else {**self._poses, self.t: wire.pose_values(pose)}
         if poses:
             reply = yield from self._send("close", poses, max(poses), {}, tries)
         else:
-            reply = (yield from deliver(post("sessions", self.id, "close", body={}, tries=tries))).reply
-        verdict = build(Verdict, json_object(reply))
+            reply = (yield from deliver(wire.post("sessions", self.id, "close", body={}, tries=tries))).reply
+        verdict = build(Verdict, wire.json_object(reply))
         self.closed = self.finished = True
         self.spec_status = verdict.spec_status
         return verdict
@@ -263,7 +254,7 @@ class SessionState:
 
     def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
         """The states x_0..x_t that the server has, and its answers."""
-        body = yield from call(get("sessions", self.id, "trajectory", slow=True))
+        body = yield from call(wire.get("sessions", self.id, "trajectory", slow=True))
         raw: Page[Any] = build(Page, body)
         return tuple(build(TrajectoryItem, item) for item in raw.items)
 
@@ -272,8 +263,8 @@ class SessionState:
 
         Who keeps the seal can tell later that a record shown to them is this one.
         """
-        reply = (yield from deliver(get("sessions", self.id, "record", slow=True))).reply
-        check(reply)
+        reply = (yield from deliver(wire.get("sessions", self.id, "record", slow=True))).reply
+        wire.check(reply)
         Path(path).write_bytes(reply.content)
         return reply.headers.get("x-record-seal", "")
 
@@ -291,7 +282,7 @@ class SessionState:
         """
         poses, start, gaps, joined = dict(poses), min(self._stored, t), 0, -1
         while True:
-            request = post(
+            request = wire.post(
                 "sessions",
                 self.id,
                 action,
@@ -302,7 +293,7 @@ class SessionState:
             )
             reply = (yield from deliver(request)).reply
             try:
-                check(reply)
+                wire.check(reply)
             except HistoryGap as gap:
                 start, gaps = gap.details.get("expected_t", -1), gaps + 1
                 if gaps > 1 or not isinstance(start, int) or not all(i in poses for i in range(start, t)):
@@ -311,7 +302,7 @@ class SessionState:
                 start = conflict.details.get("t", -1)
                 if not joined < start < self.t:
                     raise  # it is x_t that differs
-                poses[start], joined = pose_values(conflict.details["stored"]), start
+                poses[start], joined = wire.pose_values(conflict.details["stored"]), start
                 self._stored = max(self._stored, start + 1)
             else:
                 return reply

@@ -88,14 +88,13 @@ class Streams:
         return exchange.streamed(status, PROBLEM if status != 200 else {}, document)
 
 
-def _refusal(error: Exception) -> httpx.Response | None:
-    """The HTTP answer that refuses a handshake."""
+def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
+    """What a try came to on a connection that failed: an HTTP answer may have refused the handshake."""
     answer = getattr(error, "response", None)
     if answer is None:
-        return None
-    return httpx.Response(
-        answer.status_code, headers=dict(answer.headers.raw_items()), content=bytes(answer.body or b"")
-    )
+        return exchange.failure(httpx.ReadError(str(error)))
+    refusal = httpx.Response(answer.status_code, headers=dict(answer.headers.raw_items()))
+    return exchange.told(refusal, bytes(answer.body or b""))
 
 
 class SyncStreams(Streams):
@@ -117,10 +116,7 @@ class SyncStreams(Streams):
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
             leave(connection)
-            refusal = _refusal(error)
-            if refusal is not None:
-                return exchange.told(refusal)
-            return exchange.failure(httpx.ReadError(str(error)))
+            return _failed(exchange, error)
         if reply is None:
             leave(connection)
             return exchange.failure(httpx.ReadError(STALE))
@@ -180,10 +176,7 @@ class AsyncStreams(Streams):
         except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
-            refusal = _refusal(error)
-            if refusal is not None:
-                return exchange.told(refusal)
-            return exchange.failure(httpx.ReadError(str(error)))
+            return _failed(exchange, error)
         return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     async def _asked(self, exchange: Exchange, message: bytes) -> Reply | None:

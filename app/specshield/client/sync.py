@@ -5,46 +5,26 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import TracebackType
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Concatenate,
-    Generic,
-    Literal,
-    ParamSpec,
-    Protocol,
-    TypeVar,
-    cast,
-    overload,
-)
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, cast, overload
 
 import httpx
 
 from specshield.client import bounded, calls
-from specshield.client.away import OnFailure
-from specshield.client.core import Feed, Flow, More, Wait, looks_like, page_of
+from specshield.client.core import D, Feed, Flow, More, P, T, Wait, looks_like, page_of
 from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Logits, Numbers, Points, Reply, Request
+from specshield.client.wire import TRIES, Failure, Reply, Request
 from specshield.errors import NotFound, SpecshieldError
 
 if TYPE_CHECKING:
-    from typing_extensions import TypeVar as Defaulted
     from typing_extensions import Unpack
 
     from specshield.client.models import Beginning
-
-    D = Defaulted("D", default=Decision)
-else:
-    D = TypeVar("D")
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 
 class Run(Protocol):
@@ -195,6 +175,13 @@ def blocking_step(
     return method
 
 
+def deciding(
+    flow: Callable[Concatenate[Session[Any], P], Flow[Any]],
+) -> Callable[Concatenate[Session[D], P], D]:
+    """As `blocking_step`, of the call whose answer is what this session's steps give."""
+    return blocking_step(flow)
+
+
 def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resource, P], Session]:
     """The method that makes this call and gives the session that it tells of."""
 
@@ -226,15 +213,7 @@ def pages(cls: type[T], resource: str) -> Callable[[Resource], Iterator[T]]:
 class Session(SessionState, Generic[D]):
     """A session; as a context manager it is closed at the end, and its trajectory stays."""
 
-    def __init__(
-        self,
-        run: Run,
-        info: SessionInfo,
-        initial_pose: Numbers | None = None,
-        on_failure: OnFailure = "raise",
-    ) -> None:
-        super().__init__(info, initial_pose, on_failure)
-        self._run = run
+    _run: Run
 
     def __enter__(self) -> Session[D]:
         return self
@@ -248,23 +227,7 @@ class Session(SessionState, Generic[D]):
         with contextlib.suppress(NotFound if error is None else SpecshieldError):
             self._run(self._close(None, TRIES if error is None else 1))
 
-    if TYPE_CHECKING:
-
-        def step(
-            self,
-            pose: Numbers,
-            logits: Logits | None = None,
-            *,
-            main_task_done: bool | None = None,
-            signals: Mapping[str, float] | None = None,
-            witnesses: bool = False,
-            occupied: Points | None = None,
-            free: Points | None = None,
-            explain: bool = False,
-            deadline: float | None = None,
-        ) -> D: ...
-    else:
-        step = blocking_step(SessionState._step)
+    step = deciding(SessionState._step)
     switch = blocking_step(SessionState._switch)
     trajectory = blocking_step(SessionState._trajectory)
     save_record = blocking_step(SessionState._save_record)

@@ -103,14 +103,13 @@ class Exchange:
         """None for an answer to another request: it came late, and its connection has to go."""
         if response.headers.get(MINE, self._id) != self._id:
             return None
-        names = {name.lower(): value for name, value in response.headers.items()}
-        reply = Reply(response.status_code, names, b"".join(self._chunks), *self._taken())
+        reply = self.told(response, b"".join(self._chunks))
         return None if stale(self.request, reply) else reply
 
-    def told(self, response: httpx.Response) -> Reply:
+    def told(self, response: httpx.Response, content: bytes) -> Reply:
         """A whole answer, such as the refusal of a WebSocket's handshake."""
         names = {name.lower(): value for name, value in response.headers.items()}
-        return Reply(response.status_code, names, response.content, *self._taken())
+        return Reply(response.status_code, names, content, *self._taken())
 
     def streamed(self, status: int, headers: dict[str, str], document: Any) -> Reply | None:
         """An answer that came as a message; None for one about another step."""

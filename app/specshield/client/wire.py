@@ -264,7 +264,8 @@ def check(reply: Reply) -> None:
 
 def error_of(reply: Reply) -> SpecshieldError:
     """The class its problem document's `type` names (RFC 9457), holding all the document says."""
-    document = _problem(reply)
+    problem = reply.headers.get("content-type", "").startswith("application/problem+json")
+    document = reply.document if problem and isinstance(reply.document, dict) else None
     if document is None and reply.status in _GATEWAY:  # something in front of the server spoke
         return _GATEWAY[reply.status](
             f"the server cannot be reached: status {reply.status}", status=reply.status
@@ -283,12 +284,6 @@ def error_of(reply: Reply) -> SpecshieldError:
     )
     error.details.update({"status": reply.status, **{k: v for k, v in document.items() if k not in told}})
     return error
-
-
-def _problem(reply: Reply) -> dict[str, Any] | None:
-    if not reply.headers.get("content-type", "").startswith("application/problem+json"):
-        return None
-    return reply.document if isinstance(reply.document, dict) else None
 
 
 def stale(request: Request, reply: Reply) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,6 +14,9 @@ from specshield.errors import InputError, NotFound
 
 if TYPE_CHECKING:  # every command line reads this module
     from specshield.world.regions import Region
+
+
+WRITERS = {"mcap": "foxglove", "rrd": "rerun", "parquet": "tables", "csv": "tables"}  # where `write_...` is
 
 
 def export(
@@ -53,15 +57,7 @@ def export(
     recording = of_record(found, grid, rooms, step_seconds)
     path = out or Path(f"{recording.id}.{to}")
     try:
-        if to == "mcap":
-            from specshield.recordings.foxglove import write_mcap as write
-        elif to == "rrd":
-            from specshield.recordings.rerun import write_rrd as write
-        elif to == "parquet":
-            from specshield.recordings.tables import write_parquet as write
-        else:
-            from specshield.recordings.tables import write_csv as write
-        write(recording, path)
+        getattr(import_module(f"specshield.recordings.{WRITERS[to]}"), f"write_{to}")(recording, path)
     except OSError as error:
         raise InputError(
             f"{path} cannot be written: {error.strerror or error}",

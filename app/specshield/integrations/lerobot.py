@@ -10,15 +10,14 @@ with discrete actions needs none of this: give its logits to `session.step`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 
-from specshield.arrays import Floats
 from specshield.client.models import Decision
-from specshield.integrations.samples import SampleShield
+from specshield.integrations.samples import Sampled
 
 
 class Policy(Protocol):
@@ -29,18 +28,11 @@ class Policy(Protocol):
     def reset(self) -> None: ...
 
 
-class ShieldedPolicy:
-    """`policy` inside the rule of a shield's session; row_of and samples as in `openpi.ShieldedPolicy`."""
+class ShieldedPolicy(Sampled):
+    """`policy` inside the rule of a shield's session; the arguments are those of `Sampled`."""
 
-    def __init__(
-        self,
-        policy: Policy,
-        shield: SampleShield,
-        row_of: Callable[[float, float, Floats], Floats],
-        samples: int = 8,
-    ) -> None:
-        self._policy, self._shield, self._row_of, self._samples = policy, shield, row_of, samples
-        self.decision: Decision | None = None
+    _policy: Policy
+    decision: Decision | None = None
 
     @torch.no_grad()
     def select_action(self, observation: Mapping[str, Any]) -> torch.Tensor:
@@ -52,9 +44,7 @@ class ShieldedPolicy:
         self.decision = chosen.decision
         if chosen.sample is not None:
             return chunks[chosen.sample][:, 0]
-        action = self._shield.robot.actions[chosen.action]
-        row = self._row_of(action.translate, action.rotate, rows[0])
-        return torch.as_tensor(np.asarray(row)[None]).to(chunks[0])
+        return torch.as_tensor(np.asarray(self._instead(chosen, rows[0]))[None]).to(chunks[0])
 
     def _observed(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
         """What `predict_action_chunk` is to be given. A policy that looks at several observations keeps them
@@ -67,7 +57,3 @@ class ShieldedPolicy:
         queues["action"].clear()  # else it would run an older chunk to its end, and draw no new one
         self._policy.select_action(dict(observation))
         return dict.fromkeys(kept)
-
-    def reset(self) -> None:
-        """Of the policy; a session is for one episode, so a new one takes a new wrapper."""
-        self._policy.reset()

@@ -72,6 +72,32 @@ class SampleShield:
         return Chosen(decision.execute, int(own[0]) if len(own) else None, decision)
 
 
+class Sampled:
+    """`policy` inside the rule of a shield's session.
+
+    row_of: a row of actions [D] that makes the robot's motion of `translate` [m] and `rotate` [rad], like the
+    given row in all else: what is run where no sample is allowed. samples: how often the policy is asked.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        shield: SampleShield,
+        row_of: Callable[[float, float, Floats], Floats],
+        samples: int = 8,
+    ) -> None:
+        self._policy, self._shield, self._row_of, self._samples = policy, shield, row_of, samples
+
+    def reset(self) -> None:
+        """Of the policy; a session is for one episode, so a new one takes a new wrapper."""
+        self._policy.reset()
+
+    def _instead(self, chosen: Chosen, row: Floats) -> Floats:
+        """The row that is run where no sample is allowed."""
+        action = self._shield.robot.actions[chosen.action]
+        return self._row_of(action.translate, action.rotate, row)
+
+
 def nearest_action(robot: Robot, translate: float, rotate: float) -> int:
     """The action whose motion is nearest to [m], [rad]; a turn counts as its arc at the footprint's edge."""
     motions = np.array(robot.motions) - (translate, rotate)

@@ -84,24 +84,12 @@ class LookAhead:
         """
         if len(memory) != len(begun := self.begin()):  # it was written by another version
             memory = begun
-        belief = Belief.from_bytes(memory, len(self.task.robot.motions))
-        belief, weights = self.advance(belief, history, signals, log_prior, feasible)
-        return belief.to_bytes(), weights
-
-    def advance(
-        self,
-        belief: Belief,
-        history: Floats,
-        signals: Mapping[str, Floats],
-        log_prior: Floats,
-        feasible: Bools,
-    ) -> tuple[Belief, Floats]:
-        """What is believed after the model's log_prior [A] at x_t with S_t [A], and the log-weights [A]."""
         robot, pose = self.task.robot, history[-1]
+        belief = Belief.from_bytes(memory, len(robot.motions))
         prior = exp(log_prior)
         going_on = prior[~robot.terminal]
         if going_on.sum() <= 0.0:  # the model ends for certain: it says nothing of where it would go
-            return belief, np.zeros(len(prior))
+            return memory, np.zeros(len(prior))
         said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(robot.motions)) / going_on.sum()
         blocked = blocked_at(self.body, *pose)
         end = float(prior[robot.terminal].sum())
@@ -109,16 +97,16 @@ class LookAhead:
         forced = -float(going_on.sum()) * math.log(possible) if possible > 0.0 else FORCED
         belief = beliefs.update(belief, self.body, self.goals, pose, blocked, said, end, max(forced, 0.0))
         if belief.forced < FORCED or belief.trust < NEGLIGIBLE:
-            return belief, np.zeros(len(prior))
+            return belief.to_bytes(), np.zeros(len(prior))
         costs = self._costs(belief, history, signals)
-        return belief, np.where(robot.terminal, 0.0, -belief.trust * costs[robot.motion_of])
+        return belief.to_bytes(), np.where(robot.terminal, 0.0, -belief.trust * costs[robot.motion_of])
 
     def _costs(self, belief: Belief, history: Floats, signals: Mapping[str, Floats]) -> Floats:
         """D after each motion above the least of them, [M]: the mean over the likely stand-ins."""
         t = len(history) - 1
         rules = self.rules._replace(signals=self.rules.signals.copy())
         status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
-        replay(rules, history, signal_rows(self.task, signals, t + 1), status, run)
+        replay(rules, rules.margin, history, signal_rows(self.task, signals, t + 1), status, run)
         mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
         weights = inner(self.shares.T, belief.probabilities())
         asked = np.argsort(-weights, kind="stable")[:LEADERS]

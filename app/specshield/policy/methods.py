@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -69,6 +70,16 @@ class Method:
     make: Callable[[Task, Any, Run], Made]
     load: Callable[[bytes | Path, Card, Task], Proposer]
     needs: tuple[str, ...] = ()
+
+
+def lazily(place: str) -> Callable[..., Any]:
+    """The function at "module:name", imported when it is called."""
+
+    def call(*arguments: Any) -> Any:
+        module, _, name = place.partition(":")
+        return getattr(import_module(module), name)(*arguments)
+
+    return call
 
 
 METHODS = Registry(

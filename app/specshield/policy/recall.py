@@ -10,7 +10,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
-from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay_by
+from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay
 from specshield.rule.residual import again, joined, left_over
 from specshield.stl import Formula
 
@@ -22,11 +22,11 @@ def recall(rules: Rules, past: float, poses: Floats, signals: Floats, status: In
     J asks the rules' own margin of every step of a dwell. So of a dwell that has begun only the steps that
     keep that margin count. Where it is too late to begin the dwell anew, all steps that keep `past` count.
     """
-    replay_by(rules, past, poses, signals, status, run)
+    replay(rules, past, poses, signals, status, run)
     if past == rules.margin:
         return
     asked, whole = np.empty_like(status), np.empty_like(run)
-    replay_by(rules, rules.margin, poses, signals, asked, whole)
+    replay(rules, rules.margin, poses, signals, asked, whole)
     for k in range(status.shape[0]):
         if status[k] == PENDING and asked[k] == PENDING:
             run[k] = whole[k]
@@ -54,8 +54,8 @@ def _fall_short(rules: Rules, poses: Floats, signals: Floats) -> tuple[bool, boo
     """
     count = rules.kind.shape[0]
     asked, status, run = np.empty(count, np.int8), np.empty(count, np.int8), np.empty(count, np.int64)
-    replay_by(rules, rules.margin, poses, signals, asked, run)
-    replay_by(rules, 0.0, poses, signals, status, run)
+    replay(rules, rules.margin, poses, signals, asked, run)
+    replay(rules, 0.0, poses, signals, status, run)
     lost = less = False
     for k in range(count):
         lost = lost or (asked[k] == BROKEN and status[k] != BROKEN)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -24,7 +23,6 @@ from specshield.world.regions import Region
 
 if TYPE_CHECKING:
     from specshield.client import ShieldClient
-    from specshield.local import LocalSession
     from specshield.service.sessions.chain import Chain
 
 
@@ -63,22 +61,6 @@ class Recording:
             if motion >= 0:
                 ahead.append(step(body, *ahead[-1], motion))
         return np.array(ahead)
-
-
-def of_local(session: LocalSession, step_seconds: float = 1.0) -> Recording:
-    """Of a session in process, up to now."""
-    task = session.task
-    return Recording(
-        session.id,
-        str(task.formula),
-        session.info.actions,
-        task.regions,
-        session.trajectory(),
-        task.grid,
-        task.robot,
-        time.time(),
-        step_seconds,
-    )
 
 
 def of_record(

@@ -38,16 +38,12 @@ def _cell(body: Body, u: float, v: float) -> tuple[int, int]:
 
 
 @inlined
-def _rows(body: Body, low: float, high: float) -> tuple[int, int]:
-    """The range of rows between two heights (grid metres), with the ring that stands for the outside."""
+def _span(body: Body, low: float, high: float, cells: int) -> tuple[int, int]:
+    """The range of rows or columns, `cells` of them, between two places (grid metres), with the ring that
+    stands for the outside.
+    """
     h = body.resolution
-    return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[0]) + 1
-
-
-@inlined
-def _columns(body: Body, low: float, high: float) -> tuple[int, int]:
-    h = body.resolution
-    return max(math.floor(low / h), -1), min(math.floor(high / h), body.occupied.shape[1]) + 1
+    return max(math.floor(low / h), -1), min(math.floor(high / h), cells) + 1
 
 
 @inlined
@@ -76,8 +72,8 @@ def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     if _is_clear(body, u, v, limit):
         return limit
     best = limit * limit
-    first, last = _columns(body, u - limit, u + limit)
-    for j in range(*_rows(body, v - limit, v + limit)):
+    first, last = _span(body, u - limit, u + limit, body.occupied.shape[1])
+    for j in range(*_span(body, v - limit, v + limit, body.occupied.shape[0])):
         dy = max(j * h - v, 0.0, v - (j + 1) * h)
         if dy * dy >= best:
             continue
@@ -150,15 +146,12 @@ def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length:
     """How far [m] a disc of radius r moves from (u, v) along a unit vector until it overlaps; inf: never."""
     h = body.resolution
     mu, mv = u + 0.5 * length * du, v + 0.5 * length * dv
-    col, row = math.floor(mu / h), math.floor(mv / h)
-    if 0 <= row < body.occupied.shape[0] and 0 <= col < body.occupied.shape[1]:
-        bound = body.clearance[row, col] - math.hypot(mu - (col + 0.5) * h, mv - (row + 0.5) * h)
-        if bound >= r + 0.5 * length:
-            return np.inf
+    if _is_clear(body, mu, mv, r + 0.5 * length):
+        return np.inf
     eu, ev = u + length * du, v + length * dv
-    left, right = _columns(body, min(u, eu) - r, max(u, eu) + r)
+    left, right = _span(body, min(u, eu) - r, max(u, eu) + r, body.occupied.shape[1])
     first, reach = np.inf, r + 0.7072 * h  # to the centre of a square that the disc may touch
-    for j in range(*_rows(body, min(v, ev) - r, max(v, ev) + r)):
+    for j in range(*_span(body, min(v, ev) - r, max(v, ev) + r, body.occupied.shape[0])):
         for i in range(left, right):
             if not _is_occupied(body, j, i):
                 continue
@@ -221,8 +214,8 @@ def _arc_contact(body: Body, ou: float, ov: float, u: float, v: float, angle: fl
     around = r + reach * min(0.5 * abs(angle), 2.0)  # of the middle of the arc, all that the disc can touch
     if _is_clear(body, mu, mv, around):
         return False
-    left, right = _columns(body, mu - around, mu + around)
-    for j in range(*_rows(body, mv - around, mv + around)):
+    left, right = _span(body, mu - around, mu + around, body.occupied.shape[1])
+    for j in range(*_span(body, mv - around, mv + around, body.occupied.shape[0])):
         for i in range(left, right):
             if not _is_occupied(body, j, i):
                 continue

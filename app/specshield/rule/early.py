@@ -49,30 +49,26 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
     whole = parts[0] if len(parts) == 1 else And(parts)
     whole = formula if whole == formula else whole
     tree = compile_tree(whole, slots)
-    kinds, at, kept, size = [], [], np.ones(len(tree.op), np.bool_), 0
-    node = 0
+    rows, kept, node, size = [], np.ones(len(tree.op), np.bool_), 0, 0
     for k, part in enumerate(parts):
         own = compile_tree(part, slots)
-        kinds.append(
-            EVENTUALLY if isinstance(part, Eventually) else ALWAYS if isinstance(part, Always) else OTHER
-        )
         node += len(own.op)
-        if kinds[-1] != OTHER:
+        row = (OTHER, size, 0, 0, 0)
+        if isinstance(part, (Always, Eventually)):
             kept[node - 1] = False
+            kind = EVENTUALLY if isinstance(part, Eventually) else ALWAYS
+            row = (kind, size, part.a, part.b, part.child.horizon)
+        rows.append(row)
         if k > 0:  # the `and`
             kept[node] = False
             node += 1
-        at.append(size)
         size += own.size
     below = tree._replace(
         **{name: getattr(tree, name)[kept] for name in ("op", "at", "length", "a", "b", "right")}
     )
-    windows = [
-        (p.a, p.b, p.child.horizon) if isinstance(p, (Always, Eventually)) else (0, 0, 0) for p in parts
-    ]
-    a, b, horizon = np.array(windows, np.int64).reshape(-1, 3).T.copy()
+    kind_of, at, a, b, horizon = np.array(rows, np.int64).T.copy()
     plain = np.array([_is_plain(part) for part in parts], np.bool_)
-    return whole, Conjuncts(below, np.array(kinds, np.int64), np.array(at, np.int64), a, b, horizon, plain)
+    return whole, Conjuncts(below, kind_of, at, a, b, horizon, plain)
 
 
 def _is_plain(part: Formula) -> bool:

@@ -15,8 +15,8 @@ from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.errors import FragmentError
 from specshield.rule.values import REGIONS, fill_place, fill_signals, initial_signals, places, regions_of
-from specshield.stl import Obligation, obligations
-from specshield.stl.program import STACK_SIZE, Programs, compile_predicate, evaluate_packed, pack
+from specshield.stl import obligations
+from specshield.stl.program import STACK_SIZE, Programs, compile_predicates, evaluate_packed
 from specshield.task import Task
 from specshield.world.regions import PackedRegions
 
@@ -48,28 +48,10 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
     if len(parts) > MAX_OBLIGATIONS:
         expected = f"at most {MAX_OBLIGATIONS}; or method 'planner', which takes any formula"
         raise FragmentError("too many obligations", got=len(parts), expected=expected)
-    known = places(task)
-
-    def column(values: list[int]) -> Ints:
-        return np.array(values, dtype=np.int64)
-
-    return Rules(
-        kind=column([KINDS[p.kind] for p in parts]),
-        a=column([p.a for p in parts]),
-        b=column([p.b for p in parts]),
-        c1=column([p.c1 for p in parts]),
-        c2=column([p.c2 for p in parts]),
-        last=column([last_step(p) for p in parts]),
-        programs=pack([compile_predicate(part.predicate, known) for part in parts]),
-        regions=regions_of(task),
-        signals=initial_signals(task),
-        margin=margin,
-    )
-
-
-def last_step(part: Obligation) -> int:
-    """The last step an obligation looks at: its own horizon."""
-    return part.c1 + part.b if part.kind == "eventually_always" else part.b
+    rows = [(KINDS[p.kind], p.a, p.b, p.c1, p.c2, p.c1 + p.b) for p in parts]
+    kind, a, b, c1, c2, last = np.array(rows, np.int64).reshape(-1, 6).T.copy()
+    programs = compile_predicates([part.predicate for part in parts], places(task))
+    return Rules(kind, a, b, c1, c2, last, programs, regions_of(task), initial_signals(task), margin)
 
 
 def signal_rows(task: Task, signals: Mapping[str, Floats], n: int) -> Floats:
@@ -127,17 +109,11 @@ def advance(rules: Rules, t: int, predicates: Floats, status: Int8s, run: Ints) 
 
 
 @kernel
-def replay(rules: Rules, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
-    """The progress after the states x_0..x_t. poses (t + 1, 3), signals (t + 1, S).
+def replay(rules: Rules, past: float, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
+    """The progress after the states x_0..x_t, by the margin `past`. poses (t + 1, 3), signals (t + 1, S).
 
     Overwritten: status, run (K,), and rules.signals, which is left at the last row: the values that are held.
     """
-    replay_by(rules, rules.margin, poses, signals, status, run)
-
-
-@kernel
-def replay_by(rules: Rules, past: float, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
-    """`replay` with the margin `past` instead of the rules' own."""
     values, stack = np.empty(value_count(rules)), np.empty(STACK)
     predicates = np.empty(rules.kind.shape[0])
     status[:] = PENDING

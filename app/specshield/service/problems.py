@@ -220,17 +220,17 @@ def _allowed(request: Request) -> str:
 def install(app: FastAPI) -> None:
     """Every way an answer can go wrong ends in `response`."""
 
-    async def known(request: Request, error: Exception) -> Response:
-        assert isinstance(error, SpecshieldError)
+    @app.exception_handler(SpecshieldError)
+    async def known(request: Request, error: SpecshieldError) -> Response:
         tell(request.scope, error)
         return response(error)
 
-    async def invalid(request: Request, error: Exception) -> Response:
-        assert isinstance(error, RequestValidationError)
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> Response:
         return response(from_validation(error.errors(), error.body))
 
-    async def http(request: Request, error: Exception) -> Response:
-        assert isinstance(error, HTTPException)
+    @app.exception_handler(HTTPException)
+    async def http(request: Request, error: HTTPException) -> Response:
         path = request.url.path
         if error.status_code == 404:
             return response(
@@ -244,22 +244,17 @@ def install(app: FastAPI) -> None:
             )
         return response(InputError(str(error.detail), expected="a request in the form that /docs describes"))
 
+    @app.exception_handler(ClientGone)
     async def gone(request: Request, error: Exception) -> Response:
         request.scope["state"]["status"] = CLIENT_GONE
         return Response(status_code=CLIENT_GONE)  # which nobody reads
 
-    async def disk(request: Request, error: Exception) -> Response:
-        assert isinstance(error, OSError)
+    @app.exception_handler(OSError)
+    async def disk(request: Request, error: OSError) -> Response:
         if not is_full(error):
             raise error
         return response(errors.InsufficientStorage("the server's disk is full", expected="a disk with room"))
 
+    @app.exception_handler(Exception)
     async def unknown(request: Request, error: Exception) -> Response:
         return failed()
-
-    app.add_exception_handler(SpecshieldError, known)
-    app.add_exception_handler(RequestValidationError, invalid)
-    app.add_exception_handler(HTTPException, http)
-    app.add_exception_handler(ClientGone, gone)
-    app.add_exception_handler(OSError, disk)
-    app.add_exception_handler(Exception, unknown)

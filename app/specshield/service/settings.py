@@ -26,127 +26,117 @@ class Settings(BaseSettings):
     )
 
     data_dir: Path = Field(
-        default=Path("data"), description="Uploaded maps, trained policies and the embedded store."
+        Path("data"), description="Uploaded maps, trained policies and the embedded store."
     )
     data_url: str | None = Field(
-        default=None,
+        None,
         description="Folder or fsspec URL (s3://bucket/prefix) of maps, policies and archived sessions, the "
         "same for all servers and workers of one store; unset, the data folder.",
     )
-    models_dir: Path = Field(default=shipped.MODELS, description="Policies there at start, one folder each.")
-    maps_dir: Path = Field(
-        default=shipped.MAPS, description="Maps there at start, <name>.yaml beside its image."
-    )
+    models_dir: Path = Field(shipped.MODELS, description="Policies there at start, one folder each.")
+    maps_dir: Path = Field(shipped.MAPS, description="Maps there at start, <name>.yaml beside its image.")
     redis_url: str | None = Field(
-        default=None,
+        None,
         validation_alias=AliasChoices("redis_url", "REDIS_URL"),
         description="The store, as storage/connect.py says; unset, the server starts its own.",
     )
-    store_timeout: float = Field(
-        default=2.0, gt=0, description="Longest wait for one answer of the store [s]."
-    )
+    store_timeout: float = Field(2.0, gt=0, description="Longest wait for one answer of the store [s].")
     store_replicas: int = Field(
-        default=0,
+        0,
         ge=0,
         le=8,
         description="Replicas of the store at REDIS_URL that have to have a step before it is answered.",
     )
     api_key: SecretStr | None = Field(
-        default=None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
+        None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
     )
     allowed_hosts: str = Field(
-        default="",
+        "",
         description="Names, with or without a port, that a request's Host may hold beside the server's own "
         "address: that of a proxy in front, say. Separated by commas.",
     )
 
-    max_horizon: int = Field(default=1000, ge=1, description="Longest horizon of a formula [steps].")
-    max_steps: int = Field(default=10_000, ge=1, description="Most steps that a session may ask for.")
-    max_body_bytes: int = Field(default=1 << 20, ge=1024, description="Largest request body [bytes].")
-    max_upload_bytes: int = Field(
-        default=64 << 20, ge=1024, description="Largest map or policy sent [bytes]."
-    )
+    max_horizon: int = Field(1000, ge=1, description="Longest horizon of a formula [steps].")
+    max_steps: int = Field(10_000, ge=1, description="Most steps that a session may ask for.")
+    max_body_bytes: int = Field(1 << 20, ge=1024, description="Largest request body [bytes].")
+    max_upload_bytes: int = Field(64 << 20, ge=1024, description="Largest map or policy sent [bytes].")
     max_bodies_bytes: int = Field(
-        default=128 << 20, ge=1 << 20, description="Most that all bodies being received may hold [bytes]."
+        128 << 20, ge=1 << 20, description="Most that all bodies being received may hold [bytes]."
     )
     max_body_members: int = Field(
-        default=10_000, ge=100, description="Most members of objects in a JSON body, uploads excepted."
+        10_000, ge=100, description="Most members of objects in a JSON body, uploads excepted."
     )
     max_spec_bytes: int = Field(
-        default=256 << 10,
+        256 << 10,
         ge=1024,
         description="Largest spec of a policy, and largest outlines of a map's rooms, as JSON [bytes].",
     )
-    max_header_bytes: int = Field(default=32 << 10, ge=1024, description="Largest head of a request [bytes].")
-    max_connections: int = Field(
-        default=2000, ge=8, description="Most connections at once to one server process."
-    )
+    max_header_bytes: int = Field(32 << 10, ge=1024, description="Largest head of a request [bytes].")
+    max_connections: int = Field(2000, ge=8, description="Most connections at once to one server process.")
     request_timeout: float = Field(
-        default=15.0, gt=0, description="Longest that a request's head, or its body, may take to arrive [s]."
+        15.0, gt=0, description="Longest that a request's head, or its body, may take to arrive [s]."
     )
     min_body_rate: int = Field(
-        default=64 << 10, ge=1, description="A body may take 1 s more for each so many of its bytes [bytes]."
+        64 << 10, ge=1, description="A body may take 1 s more for each so many of its bytes [bytes]."
     )
     keep_alive_timeout: float = Field(
-        default=30.0, gt=0, description="A connection without a request is closed after this long [s]."
+        30.0, gt=0, description="A connection without a request is closed after this long [s]."
     )
     heavy_timeout: float = Field(
-        default=20.0, gt=0, description="Longest that reading an upload or drawing a map may take [s]."
+        20.0, gt=0, description="Longest that reading an upload or drawing a map may take [s]."
     )
     heavy_memory: int = Field(
-        default=1 << 30, ge=256 << 20, description="Most memory of a process that does it [bytes]."
+        1 << 30, ge=256 << 20, description="Most memory of a process that does it [bytes]."
     )
 
     max_owner_bytes: int = Field(
-        default=8 << 30, ge=0, description="Most that one key's maps and policies take on the disk [bytes]."
+        8 << 30, ge=0, description="Most that one key's maps and policies take on the disk [bytes]."
     )
     max_stored_bytes: int = Field(
-        default=32 << 30, ge=0, description="Most that all maps and policies take on the disk [bytes]."
+        32 << 30, ge=0, description="Most that all maps and policies take on the disk [bytes]."
     )
     disk_reserve_bytes: int = Field(
-        default=64 << 20,
+        64 << 20,
         ge=0,
         description="Free space of the data folder's disk that only running sessions use up [bytes].",
     )
-    max_maps: int = Field(default=1000, ge=1, description="Most uploaded maps kept.")
-    max_policies: int = Field(default=1000, ge=1, description="Most policies kept.")
-    max_sessions: int = Field(default=100_000, ge=1, description="Most sessions kept.")
+    max_maps: int = Field(1000, ge=1, description="Most uploaded maps kept.")
+    max_policies: int = Field(1000, ge=1, description="Most policies kept.")
+    max_sessions: int = Field(100_000, ge=1, description="Most sessions kept.")
     session_ttl: int = Field(
-        default=7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
+        7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
     )
     archive_after: int = Field(
-        default=3600, ge=1,
+        3600, ge=1,
         description="A session that has not changed for so long moves to the archive [s]; one that has ended "
         "does after 60 s, or after this long.",
     )  # fmt: skip
     archive_bytes: int = Field(
-        default=100 << 30, ge=1 << 20,
+        100 << 30, ge=1 << 20,
         description="Where the archive holds so much, none moves there and none is begun [bytes].",
     )  # fmt: skip
     drain: float = Field(
-        default=0.0, ge=0, le=3600,
+        0.0, ge=0, le=3600,
         description="How long a server that was told to stop goes on answering, /readyz excepted [s].",
     )  # fmt: skip
-    shield_cache: int = Field(default=32, ge=1, description="Prepared shields kept in memory.")
+    shield_cache: int = Field(32, ge=1, description="Prepared shields kept in memory.")
 
-    max_watchers: int = Field(
-        default=1000, ge=0, description="Most open streams of events, for each server process."
-    )
+    max_watchers: int = Field(1000, ge=0, description="Most open streams of events, for each server process.")
     log_format: Literal["text", "json"] = Field(
-        default="text", description="Lines of the log, for people or for programs."
+        "text", description="Lines of the log, for people or for programs."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="The least that is logged; `debug` tells of each decision."
+        "info", description="The least that is logged; `debug` tells of each decision."
     )
 
     worker: bool | None = Field(
-        default=None, description="Start a training worker too. Unset: where the store is embedded."
+        None, description="Start a training worker too. Unset: where the store is embedded."
     )
     training_timeout: int = Field(
-        default=6 * 3600, ge=1, description="Longest training run of a method that learns [s]."
+        6 * 3600, ge=1, description="Longest training run of a method that learns [s]."
     )
     synthesis_timeout: int = Field(
-        default=600, ge=1, description="Longest run of a method that computes its policies [s]."
+        600, ge=1, description="Longest run of a method that computes its policies [s]."
     )
 
     @field_validator("redis_url")

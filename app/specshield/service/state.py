@@ -60,6 +60,12 @@ Cursor = Annotated[
 Limit = Annotated[int, Query(ge=1, le=1000, description="Items a page.")]
 
 
+def json_content(model: str, example: Any) -> dict[str, Any]:
+    """A body in JSON that a route reads by itself."""
+    schema = {"$ref": f"#/components/schemas/{model}"}
+    return {"application/json": {"schema": schema, "example": example}}
+
+
 def problems(**said: str) -> dict[int | str, dict[str, Any]]:
     """The problem documents a route may answer: problems(_409="history-gap, ...")."""
     return problem_documents(_422="Bad input: the field, what it held, what is valid.", **said)

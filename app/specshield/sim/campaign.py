@@ -56,13 +56,10 @@ def run(
     def pair(i: int) -> tuple[Episode, Episode, int]:
         own = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
         ids = [f"{case.name}-{i}-{how}" if named else None for how in ("shielded", "alone")]
-        session, start, refused = _begin(client, case, own, ids[0])
+        session, start, refused = begin(client, case, case.name, own, ids[0])
         model = load_learned(case.instruction)
-        return (
-            with_shield(session, case, model, start, own),
-            without_shield(client, case, model, start, own, id=ids[1]),
-            refused,
-        )
+        shielded = with_shield(session, case, model, start, own)
+        return shielded, without_shield(client, case, model, start, own, id=ids[1]), refused
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as robots:
         futures = [robots.submit(pair, i) for i in range(runs)]
@@ -77,13 +74,17 @@ def run(
     return Campaign(case, seed, [p[0] for p in pairs], [p[1] for p in pairs], sum(p[2] for p in pairs))
 
 
-def _begin(client: ShieldClient, case: Case, seed: int, id: str | None) -> tuple[Session, Pose, int]:
-    """A session at the first start that is not refused, of those drawn uniformly over free space."""
+def begin(
+    client: ShieldClient, case: Case, policy_id: str, seed: int, id: str | None = None
+) -> tuple[Session, Pose, int]:
+    """A session at the first start that is not refused, of those drawn uniformly over free space; that start;
+    and how many were refused.
+    """
     starts = free_poses(case.task, case.body, DRAWS, np.random.default_rng([seed, 2]))
     for refused, (x, y, theta) in enumerate(starts.tolist()):
         start = (x, y, theta)
         try:
-            session = client.sessions.create(policy_id=case.name, initial_pose=start, seed=seed, id=id)
+            session = client.sessions.create(policy_id=policy_id, initial_pose=start, seed=seed, id=id)
             return session, start, refused
         except InfeasibleStart:
             continue

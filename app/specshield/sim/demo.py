@@ -34,7 +34,8 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
         _tell(campaigns, runs, seed, out)
         print(f"{time.monotonic() - began:.0f} s")
         for campaign in campaigns:
-            print(f"page of both: {_page(url, campaign)}")
+            both = f"{campaign.shielded[0].session},{campaign.unshielded[0].session}"
+            print(f"page of both: {url}/#/floor?sessions={both}")  # the first episode of the case, twice
         if stay:
             print("The service stays up for it; Ctrl-C ends both.", flush=True)
             with contextlib.suppress(KeyboardInterrupt):
@@ -58,11 +59,6 @@ def _tell(campaigns: Sequence[Campaign], runs: int, seed: int, out: Path) -> Non
         path = out / f"{campaign.case.name}.png"
         picture.draw(campaign.case, campaign.shielded[0], campaign.unshielded[0], path)
         print(f"picture: {path}")
-
-
-def _page(url: str, campaign: Campaign) -> str:
-    """Where the case's first episode is seen, with the shield and without it, on one floor."""
-    return f"{url}/#/floor?sessions={campaign.shielded[0].session},{campaign.unshielded[0].session}"
 
 
 def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: StatusLine) -> Campaign:

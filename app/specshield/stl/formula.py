@@ -7,11 +7,10 @@ in whole steps; for `F`, `G` and `U` they are relative to the step at which the 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import chain
-from typing import Any, Literal
+from typing import Literal
 
 from specshield.errors import FormulaError
 
@@ -23,12 +22,10 @@ MAX_BOUND = 100_000  # steps; bounds the memory that a formula's samples take wh
 # in parentheses.
 IMPLIES, OR, AND, UNTIL, PREFIX, COMPARISON, SUM, PRODUCT, NEGATION, PRIMARY = range(1, 11)
 
-_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-
 
 def is_name(text: str) -> bool:
     """Whether `text` can be a name in a formula: letters, digits and _, no digit in front, no keyword."""
-    return _NAME.fullmatch(text) is not None and text not in KEYWORDS
+    return text.isascii() and text.isidentifier() and text not in KEYWORDS
 
 
 def body_name(how: str, region: str) -> str:
@@ -65,14 +62,47 @@ class Node:
         """The number of nodes on the longest way down, this one included."""
         return 1 + max((part.depth for part in self.parts), default=0)
 
-    @property
-    def binding(self) -> int:
-        if isinstance(self, Arithmetic):
-            return SUM if self.op in "+-" else PRODUCT
-        return _BINDING.get(type(self), PRIMARY)
+    def __str__(self) -> str:
+        return self._written[1]
 
     def _at(self, binding: int) -> str:
-        return str(self) if self.binding >= binding else f"({self})"
+        own, text = self._written
+        return text if own >= binding else f"({text})"
+
+    @property
+    def _written(self) -> tuple[int, str]:
+        """How tightly the node binds, and its text."""
+        match self:
+            case Number(value):
+                return PRIMARY, repr(value).removesuffix(".0")
+            case Name(name) | Atom(name):
+                return PRIMARY, name
+            case Neg(Number() as child) if not str(child).startswith("-"):
+                return NEGATION, f"-({child})"  # `-3` parses as the number minus three
+            case Neg(child):
+                return NEGATION, f"-{child._at(NEGATION)}"
+            case Abs(child):
+                return PRIMARY, f"abs({child})"
+            case Arithmetic(op, left, right):
+                own = SUM if op in "+-" else PRODUCT
+                return own, f"{left._at(own)} {op} {right._at(own + 1)}"
+            case Comparison(op, left, right):
+                return COMPARISON, f"{left._at(SUM)} {op} {right._at(SUM)}"
+            case Not(child):
+                return PREFIX, f"not {child._at(PREFIX)}"
+            case And(children):
+                return AND, " and ".join(child._at(AND + 1) for child in children)
+            case Or(children):
+                return OR, " or ".join(child._at(OR + 1) for child in children)
+            case Implies(left, right):
+                return IMPLIES, f"{left._at(IMPLIES + 1)} -> {right._at(IMPLIES + 1)}"
+            case Always(a, b, child):
+                return PREFIX, f"G[{a},{b}] {child._at(PREFIX)}"
+            case Eventually(a, b, child):
+                return PREFIX, f"F[{a},{b}] {child._at(PREFIX)}"
+            case Until(a, b, left, right):
+                return UNTIL, f"{left._at(UNTIL + 1)} U[{a},{b}] {right._at(UNTIL + 1)}"
+        raise TypeError(f"not a formula: {self!r}")
 
 
 @dataclass(frozen=True)
@@ -89,9 +119,6 @@ class Number(Term):
         if not math.isfinite(self.value):
             raise FormulaError("a number has to be finite", got=repr(self.value), expected="a finite number")
 
-    def __str__(self) -> str:
-        return repr(self.value).removesuffix(".0")
-
 
 @dataclass(frozen=True)
 class Name(Term):
@@ -103,26 +130,15 @@ class Name(Term):
     def __post_init__(self) -> None:
         _check_name(self.name)
 
-    def __str__(self) -> str:
-        return self.name
-
 
 @dataclass(frozen=True)
 class Neg(Term):
     child: Term
 
-    def __str__(self) -> str:
-        text = self.child._at(NEGATION)
-        # `-3` parses as the number minus three, so the negated number three prints as `-(3)`.
-        return f"-({text})" if isinstance(self.child, Number) and not text.startswith("-") else f"-{text}"
-
 
 @dataclass(frozen=True)
 class Abs(Term):
     child: Term
-
-    def __str__(self) -> str:
-        return f"abs({self.child})"
 
 
 @dataclass(frozen=True)
@@ -130,9 +146,6 @@ class Arithmetic(Term):
     op: Literal["+", "-", "*", "/"]
     left: Term
     right: Term
-
-    def __str__(self) -> str:
-        return f"{self.left._at(self.binding)} {self.op} {self.right._at(self.binding + 1)}"
 
 
 @dataclass(frozen=True)
@@ -143,11 +156,7 @@ class Formula(Node):
     def horizon(self) -> int:
         """hrz: the last step whose samples the formula may need, counted from the step of evaluation."""
         below = (part.horizon for part in self.parts if isinstance(part, Formula))
-        return self._reach + max(below, default=0)
-
-    @property
-    def _reach(self) -> int:
-        return 0
+        return (self.b if isinstance(self, Windowed) else 0) + max(below, default=0)
 
 
 @dataclass(frozen=True)
@@ -159,9 +168,6 @@ class Atom(Formula):
     def __post_init__(self) -> None:
         _check_name(self.name)
 
-    def __str__(self) -> str:
-        return self.name
-
 
 @dataclass(frozen=True)
 class Comparison(Formula):
@@ -171,16 +177,10 @@ class Comparison(Formula):
     left: Term
     right: Term
 
-    def __str__(self) -> str:
-        return f"{self.left._at(SUM)} {self.op} {self.right._at(SUM)}"
-
 
 @dataclass(frozen=True)
 class Not(Formula):
     child: Formula
-
-    def __str__(self) -> str:
-        return f"not {self.child._at(PREFIX)}"
 
 
 @dataclass(frozen=True)
@@ -197,23 +197,18 @@ class Joined(Formula):
 
 @dataclass(frozen=True)
 class And(Joined):
-    def __str__(self) -> str:
-        return " and ".join(child._at(AND + 1) for child in self.children)
+    """rho is the least of the children's."""
 
 
 @dataclass(frozen=True)
 class Or(Joined):
-    def __str__(self) -> str:
-        return " or ".join(child._at(OR + 1) for child in self.children)
+    """rho is the largest of the children's."""
 
 
 @dataclass(frozen=True)
 class Implies(Formula):
     left: Formula
     right: Formula
-
-    def __str__(self) -> str:
-        return f"{self.left._at(IMPLIES + 1)} -> {self.right._at(IMPLIES + 1)}"
 
 
 @dataclass(frozen=True)
@@ -224,27 +219,22 @@ class Windowed(Formula):
     b: int
 
     def __post_init__(self) -> None:
-        _check_window(self.a, self.b)
-
-    @property
-    def _reach(self) -> int:
-        return self.b
+        window = (self.a, self.b)
+        whole = all(isinstance(bound, int) and not isinstance(bound, bool) for bound in window)
+        if not whole or not 0 <= self.a <= self.b <= MAX_BOUND:
+            problem = f"[{self.a},{self.b}] is not a window"
+            expected = f"whole numbers with 0 <= a <= b <= {MAX_BOUND}"
+            raise FormulaError(f"{problem}; expected {expected}", got=[*window], expected=expected)
 
 
 @dataclass(frozen=True)
 class Always(Windowed):
     child: Formula
 
-    def __str__(self) -> str:
-        return f"G[{self.a},{self.b}] {self.child._at(PREFIX)}"
-
 
 @dataclass(frozen=True)
 class Eventually(Windowed):
     child: Formula
-
-    def __str__(self) -> str:
-        return f"F[{self.a},{self.b}] {self.child._at(PREFIX)}"
 
 
 @dataclass(frozen=True)
@@ -253,29 +243,6 @@ class Until(Windowed):
 
     left: Formula
     right: Formula
-
-    def __str__(self) -> str:
-        return f"{self.left._at(UNTIL + 1)} U[{self.a},{self.b}] {self.right._at(UNTIL + 1)}"
-
-
-_BINDING: dict[type[Node], int] = {
-    Neg: NEGATION,
-    Comparison: COMPARISON,
-    Not: PREFIX,
-    Always: PREFIX,
-    Eventually: PREFIX,
-    Until: UNTIL,
-    And: AND,
-    Or: OR,
-    Implies: IMPLIES,
-}
-
-
-def _check_window(a: Any, b: Any) -> None:
-    whole = all(isinstance(bound, int) and not isinstance(bound, bool) for bound in (a, b))
-    if not whole or not 0 <= a <= b <= MAX_BOUND:
-        expected = f"whole numbers with 0 <= a <= b <= {MAX_BOUND}"
-        raise FormulaError(f"[{a},{b}] is not a window; expected {expected}", got=[a, b], expected=expected)
 
 
 def _check_name(name: str) -> None:

@@ -89,19 +89,17 @@ def _normal(formula: Formula) -> tuple[Obligation, ...]:
     match formula:
         case Always(a, b, child) | Eventually(a, b, child):
             inner = _normal(child)
-            if a == b:
-                return tuple(_shifted(obligation, a, a) for obligation in inner)
-            if isinstance(formula, Always):
-                return tuple(_under_always(formula, a, b, obligation) for obligation in inner)
-            if len(inner) == 1:
+            merges = isinstance(formula, Always) and all(each.kind == "always" for each in inner)
+            if a == b or merges:
+                return tuple(_shifted(each, a, b) for each in inner)
+            if isinstance(formula, Eventually) and len(inner) == 1:
                 return (_under_eventually(a, b, inner[0]),)
-    raise _outside(formula)
-
-
-def _under_always(formula: Formula, a: int, b: int, inner: Obligation) -> Obligation:
-    if inner.kind == "always":
-        return _shifted(inner, a, b)
-    raise _outside(formula)
+    expected = "conjunctions of F, G and F[a,c1] G[c2,b] over boolean combinations of predicates"
+    raise FragmentError(
+        f"'{formula}' is outside the fragment of this method; expected {expected}",
+        got=str(formula),
+        expected=f"{expected}; or method 'planner', which takes any formula",
+    )
 
 
 def _under_eventually(a: int, b: int, inner: Obligation) -> Obligation:
@@ -117,12 +115,3 @@ def _shifted(inner: Obligation, a: int, b: int) -> Obligation:
     if inner.kind == "eventually_always":
         return replace(inner, a=inner.a + a, c1=inner.c1 + b)
     return replace(inner, a=inner.a + a, b=inner.b + b)
-
-
-def _outside(formula: Formula) -> FragmentError:
-    expected = "conjunctions of F, G and F[a,c1] G[c2,b] over boolean combinations of predicates"
-    return FragmentError(
-        f"'{formula}' is outside the fragment of this method; expected {expected}",
-        got=str(formula),
-        expected=f"{expected}; or method 'planner', which takes any formula",
-    )

@@ -31,53 +31,26 @@ from collections.abc import Collection
 from typing import Any, TypeVar
 
 from specshield.errors import FormulaError, HorizonError
-from specshield.stl.formula import (
-    AND,
-    BODY_WORDS,
-    COMPARISON,
-    IMPLIES,
-    KEYWORDS,
-    MAX_BOUND,
-    NEGATION,
-    OR,
-    PREFIX,
-    PRODUCT,
-    SUM,
-    UNTIL,
-    Abs,
-    Always,
-    And,
-    Arithmetic,
-    Atom,
-    Comparison,
-    Eventually,
-    Formula,
-    Implies,
-    Name,
-    Neg,
-    Node,
-    Not,
-    Number,
-    Or,
-    Term,
-    Until,
-    body_name,
-)
+from specshield.stl import formula as nodes
+from specshield.stl.formula import BODY_WORDS, KEYWORDS, MAX_BOUND, Formula, Name, Node, Term
 from specshield.stl.tokens import Token, tokens
 
 MAX_DEPTH = 64  # nodes on the longest way down; a hand-written formula has about 6
 
 _BINDING = {
-    "implies": IMPLIES,
-    "or": OR,
-    "and": AND,
-    "U": UNTIL,
-    **dict.fromkeys(("<", "<=", ">", ">="), COMPARISON),
-    **dict.fromkeys("+-", SUM),
-    **dict.fromkeys("*/", PRODUCT),
+    "implies": nodes.IMPLIES,
+    "or": nodes.OR,
+    "and": nodes.AND,
+    "U": nodes.UNTIL,
+    **dict.fromkeys(("<", "<=", ">", ">="), nodes.COMPARISON),
+    **dict.fromkeys("+-", nodes.SUM),
+    **dict.fromkeys("*/", nodes.PRODUCT),
 }
-_COMPARE = "a comparison (< <= > >=)"
-_OPERAND = "a formula, a name or a number"
+_NO_CHAIN = {
+    nodes.IMPLIES: ("implications", "parentheses around one of them"),
+    nodes.UNTIL: ("untils", "parentheses around one of them"),
+    nodes.COMPARISON: ("comparisons", "'and' between two of them"),
+}
 
 _N = TypeVar("_N", bound=Node)
 
@@ -100,7 +73,7 @@ class _Parser:
         self._nesting = 0
 
     def formula(self) -> Formula:
-        formula = self._as_formula(self._expression(IMPLIES))
+        formula = self._as_formula(self._expression(nodes.IMPLIES))
         if self._token.kind != "end":
             raise self._unexpected("an operator or the end")
         return formula
@@ -127,6 +100,9 @@ class _Parser:
         left = self._operand()
         while (level := _BINDING.get(self._token.kind, 0)) >= binding:
             left = self._infix(left, start, level)
+            if level in _NO_CHAIN and _BINDING.get(self._token.kind) == level:
+                problem, expected = _NO_CHAIN[level]
+                raise self._error(f"{problem} do not chain", self._token, expected)
         self._nesting -= 1
         return left
 
@@ -138,27 +114,27 @@ class _Parser:
             case "name":
                 return self._name(token)
             case "(":
-                inner = self._expression(IMPLIES)
+                inner = self._expression(nodes.IMPLIES)
                 self._take(")", "')' or an operator")
                 return inner
             case "-":
                 if self._token.kind == "number":
                     return self._number(self._next(), sign=-1.0)
-                return self._made(Neg(self._term(NEGATION)), token)
+                return self._made(nodes.Neg(self._term(nodes.NEGATION)), token)
             case "abs":
                 self._take("(", "'(' after abs")
-                child = self._term(IMPLIES)
+                child = self._term(nodes.IMPLIES)
                 self._take(")", "')' or an operator")
-                return self._made(Abs(child), token)
+                return self._made(nodes.Abs(child), token)
             case "not":
-                return self._made(Not(self._subformula(PREFIX)), token)
+                return self._made(nodes.Not(self._subformula(nodes.PREFIX)), token)
             case "G" | "F":
                 a, b = self._window(token)
-                make = Always if token.kind == "G" else Eventually
-                return self._made(make(a, b, self._subformula(PREFIX)), token)
+                make = nodes.Always if token.kind == "G" else nodes.Eventually
+                return self._made(make(a, b, self._subformula(nodes.PREFIX)), token)
             case _:
                 self._index -= 1
-                raise self._unexpected(_OPERAND)
+                raise self._unexpected("a formula, a name or a number")
 
     def _infix(self, left: Node, start: int, level: int) -> Node:
         token = self._token
@@ -168,30 +144,24 @@ class _Parser:
                 while self._token.kind == token.kind:
                     self._next()
                     children.append(self._subformula(level + 1))
-                return self._made((And if token.kind == "and" else Or)(tuple(children)), token)
+                return self._made((nodes.And if token.kind == "and" else nodes.Or)(tuple(children)), token)
             case "implies":
                 condition = self._as_formula(left)
                 self._next()
-                implied = self._made(Implies(condition, self._subformula(level + 1)), token)
-                self._refuse_chain(level, "implications do not chain", "parentheses around one of them")
-                return implied
+                return self._made(nodes.Implies(condition, self._subformula(level + 1)), token)
             case "U":
                 before = self._as_formula(left)
                 self._next()
                 a, b = self._window(token)
-                until = self._made(Until(a, b, before, self._subformula(level + 1)), token)
-                self._refuse_chain(level, "untils do not chain", "parentheses around one of them")
-                return until
+                return self._made(nodes.Until(a, b, before, self._subformula(level + 1)), token)
             case "<" | "<=" | ">" | ">=" as op:
                 lesser = self._as_term(left, start)
                 self._next()
-                comparison = self._made(Comparison(op, lesser, self._term(level + 1)), token)
-                self._refuse_chain(level, "comparisons do not chain", "'and' between two of them")
-                return comparison
+                return self._made(nodes.Comparison(op, lesser, self._term(level + 1)), token)
             case "+" | "-" | "*" | "/" as op:
                 first = self._as_term(left, start)
                 self._next()
-                return self._made(Arithmetic(op, first, self._term(level + 1)), token)
+                return self._made(nodes.Arithmetic(op, first, self._term(level + 1)), token)
         raise AssertionError(token.kind)
 
     def _subformula(self, binding: int) -> Formula:
@@ -203,10 +173,10 @@ class _Parser:
 
     def _as_formula(self, node: Node) -> Formula:
         if isinstance(node, Name):
-            return Atom(node.name)
+            return nodes.Atom(node.name)
         if not isinstance(node, Formula):
             problem = f"'{_clip(str(node))}' is a number, not true or false"
-            raise self._error(problem, self._token, _COMPARE)
+            raise self._error(problem, self._token, "a comparison (< <= > >=)")
         return node
 
     def _as_term(self, node: Node, start: int) -> Term:
@@ -215,11 +185,11 @@ class _Parser:
             raise self._error(problem, Token("", str(node), start), "arithmetic over names and numbers")
         return node
 
-    def _number(self, token: Token, sign: float) -> Number:
+    def _number(self, token: Token, sign: float) -> nodes.Number:
         value = sign * float(token.text)
         if not math.isfinite(value):
             raise self._error(f"'{_clip(token.text)}' is too large", token, "a number that a float64 holds")
-        return Number(value)
+        return nodes.Number(value)
 
     def _name(self, token: Token) -> Name:
         if self._token.kind == "(" and token.text in BODY_WORDS:
@@ -238,7 +208,7 @@ class _Parser:
         region = self._take("name", f"the name of a region after '{word.text}('")
         found = self._name(region).name
         self._take(")", f"')' after the region of '{word.text}'")
-        name = body_name(word.text, found)
+        name = nodes.body_name(word.text, found)
         if self._names is not None and name not in self._names:
             raise self._error(f"'{_clip(found)}' is not a region", region, "a region or a room of the map")
         return Name(name)
@@ -274,10 +244,6 @@ class _Parser:
             problem = f"a horizon of {node.horizon} steps"
             raise self._error(problem, token, f"at most {limit} steps", HorizonError, got=node.horizon)
         return node
-
-    def _refuse_chain(self, level: int, problem: str, expected: str) -> None:
-        if _BINDING.get(self._token.kind) == level:
-            raise self._error(problem, self._token, expected)
 
     def _too_deep(self, token: Token) -> FormulaError:
         return self._error("the nesting is too deep", token, f"at most {MAX_DEPTH} levels")

@@ -7,13 +7,13 @@ in the same order. Where `robustness` raises because arithmetic is not finite, t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Floats, Ints
-from specshield.compiled import inlined, kernel
+from specshield.compiled import inlined
 from specshield.errors import FormulaError, FragmentError
 from specshield.stl.formula import (
     Abs,
@@ -30,6 +30,7 @@ from specshield.stl.formula import (
     Or,
 )
 from specshield.stl.parser import MAX_DEPTH
+from specshield.stl.robustness import difference
 
 STACK_SIZE = MAX_DEPTH  # numbers; a formula as deep as the parser allows needs no more
 
@@ -37,40 +38,33 @@ NUMBER, VALUE, NEGATE, ABSOLUTE, ADD, SUBTRACT, MULTIPLY, DIVIDE, MINIMUM, MAXIM
 _ARITHMETIC = {"+": ADD, "-": SUBTRACT, "*": MULTIPLY, "/": DIVIDE}
 
 
-class Program(NamedTuple):
-    """ops int64[n]; args float64[n]: the number of a NUMBER, the slot of a VALUE, else 0."""
-
-    ops: Ints
-    args: Floats
-
-
 class Programs(NamedTuple):
-    """Several programs end to end; program k is at starts[k] to starts[k + 1]. starts int64[k + 1]."""
+    """Several programs end to end; program k is at starts[k] to starts[k + 1]. starts int64[k + 1].
+
+    ops int64[n]; args float64[n]: the number of a NUMBER, the slot of a VALUE, else 0.
+    """
 
     ops: Ints
     args: Floats
     starts: Ints
 
 
-def compile_predicate(predicate: Node, slots: Mapping[str, int]) -> Program:
-    """The program of `predicate`, which finds the value of a name at values[slots[name]].
+def compile_predicates(predicates: Iterable[Node], slots: Mapping[str, int]) -> Programs:
+    """The programs of `predicates`, which find the value of a name at values[slots[name]].
 
     Raises FragmentError for a temporal operator, FormulaError for a name without a slot and for a predicate
     deeper than STACK_SIZE.
     """
-    if predicate.depth > STACK_SIZE:
-        expected = f"at most {STACK_SIZE} levels of nesting"
-        problem = f"a predicate is {predicate.depth} levels deep; expected {expected}"
-        raise FormulaError(problem, got=predicate.depth, expected=expected)
-    code = list(_code(predicate, slots))
-    return Program(np.array([op for op, _ in code], np.int64), np.array([arg for _, arg in code], np.float64))
-
-
-def pack(programs: Sequence[Program]) -> Programs:
-    starts = np.cumsum([0, *(len(program.ops) for program in programs)], dtype=np.int64)
-    ops = np.concatenate([np.empty(0, np.int64), *(program.ops for program in programs)])
-    args = np.concatenate([np.empty(0, np.float64), *(program.args for program in programs)])
-    return Programs(ops, args, starts)
+    code, starts = list[tuple[int, float]](), [0]
+    for predicate in predicates:
+        if predicate.depth > STACK_SIZE:
+            expected = f"at most {STACK_SIZE} levels of nesting"
+            problem = f"a predicate is {predicate.depth} levels deep; expected {expected}"
+            raise FormulaError(problem, got=predicate.depth, expected=expected)
+        code += _code(predicate, slots)
+        starts.append(len(code))
+    ops, args = np.array([op for op, _ in code], np.int64), np.array([arg for _, arg in code], np.float64)
+    return Programs(ops, args, np.array(starts, np.int64))
 
 
 def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
@@ -91,11 +85,8 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
             yield from _code(left, slots)
             yield from _code(right, slots)
             yield _ARITHMETIC[op], 0
-        case Comparison(op, left, right):
-            first, second = (left, right) if op in (">", ">=") else (right, left)
-            yield from _code(first, slots)
-            yield from _code(second, slots)
-            yield SUBTRACT, 0
+        case Comparison():
+            yield from _code(difference(node), slots)
         case And(children) | Or(children):
             yield from _code(children[0], slots)
             for child in children[1:]:
@@ -113,9 +104,12 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
 
 
 @inlined
-def _run(ops: Ints, args: Floats, start: int, stop: int, values: Floats, stack: Floats) -> float:
-    top = -1
-    for i in range(start, stop):
+def evaluate_packed(k: int, programs: Programs, values: Floats, stack: Floats) -> float:
+    """The robustness of program k, NaN where arithmetic is not finite. values float64[slots]; stack
+    float64[STACK_SIZE] is scratch.
+    """
+    ops, args, top = programs.ops, programs.args, -1
+    for i in range(programs.starts[k], programs.starts[k + 1]):
         op = ops[i]
         if op == VALUE:
             top += 1
@@ -148,15 +142,3 @@ def _run(ops: Ints, args: Floats, start: int, stop: int, values: Floats, stack: 
                     return math.nan
                 stack[top] = left
     return float(stack[0] + 0.0)  # -0.0 becomes 0.0, as in `robustness`
-
-
-@kernel
-def evaluate(ops: Ints, args: Floats, values: Floats) -> float:
-    """The robustness that one program computes from values float64[slots]."""
-    return _run(ops, args, 0, len(ops), values, np.empty(STACK_SIZE))
-
-
-@inlined
-def evaluate_packed(k: int, programs: Programs, values: Floats, stack: Floats) -> float:
-    """The robustness of program k of `programs`; stack float64[STACK_SIZE] is scratch."""
-    return _run(programs.ops, programs.args, programs.starts[k], programs.starts[k + 1], values, stack)

@@ -23,6 +23,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from specshield.arrays import Floats
 from specshield.errors import SampleError
 from specshield.stl.formula import (
     Always,
@@ -39,14 +40,14 @@ from specshield.stl.formula import (
     Term,
     Until,
 )
-from specshield.stl.terms import Array, interval, value
+from specshield.stl.terms import interval, value
 
 SATISFIED_ABOVE = 0.0  # satisfied means rho > 0; rho = 0 is not satisfied
 
 Verdict: TypeAlias = Literal["satisfied", "violated", "pending"]
 
 
-def robustness(formula: Formula, samples: Mapping[str, ArrayLike]) -> Array:
+def robustness(formula: Formula, samples: Mapping[str, ArrayLike]) -> Floats:
     """rho at step 0, shape [...], from samples [..., N] of each name, N >= horizon + 1.
 
     The names' batch shapes broadcast. Raises SampleError if a name is missing, if samples are too few, NaN or
@@ -62,13 +63,19 @@ def robustness(formula: Formula, samples: Mapping[str, ArrayLike]) -> Array:
     return _bounds(formula, seen)[0]
 
 
-def robustness_bounds(formula: Formula, prefix: Mapping[str, ArrayLike]) -> tuple[Array, Array]:
+def robustness_bounds(formula: Formula, prefix: Mapping[str, ArrayLike]) -> tuple[Floats, Floats]:
     """(lo, hi), each [...]: rho at step 0 lies in [lo, hi] however the samples [..., n] go on.
 
     Samples to come may be any real numbers, so a bound may be infinite. With n > horizon both bounds are the
     robustness, bit for bit. n may be 0. Raises SampleError as `robustness` does, but not for too few samples.
     """
     return _bounds(formula, _read(formula, prefix))
+
+
+def unseen_bounds(formula: Formula) -> tuple[float, float]:
+    """Bounds (lo, hi) on rho if every name may be any real number."""
+    low, high = _bounds(formula, _Seen({name: np.empty(0) for name in formula.names}, (), 0))
+    return float(low), float(high)
 
 
 def verdict(formula: Formula, prefix: Mapping[str, ArrayLike], margin: float = SATISFIED_ABOVE) -> Verdict:
@@ -90,7 +97,7 @@ def verdict(formula: Formula, prefix: Mapping[str, ArrayLike], margin: float = S
 class _Seen:
     """The samples so far: `values` [*batch, known] of each name, at steps 0 to known - 1."""
 
-    values: Mapping[str, Array]
+    values: Mapping[str, Floats]
     batch: tuple[int, ...]
     known: int
 
@@ -123,7 +130,7 @@ def _read(formula: Formula, samples: Mapping[str, ArrayLike]) -> _Seen:
     return _Seen({name: np.broadcast_to(x, (*batch, known)) for name, x in arrays.items()}, batch, known)
 
 
-def _sampled(name: str, samples: ArrayLike) -> Array:
+def _sampled(name: str, samples: ArrayLike) -> Floats:
     array = np.asarray(samples)
     if array.dtype.kind not in "fiub" or array.ndim == 0:
         got = f"{array.dtype} of shape {list(array.shape)}"
@@ -143,13 +150,13 @@ def _sampled(name: str, samples: ArrayLike) -> Array:
     return array
 
 
-def _bounds(formula: Formula, seen: _Seen) -> tuple[Array, Array]:
+def _bounds(formula: Formula, seen: _Seen) -> tuple[Floats, Floats]:
     with np.errstate(all="ignore"):
         ends = _evaluate(formula, seen, 0, 1)[..., 0] + 0.0  # makes a copy, and 0.0 of -0.0
     return np.asarray(ends[0]), np.asarray(ends[-1])
 
 
-def _evaluate(formula: Formula, seen: _Seen, start: int, stop: int) -> Array:
+def _evaluate(formula: Formula, seen: _Seen, start: int, stop: int) -> Floats:
     """rho at steps start to stop - 1. Shape [ends, *batch, stop - start]."""
     match formula:
         case Atom() | Comparison():
@@ -178,21 +185,21 @@ def _evaluate(formula: Formula, seen: _Seen, start: int, stop: int) -> Array:
     raise TypeError(f"not a formula: {formula!r}")
 
 
-def _sliding(extremum: np.ufunc, values: Array, width: int) -> Array:
+def _sliding(extremum: np.ufunc, values: Floats, width: int) -> Floats:
     """The extremum of every `width` neighbours, [..., n + width - 1] to [..., n], in log2(width) passes."""
     n = values.shape[-1] - width + 1
     if n == 1:
-        single: Array = extremum.reduce(values, axis=-1, keepdims=True)
+        single: Floats = extremum.reduce(values, axis=-1, keepdims=True)
         return single
     size = 1
     while 2 * size <= width:
         values = extremum(values[..., :-size], values[..., size:])
         size *= 2
-    doubled: Array = extremum(values[..., :n], values[..., width - size : width - size + n])
+    doubled: Floats = extremum(values[..., :n], values[..., width - size : width - size + n])
     return doubled
 
 
-def _until(left: Array, right: Array, width: int) -> Array:
+def _until(left: Floats, right: Floats, width: int) -> Floats:
     """max over k < width of min(right[t + k], min left[t : t + k]), for each t < n.
 
     left [..., n + width - 2], right [..., n + width - 1]. In log2(width) passes, as `_sliding`: `right` is
@@ -213,7 +220,7 @@ def _until(left: Array, right: Array, width: int) -> Array:
     return np.maximum(reached[..., :n], later)
 
 
-def _predicate(predicate: Atom | Comparison, seen: _Seen, start: int, stop: int) -> Array:
+def _predicate(predicate: Atom | Comparison, seen: _Seen, start: int, stop: int) -> Floats:
     """[1, *batch, stop - start] if all of these samples are known, [2, ...] if some are not."""
     known = max(0, min(stop, seen.known) - start)
     term = difference(predicate)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +12,10 @@ from specshield.arrays import Floats
 from specshield.errors import SampleError
 from specshield.stl.formula import Abs, Arithmetic, Name, Neg, Number, Term
 
-Array: TypeAlias = Floats
-
 _ARITHMETIC = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}
 
 
-def value(term: Term, samples: Mapping[str, Array], start: int, stop: int) -> Any:
+def value(term: Term, samples: Mapping[str, Floats], start: int, stop: int) -> Any:
     """The term at steps start to stop - 1, whose samples are known: [*batch, stop - start], or a number.
 
     Raises SampleError where the arithmetic is not finite.

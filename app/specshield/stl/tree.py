@@ -14,22 +14,9 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, leaf
-from specshield.stl.formula import (
-    Always,
-    And,
-    Atom,
-    Comparison,
-    Eventually,
-    Formula,
-    Implies,
-    Node,
-    Not,
-    Or,
-    Until,
-)
-from specshield.stl.program import Program, Programs, compile_predicate, pack
-from specshield.stl.robustness import difference
-from specshield.stl.terms import interval
+from specshield.stl.formula import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until
+from specshield.stl.program import Programs, compile_predicates
+from specshield.stl.robustness import unseen_bounds
 
 NOT, AND, OR, ALWAYS, EVENTUALLY, UNTIL = range(6)
 
@@ -64,27 +51,25 @@ def compile_tree(formula: Formula, slots: Mapping[str, int]) -> Tree:
 
     Raises FormulaError for a name without a slot.
     """
-    builder = _Builder(slots)
+    builder = _Builder()
     builder.add(formula, 0, 1)
     op, at, length, a, b, right = np.array(builder.nodes, np.int64).reshape(-1, 6).T.copy()
-    leaf_at, leaf_start, leaf_stop = np.array(builder.leaves, np.int64).reshape(-1, 3).T.copy()
-    low, high = np.array(builder.unknown, np.float64).reshape(-1, 2).T.copy()
-    programs = pack(builder.programs)
+    leaf_at, leaf_start, leaf_stop = np.array(builder.leaves, np.int64).T.copy()
+    low, high = np.array([unseen_bounds(each) for each in builder.predicates]).T.copy()
+    programs = compile_predicates(builder.predicates, slots)
     return Tree(
         op, at, length, a, b, right, leaf_at, leaf_start, leaf_stop, low, high, programs, builder.size
     )
 
 
 class _Builder:
-    def __init__(self, slots: Mapping[str, int]) -> None:
-        self.slots = slots
+    def __init__(self) -> None:
         self.nodes: list[tuple[int, ...]] = []
         self.leaves: list[tuple[int, int, int]] = []
-        self.unknown: list[tuple[float, float]] = []
-        self.programs: list[Program] = []
+        self.predicates: list[Formula] = []
         self.size = 0
 
-    def add(self, formula: Node, start: int, stop: int) -> int:
+    def add(self, formula: Formula, start: int, stop: int) -> int:
         """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin."""
         count = stop - start
         match formula:
@@ -111,11 +96,10 @@ class _Builder:
                 return self._node(UNTIL, at, count, a, b, self.add(right, start + a, stop + b))
         raise TypeError(f"not a formula: {formula!r}")
 
-    def _leaf(self, formula: Node, start: int, stop: int) -> int:
+    def _leaf(self, formula: Formula, start: int, stop: int) -> int:
         at, self.size = self.size, self.size + stop - start
         self.leaves.append((at, start, stop))
-        self.unknown.append(_unknown(formula))
-        self.programs.append(compile_predicate(formula, self.slots))
+        self.predicates.append(formula)
         return at
 
     def _node(self, op: int, at: int, count: int, a: int = 0, b: int = 0, right: int = -1) -> int:
@@ -126,26 +110,6 @@ class _Builder:
 def is_temporal(formula: Node) -> bool:
     """Whether an `always`, `eventually` or `until` is anywhere in the formula."""
     return isinstance(formula, (Always, Eventually, Until)) or any(map(is_temporal, formula.parts))
-
-
-def _unknown(formula: Node) -> tuple[float, float]:
-    """Bounds on a leaf's robustness if every name may be any real number."""
-    match formula:
-        case Atom() | Comparison():
-            return interval(difference(formula))
-        case Not(child):
-            low, high = _unknown(child)
-            return -high, -low
-        case And(children):
-            lows, highs = zip(*map(_unknown, children), strict=True)
-            return min(lows), min(highs)
-        case Or(children):
-            lows, highs = zip(*map(_unknown, children), strict=True)
-            return max(lows), max(highs)
-        case Implies(left, right):
-            (low, high), (low_right, high_right) = _unknown(left), _unknown(right)
-            return max(-high, low_right), max(-low, high_right)
-    raise TypeError(f"not a predicate: {formula!r}")
 
 
 @inlined

@@ -111,32 +111,28 @@ def learn(
     """
     if not len(cells):
         return known
-    stays = ~np.isin(known.cell, cells, assume_unique=True)
-    differs = cells[grid.occupied.ravel()[cells] != occupied][: max(MAX_CELLS - int(stays.sum()), 0)]
+    others = _rows(known, ~np.isin(known.cell, cells, assume_unique=True))
+    differs = cells[grid.occupied.ravel()[cells] != occupied][: max(MAX_CELLS - len(others), 0)]
     count = len(differs)
-    cell = np.concatenate([known.cell[stays], differs])
-    order = np.argsort(cell, kind="stable")
-    return replace(
-        known,
-        cell=cell[order],
-        occupied=np.concatenate([known.occupied[stays], np.full(count, occupied)])[order],
-        by=np.concatenate([known.by[stays], np.full(count, by)])[order],
-        step=np.concatenate([known.step[stays], np.full(count, t)])[order],
+    both = LearnedMap(
+        known.revision,
+        np.concatenate([others.cell, differs]),
+        np.concatenate([others.occupied, np.full(count, occupied)]),
+        np.concatenate([others.by, np.full(count, by)]),
+        np.concatenate([others.step, np.full(count, t)]),
     )
+    return _rows(both, np.argsort(both.cell, kind="stable"))
 
 
 def forget(known: LearnedMap, old: Bools) -> LearnedMap:
     """Without the cells that `old` [N] says. Same revision."""
-    if not old.any():
-        return known
-    stays = ~old
-    return replace(
-        known,
-        cell=known.cell[stays],
-        occupied=known.occupied[stays],
-        by=known.by[stays],
-        step=known.step[stays],
-    )
+    return _rows(known, ~old) if old.any() else known
+
+
+def _rows(known: LearnedMap, which: Bools | Ints) -> LearnedMap:
+    """The cells that an index array or a mask picks. Same revision."""
+    cell, occupied, by, step = known.cell, known.occupied, known.by, known.step
+    return LearnedMap(known.revision, cell[which], occupied[which], by[which], step[which])
 
 
 def revised(before: LearnedMap, after: LearnedMap) -> LearnedMap:

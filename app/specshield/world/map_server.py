@@ -126,24 +126,19 @@ def _number(value: Any, path: str, low: float = -checks.LIMIT, high: float = che
 
 def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
     """(shade, opacity) in [0, 1], each [height, width]. The size is checked before anything is decoded."""
+    got = f"{len(image)} bytes"
     try:
         picture = Image.open(io.BytesIO(image), formats=["PPM", "PNG"])
         if picture.mode == "F":
             raise ValueError("PFM, which Pillow counts as PPM")
     except Image.DecompressionBombError as error:
+        most = f"at most {MAX_SIDE} x {MAX_SIDE} pixels"
         raise MapError(
-            "the image is too large",
-            path="image",
-            got=f"{len(image)} bytes, {error}",
-            expected=f"at most {MAX_SIDE} x {MAX_SIDE} pixels",
+            "the image is too large", path="image", got=f"{got}, {error}", expected=most
         ) from error
     except Exception as error:  # decoders raise whatever the bytes lead to
-        raise MapError(
-            "the image has no header of a PGM or PNG",
-            path="image",
-            got=f"{len(image)} bytes",
-            expected="PGM or PNG",
-        ) from error
+        problem = "the image has no header of a PGM or PNG"
+        raise MapError(problem, path="image", got=got, expected="PGM or PNG") from error
     check_size(*picture.size)
     try:
         if picture.mode[0] == "I":  # 16 bits
@@ -157,12 +152,8 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
         shade = (pixels if grey else pixels.mean(axis=-1)) / 255
         return shade, np.ones_like(shade)
     except Exception as error:
-        raise MapError(
-            "the image is broken or cut off",
-            path="image",
-            got=f"{len(image)} bytes",
-            expected="a whole PGM or PNG",
-        ) from error
+        problem = "the image is broken or cut off"
+        raise MapError(problem, path="image", got=got, expected="a whole PGM or PNG") from error
 
 
 def _parse(metadata: bytes, image: bytes) -> tuple[OccupancyGrid, Rooms]:

@@ -60,9 +60,8 @@ class OccupancyGrid:
     @cached_property
     def content_hash(self) -> str:
         """sha256 in hex over size, resolution, origin and cells."""
-        numbers = (
-            np.array([self.height, self.width, self.resolution, *self.origin], dtype="<f8") + 0.0
-        )  # no -0.0
+        numbers = np.array([self.height, self.width, self.resolution, *self.origin], dtype="<f8")
+        numbers += 0.0  # no -0.0
         return hashlib.sha256(numbers.tobytes() + np.packbits(self.occupied).tobytes()).hexdigest()
 
     def __eq__(self, other: object) -> bool:

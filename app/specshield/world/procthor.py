@@ -63,8 +63,7 @@ def _polygons(house: Any) -> list[tuple[str, Polygon]]:
         try:
             found.append((kind, Polygon(tuple(outline))))
         except MapError as error:
-            error.at(f"{path}.floorPolygon")
-            raise
+            raise error.at(f"{path}.floorPolygon") from None
     return found
 
 
@@ -115,13 +114,11 @@ def _passable(door: Mapping[str, Any], path: str) -> bool:
     Outer doors, and doors that lead back to their own room, count as closed.
     """
     inner = checks.member(door, "room0", path) != checks.member(door, "room1", path)
-    outer_wall = any(
-        str(checks.member(door, key, path)).startswith("wall|exterior") for key in ("wall0", "wall1")
-    )
+    walls = [str(checks.member(door, key, path)) for key in ("wall0", "wall1")]
+    if not inner or any(wall.startswith("wall|exterior") for wall in walls):
+        return False
     openness = door.get("openness")
-    return (
-        inner and not outer_wall and (openness is None or checks.number(openness, f"{path}.openness") >= 1.0)
-    )
+    return openness is None or checks.number(openness, f"{path}.openness") >= 1.0
 
 
 def _pieces(start: Floats, end: Floats, gaps: list[tuple[Floats, Floats]]) -> Iterator[tuple[Floats, Floats]]:
@@ -162,9 +159,8 @@ def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Floats, Floats]]:
             )
         half = np.array(_size(sizes[asset], f"asset_sizes.{asset}")) / 2
         x, y, z = _vector(checks.member(thing, "position", path), f"{path}.position")
-        edges = (
-            half[:, None] * _rotation(_vector(checks.member(thing, "rotation", path), f"{path}.rotation")).T
-        )
+        degrees = _vector(checks.member(thing, "rotation", path), f"{path}.rotation")
+        edges = half[:, None] * _rotation(degrees).T
         lowest = y - np.abs(edges[:, 1]).sum()
         fixed = checks.member(thing, "kinematic", path)
         if not isinstance(fixed, bool):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -91,6 +91,12 @@ class Union:
 
 
 Region = Circle | Rectangle | Polygon | Union
+KINDS: Mapping[str, type[Region]] = {
+    "circle": Circle,
+    "rectangle": Rectangle,
+    "polygon": Polygon,
+    "union": Union,
+}
 
 
 def signed_distance(region: Region, points: ArrayLike) -> Floats:
@@ -173,8 +179,6 @@ def pack_areas(areas: Sequence[Area]) -> PackedRegions:
 @inlined
 def turns_with_robot(regions: PackedRegions, i: int) -> bool:
     """Whether what is read of packed region i depends on the robot's heading."""
-    if regions.plain[i]:
-        return False
     return bool(regions.carried[i, 0] != 0.0 or regions.carried[i, 1] != 0.0)
 
 
@@ -243,34 +247,26 @@ def region_from_json(spec: Any, path: str) -> Region:
     """
     spec = checks.mapping(spec, path)
     kind = checks.member(spec, "type", path)
-    fields = {
-        "circle": ("center", "radius"),
-        "rectangle": ("min", "max"),
-        "polygon": ("vertices",),
-        "union": ("members",),
-    }
-    if not isinstance(kind, str) or kind not in fields:
+    if not isinstance(kind, str) or kind not in KINDS:
         raise MapError(
             f"{path} is not a known kind of region",
             path=f"{path}.type",
             got=kind,
-            expected="one of " + ", ".join(fields),
+            expected="one of " + ", ".join(KINDS),
         )
-    if extra := sorted(set(map(str, spec)) - {"type", *fields[kind]}):
+    names = [field.name for field in fields(KINDS[kind])]
+    if extra := sorted(set(map(str, spec)) - {"type", *names}):
         raise MapError(
             f"a {kind} has no member {extra[0]!r}",
-            path=f"{path}.{extra[0]}", got=extra[0], expected="type, " + ", ".join(fields[kind]),
+            path=f"{path}.{extra[0]}", got=extra[0], expected="type, " + ", ".join(names),
         )  # fmt: skip
-    values = [checks.member(spec, field, path) for field in fields[kind]]
+    values = [checks.member(spec, name, path) for name in names]
     if kind == "union":
         return _union_from_json(values[0], path)
-    made = {"circle": Circle, "rectangle": Rectangle, "polygon": Polygon}[kind]
     try:
-        region: Region = made(*values)
+        return KINDS[kind](*values)
     except MapError as error:
-        error.at(path)
-        raise
-    return region
+        raise error.at(path) from None
 
 
 def _union_from_json(members: Any, path: str) -> Union:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from specshield.errors import PolicyError
-from specshield.policy.methods import Made, Method, Run
+from specshield.policy.methods import Made, Method, Run, lazily
 from specshield.policy.options import option
 
 if TYPE_CHECKING:
-    from specshield.policy.card import Card
-    from specshield.shield.proposal import Proposer
     from specshield.task import Task
 
 
@@ -69,17 +66,11 @@ def _make(task: Task, options: Settings, run: Run) -> Made:
     return train(task, options, run.seed, report, run.checkpoints, run.should_stop, run.spec)
 
 
-def _load(weights: bytes | Path, card: Card, task: Task) -> Proposer:
-    from specshield.policy.dqn.policy import load_dqn
-
-    return load_dqn(weights, card, task)
-
-
 METHOD = Method(
     "Learned in minutes by deep Q-learning, as in the paper. For the formulas that `reachability` takes.",
     Settings,
     _check,
     _make,
-    _load,
+    lazily("specshield.policy.dqn.policy:load_dqn"),
     needs=("torch",),
 )

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from specshield.policy.methods import Made, Method, Run
+from specshield.policy.methods import Made, Method, Run, lazily
 from specshield.policy.options import option
 
 if TYPE_CHECKING:
-    from specshield.policy.card import Card
-    from specshield.shield.proposal import Proposer
     from specshield.task import Task
 
 
@@ -29,28 +26,16 @@ class Settings:
     )
 
 
-def _check(task: Task, options: Settings) -> None:
-    from specshield.policy.planner import policy
-
-    policy.check(task, options)
-
-
 def _make(task: Task, options: Settings, run: Run) -> Made:
     from specshield.policy.planner import policy
 
     return policy.synthesise(task, options, run.spec, run.on_progress)
 
 
-def _load(weights: bytes | Path, card: Card, task: Task) -> Proposer:
-    from specshield.policy.planner import policy
-
-    return policy.load_planner(weights, card, task)
-
-
 METHOD = Method(
     "Made in seconds for any formula; it searches for a plan at every decision, which then takes longer.",
     Settings,
-    _check,
+    lazily("specshield.policy.planner.policy:check"),
     _make,
-    _load,
+    lazily("specshield.policy.planner.policy:load_planner"),
 )

@@ -52,7 +52,7 @@ from specshield.rule.view import look
 from specshield.rule.worst import worst_signals
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
-from specshield.stl.program import STACK_SIZE, compile_predicate, pack
+from specshield.stl.program import STACK_SIZE, compile_predicates
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree
 from specshield.task import Task
 
@@ -307,7 +307,7 @@ def _holding(task: Task, lattice: Lattice, literals: tuple[Literal, ...]) -> tup
     what the lattice does not see (reachability/sight.py): about narrow places, where it may hold close by.
     """
     known, body = places(task), make_body(task.robot, task.grid)
-    programs = pack([compile_predicate(each.predicate, known) for each in literals])
+    programs = compile_predicates([each.predicate for each in literals], known)
     values = values_at(body, lattice, regions_of(task), programs, initial_signals(task))
     sides = np.array([each.side for each in literals]).reshape(-1, 1, 1, 1)
     rho, valid, beside = values * sides, lattice.valid == 1, BESIDE * lattice.pitch

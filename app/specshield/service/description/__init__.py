@@ -12,7 +12,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from specshield.errors import SpecshieldError
+from specshield.errors import tree
 from specshield.service import problems
 from specshield.service.middleware.guard import guarded
 from specshield.service.routes import policies, specs
@@ -70,10 +70,7 @@ def described(app: FastAPI) -> dict[str, Any]:
             tags=app.openapi_tags,
         )
         schemas = schema["components"]["schemas"]
-        for name in (
-            "HTTPValidationError",
-            "ValidationError",
-        ):  # FastAPI's own, which never leave this server
+        for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which never leave it
             schemas.pop(name, None)
         for model in (Problem, *specs.MODELS, *policies.MODELS):  # referred to by hand
             described = model.model_json_schema(ref_template="#/components/schemas/{model}")
@@ -134,13 +131,8 @@ def _show(operation: dict[str, Any], answered: Any) -> None:
 
 def _problem(told: dict[str, Any]) -> dict[str, Any]:
     """With the title and the status that its type has."""
-    made = _types(SpecshieldError)[told["type"]]("")
+    made = next(kind for kind in tree() if kind.type == told["type"])("")
     return {"type": told["type"], "title": "", "status": 0, **problems.document(made), **told}
-
-
-def _types(kind: type[SpecshieldError]) -> dict[str, type[SpecshieldError]]:
-    below = [_types(each) for each in kind.__subclasses__()]
-    return {kind.type: kind, **{type: each for found in below for type, each in found.items()}}
 
 
 PROBLEMS = {told["type"]: _problem(told) for told in _read("problems.json")}

@@ -53,15 +53,15 @@ class Claims:
         return self._store.register_script(SCRIPT)
 
     def ids(self, kind: str, owner: str) -> list[str]:
-        return sorted(id.decode() for id in _reached(lambda: self._store.hkeys(_key(kind, owner))))
+        return sorted(id.decode() for id in reached(lambda: self._store.hkeys(_key(kind, owner))))
 
     def holds(self, kind: str, id: str, owner: str) -> bool:
-        return bool(_reached(lambda: self._store.hexists(_key(kind, owner), id)))
+        return bool(reached(lambda: self._store.hexists(_key(kind, owner), id)))
 
     def settled(self, kind: str, id: str, owner: str) -> bool:
         """Whether the owner holds it, once no deletion of it is under way."""
         deadline = time.monotonic() + PATIENCE
-        while _reached(lambda: self._store.exists(_key("mark", kind, id))):
+        while reached(lambda: self._store.exists(_key("mark", kind, id))):
             if time.monotonic() > deadline:
                 return False
             time.sleep(WAIT)
@@ -69,16 +69,16 @@ class Claims:
 
     def named(self, kind: str, name: str, owner: str) -> str | None:
         """The id of what this owner calls by that name."""
-        found = _reached(lambda: self._store.hget(_key("names", kind, owner), name))
+        found = reached(lambda: self._store.hget(_key("names", kind, owner), name))
         return None if found is None else str(found.decode())
 
     def name_of(self, kind: str, id: str, owner: str) -> str | None:
-        found = _reached(lambda: self._store.hget(_key("named", kind, owner), id))
+        found = reached(lambda: self._store.hget(_key("named", kind, owner), id))
         return None if found is None else str(found.decode())
 
     def names(self, kind: str, owner: str) -> dict[str, str]:
         """{id: name} of everything that this owner has named."""
-        found = _reached(lambda: self._store.hgetall(_key("named", kind, owner)))
+        found = reached(lambda: self._store.hgetall(_key("named", kind, owner)))
         return {id.decode(): name.decode() for id, name in found.items()}
 
     def check_name(self, kind: str, name: str, id: str, owner: str, shipped: Mapping[str, str]) -> None:
@@ -157,15 +157,15 @@ class Claims:
 
     def weigh(self, kind: str, id: str, size: int) -> None:
         """Notes what was written after the claim was made."""
-        for owner in _reached(lambda: self._store.smembers(_key("owners", kind, id))):
+        for owner in reached(lambda: self._store.smembers(_key("owners", kind, id))):
             self._run("weigh", kind, id, owner.decode(), "", size)
 
     def shared(self, kind: str, id: str) -> bool:
         """Whether several owners hold it."""
-        return bool(_reached(lambda: self._store.scard(_key("owners", kind, id))) > 1)
+        return bool(reached(lambda: self._store.scard(_key("owners", kind, id))) > 1)
 
     def unowned(self, kind: str, id: str) -> bool:
-        return not _reached(lambda: self._store.exists(_key("owners", kind, id)))
+        return not reached(lambda: self._store.exists(_key("owners", kind, id)))
 
     def _give_back(self, kind: str, id: str, owner: str, map_id: str) -> None:
         token = secrets.token_hex(8)
@@ -188,22 +188,28 @@ class Claims:
         self, what: str, kind: str, id: str, owner: str, token: str, *more: Any, map_id: str = ""
     ) -> str:
         about = id if kind == "maps" else (more[-1] if what == "claim" else map_id)
-        keys = [
-            _key(kind, owner),
-            _key("owners", kind, id),
-            _key("sums"),
-            _key("mark", kind, id),
-            _key("uses", about, owner),
-        ]
-        keys += [
-            _key("maps", owner),
-            _key("mark", "maps", about),
-            _key("names", kind, owner),
-            _key("named", kind, owner),
-        ]
-        keys += [_key("policies", owner), _key("sizes", kind)]
-        said = _reached(lambda: self._script(keys=keys, args=[what, kind, id, owner, token, *more]))
+        places: list[tuple[str, ...]] = [(kind, owner), ("owners", kind, id), ("sums",), ("mark", kind, id)]
+        places += [("uses", about, owner), ("maps", owner), ("mark", "maps", about)]
+        places += [("names", kind, owner), ("named", kind, owner), ("policies", owner), ("sizes", kind)]
+        keys = [_key(*place) for place in places]
+        said = reached(lambda: self._script(keys=keys, args=[what, kind, id, owner, token, *more]))
         return str(said.decode())
+
+
+class Claimed:
+    """What maps and policies share. claims: whose they are; needed to find, add and delete."""
+
+    def __init__(self, kind: str, claims: Claims | None) -> None:
+        self._kind, self._given = kind, claims
+
+    @property
+    def _claims(self) -> Claims:
+        assert self._given is not None
+        return self._given
+
+    def _id_of(self, key: str, owner: str) -> str:
+        """The id of what an owner calls `key`; `key` itself where that is no name of theirs."""
+        return key if files.HASH.fullmatch(key) else self._claims.named(self._kind, key, owner) or key
 
 
 def _key(*parts: str) -> str:
@@ -216,7 +222,8 @@ def taken(name: str, id: str) -> NameTaken:
     )
 
 
-def _reached(action: Any) -> Any:
+def reached(action: Callable[[], Any]) -> Any:
+    """What a question to the store gives. Raises StoreError where it cannot be reached."""
     try:
         return action()
     except FAILURES as error:

@@ -21,7 +21,7 @@ from PIL import Image
 from specshield.errors import InUse, MapError, NotFound, SpecshieldError
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.library import files
-from specshield.service.library.claims import Claims
+from specshield.service.library.claims import Claimed, Claims
 from specshield.service.settings import Settings
 from specshield.task import parse_regions
 from specshield.world.map_server import dump_map, load_map
@@ -58,11 +58,12 @@ class Map:
         return buffer.getvalue()
 
 
-class Maps:
-    """The calls block: they read and write files. claims: whose they are; needed to find, add and delete."""
+class Maps(Claimed):
+    """The calls block: they read and write files."""
 
     def __init__(self, settings: Settings, claims: Claims | None = None) -> None:
-        self._folder, self._claims = files.kept(settings, "maps"), claims
+        super().__init__("maps", claims)
+        self._folder = files.kept(settings, "maps")
         self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
         self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
@@ -87,7 +88,6 @@ class Maps:
         """One that this owner may see: by id or name, or by the hash of the grid alone, which is what a
         policy's card knows. Raises NotFound.
         """
-        assert self._claims is not None
         found = self.shipped(key)
         if found is not None:
             return found
@@ -103,7 +103,6 @@ class Maps:
 
     def show(self, key: str, owner: str) -> dict[str, Any]:
         """The map as JSON, which can be had without reading the cells. Raises NotFound."""
-        assert self._claims is not None
         if self.shipped(key) is not None:
             return self.find(key, owner).to_json()
         id = self._id_of(key, owner)
@@ -114,7 +113,6 @@ class Maps:
         """Keeps a map for an owner, its content once, under a name if one is given. Raises MapError for rooms
         that no formula could name, LimitReached, InsufficientStorage and NameTaken.
         """
-        assert self._claims is not None
         parse_regions(rooms, "rooms")
         id = _id(grid, rooms)
         found = self.shipped(id)
@@ -141,7 +139,6 @@ class Maps:
 
     def delete(self, key: str, owner: str) -> None:
         """Takes an owner's map; its content goes with the last owner. Raises NotFound, InUse and Conflict."""
-        assert self._claims is not None
         found = self.shipped(key)
         if found is not None:
             raise InUse(
@@ -168,8 +165,7 @@ class Maps:
             [*self._named, *self._own(owner)], after, limit,
             lambda key: files.size(self._folder / key / "map.json"),
         )  # fmt: skip
-        names = self._claims.names("maps", owner) if self._claims is not None else {}
-        shown = []
+        names, shown = self._claims.names("maps", owner), []
         for key in keys:
             with suppress(NotFound):  # deleted at this moment
                 shown.append(self._shown(key) | ({"name": names[key]} if key in names else {}))
@@ -177,20 +173,13 @@ class Maps:
 
     def adopt(self) -> None:
         """Gives the maps that nobody has, of a time before owners, to the owner without a name."""
-        assert self._claims is not None
         for id in files.ids(self._folder):
             if self._claims.unowned("maps", id):
                 with self._claims.adding("maps", id, OPEN, files.weight_of(self._folder / id)):
                     pass
 
-    def _id_of(self, key: str, owner: str) -> str:
-        """The id of what an owner calls `key`; `key` itself where that is no name of theirs."""
-        assert self._claims is not None
-        return key if files.HASH.fullmatch(key) else self._claims.named("maps", key, owner) or key
-
     def _own(self, owner: str) -> list[str]:
         """Ids that the owner has; one whose files are not there was not written to the end."""
-        assert self._claims is not None
         return [id for id in self._claims.ids("maps", owner) if files.there(self._folder / id)]
 
     def _shown(self, key: str) -> dict[str, Any]:

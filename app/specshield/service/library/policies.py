@@ -9,7 +9,6 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from specshield.policy.options import read_options
 from specshield.robot import robot_from_json
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.library import files
-from specshield.service.library.claims import Claims
+from specshield.service.library.claims import Claimed, Claims
 from specshield.service.library.maps import Maps
 from specshield.service.settings import Settings
 from specshield.shield.proposal import Proposer
@@ -55,12 +54,12 @@ class Record:
     card: dict[str, Any] | None = None
 
 
-class Policies:
+class Policies(Claimed):
     """The calls block on files. A key is an id, or the name of a policy that came with the server."""
 
     def __init__(self, settings: Settings, maps: Maps, claims: Claims | None = None) -> None:
-        """claims: whose they are; needed to find, add and delete."""
-        self._maps, self._models, self._claims = maps, settings.models_dir, claims
+        super().__init__("policies", claims)
+        self._maps, self._models = maps, settings.models_dir
         self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
         self._folder = files.kept(settings, "policies")
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
@@ -81,17 +80,13 @@ class Policies:
 
     def find(self, key: str, owner: str) -> Record:
         """One that this owner may see. Raises NotFound."""
-        assert self._claims is not None
-        if not files.HASH.fullmatch(key) and key not in self._named:
-            key = self._claims.named("policies", key, owner) or key
-        found = self.record(key)
+        found = self.record(key if key in self._named else self._id_of(key, owner))
         if found.name is None and not self._claims.holds("policies", found.id, owner):
             raise _missing(key)
         return found
 
     def still_there(self, ids: Sequence[str], owner: str) -> None:
         """Raises NotFound where a policy is gone: asked once whoever deletes it can see that it is used."""
-        assert self._claims is not None
         shipped = {record.id for record in self._named.values()}
         for id in ids:
             if id not in shipped and not self._claims.settled("policies", id, owner):
@@ -106,14 +101,9 @@ class Policies:
             raise error.at("robot") from None
         spec = about.spec
         try:
+            regions, signals = spec.get("regions"), spec.get("signals")
             return make_task(
-                world.grid,
-                robot,
-                spec["formula"],
-                spec.get("regions"),
-                world.rooms,
-                spec.get("signals"),
-                self._max_horizon,
+                world.grid, robot, spec["formula"], regions, world.rooms, signals, self._max_horizon
             )
         except FormulaError as error:
             raise error.at("formula").at("spec") if error.path is None else error.at("spec") from None
@@ -158,23 +148,19 @@ class Policies:
 
     def check_name(self, record: Record, owner: str, name: str) -> None:
         """Raises NameTaken, and InputError for a name that this policy cannot have."""
-        assert self._claims is not None
         shipped = {each: known.id for each, known in self._named.items()}
         self._claims.check_name("policies", name, record.id, owner, shipped)
 
     def name(self, record: Record, owner: str, name: str) -> None:
         """Names an owner's policy. Raises NameTaken."""
-        assert self._claims is not None
         if record.name is None:
             self._claims.name("policies", record.id, owner, name)
 
     def name_of(self, record: Record, owner: str) -> str | None:
-        assert self._claims is not None
         return record.name or self._claims.name_of("policies", record.id, owner)
 
     def names(self, owner: str) -> dict[str, str]:
         """{id: name} of the policies that this owner has named."""
-        assert self._claims is not None
         return self._claims.names("policies", owner)
 
     def made_here(self, id: str) -> Record | None:
@@ -218,7 +204,6 @@ class Policies:
         return added
 
     def _add(self, record: Record, trained: Mapping[str, bytes], key: Key) -> Record:
-        assert self._claims is not None
         if record.id in (found.id for found in self._named.values()):
             return self.record(record.id)
         record = replace(record, created_at=files.now())
@@ -254,7 +239,7 @@ class Policies:
         with files.full_disk():
             files.write_file(folder / "policy.safetensors", weights)
             files.write_file(folder / "card.json", files.to_json({**card, "id": id}))
-        if self._claims is not None:
+        if self._given is not None:
             self._claims.weigh("policies", id, files.weight_of(folder))
 
     def checkpoints(self, id: str) -> Path:
@@ -264,7 +249,6 @@ class Policies:
         """Takes the claim of an owner who has marked the deletion by this token. True where the policy went
         with it. Raises Conflict where the marking is too long ago.
         """
-        assert self._claims is not None
         last = self._claims.free("policies", record.id, owner, token, self._own_map(record.about))
         if last:
             self._recent.drop(record.id)
@@ -273,7 +257,6 @@ class Policies:
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[Record], str | None]:
         """One page of an owner's policies and those of all."""
-        assert self._claims is not None
         own = (id for id in self._claims.ids("policies", owner) if (self._folder / id).is_dir())
         keys, following = files.page(
             [*self._named, *own], after, limit,
@@ -284,7 +267,6 @@ class Policies:
 
     def adopt(self) -> None:
         """Gives the policies that nobody has, of a time before owners, to the owner without a name."""
-        assert self._claims is not None
         for id in files.ids(self._folder):
             if self._claims.unowned("policies", id):
                 size, record = files.weight_of(self._folder / id), self.record(id)
@@ -293,20 +275,15 @@ class Policies:
 
     def _shipped(self) -> Iterator[Record]:
         for path in sorted(self._models.glob("*/card.json")):
-            with _left_out(path.parent):
+            try:
                 card = files.read_json(path)
                 about = describe(card)
                 about = replace(about, map_id=self._maps.get(about.map_id).id)
-                yield Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)
-
-
-@contextmanager
-def _left_out(folder: Path) -> Iterator[None]:
-    """Logs why a policy cannot be loaded, and goes on: one broken folder must not stop the whole server."""
-    try:
-        yield
-    except (SpecshieldError, KeyError, ValueError) as error:
-        log.warning("policy %s is left out: %s", folder, error)
+                record = Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)
+            except (SpecshieldError, KeyError, ValueError) as error:
+                log.warning("policy %s is left out: %s", path.parent, error)
+                continue  # one broken folder must not stop the whole server
+            yield record
 
 
 def describe(card: Mapping[str, Any]) -> Description:

@@ -19,7 +19,7 @@ from specshield.service.library.policies import Record
 from specshield.service.routes.uploads import TOO_MUCH, received
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.policies import PolicyList, PolicyRequest, PolicyResponse
-from specshield.service.state import Cursor, Limit, Server, ServerState, problems
+from specshield.service.state import Cursor, Limit, Server, ServerState, json_content, problems
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
@@ -46,10 +46,7 @@ PolicyId = Annotated[
             "required": True,
             "description": "What to make, as JSON; or a policy that was made elsewhere, as two files.",
             "content": {
-                "application/json": {
-                    "schema": {"$ref": "#/components/schemas/PolicyRequest"},
-                    "example": examples.POLICY,
-                },
+                **json_content("PolicyRequest", examples.POLICY),
                 "multipart/form-data": {
                     "schema": {
                         "type": "object",

@@ -12,7 +12,7 @@ from specshield.service.access.owners import Owner
 from specshield.service.heavy.uploads import explain
 from specshield.service.routes.uploads import TOO_MUCH
 from specshield.service.schemas.specs import SpecRequest, SpecResponse
-from specshield.service.state import ServerState, problems
+from specshield.service.state import ServerState, json_content, problems
 
 router = APIRouter(prefix="/v1/specs", tags=["specifications"])
 MODELS = (SpecRequest,)  # documented by hand
@@ -25,15 +25,7 @@ SHORT = 16 << 10  # [bytes] of a body that is read in a few ms
     summary="Check a formula",
     responses=problems(_404="No such map.", **TOO_MUCH),
     openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {
-                "application/json": {
-                    "schema": {"$ref": "#/components/schemas/SpecRequest"},
-                    "example": examples.SPEC_REQUEST,
-                }
-            },
-        }
+        "requestBody": {"required": True, "content": json_content("SpecRequest", examples.SPEC_REQUEST)}
     },
 )
 async def validate(request: Request, server: ServerState, owner: Owner) -> Any:

@@ -15,6 +15,7 @@ Pose = Annotated[
     list[Coordinate],
     Field(min_length=3, max_length=3, fail_fast=True, description="[x, y, theta]: [m, m, rad], map frame."),
 ]
+Poses = Annotated[list[Pose], Field(min_length=1, max_length=10_001, fail_fast=True)]
 Point = Annotated[
     list[Coordinate],
     Field(min_length=2, max_length=2, fail_fast=True, description="[x, y] in metres, map frame."),

@@ -9,7 +9,7 @@ from pydantic import ConfigDict, Field, JsonValue, model_validator
 
 from specshield.lookahead.preferences import PREFERENCES, PROJECTION
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Id, Name, Pose, SpecStatus, Strict
+from specshield.service.schemas.base import Answer, Id, Name, Pose, Poses, SpecStatus, Strict
 from specshield.service.schemas.robots import RobotResponse
 from specshield.shield.uncertainty import MOST_TRANSLATION
 
@@ -123,11 +123,8 @@ class SwitchRequest(_Policies):
         description="`keep`: the new rule's windows count from where those of the present one do, at first "
         "the session's start, and its history counts. `restart`: both begin at t.",
     )
-    poses: list[Pose] | None = Field(
+    poses: Poses | None = Field(
         None,
-        min_length=1,
-        max_length=10_001,
-        fail_fast=True,
         description="Ends with x_t, joined as in a step. Without it, x_t is taken to be where the action of "
         "the last decision leads.",
     )

@@ -8,10 +8,11 @@ import msgspec
 from pydantic import ConfigDict, Field, model_validator
 
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Point, Pose, SpecStatus, Strict
+from specshield.service.schemas.base import Answer, Point, Pose, Poses, SpecStatus, Strict
 from specshield.service.schemas.sessions import SessionResponse, SessionRule
 
 MOST_POINTS = 2000  # of each kind, in one step
+Points = Annotated[list[Point], Field(max_length=MOST_POINTS, fail_fast=True)]
 
 
 class StepRequest(Strict):
@@ -22,11 +23,8 @@ class StepRequest(Strict):
         le=1_000_000,
         description="The step to decide. It is the lock: sent again, it returns the stored answer.",
     )
-    poses: list[Pose] = Field(
-        min_length=1,
-        max_length=10_001,
-        fail_fast=True,
-        description="Ends with x_t; the whole history or any newest part that joins what the server has.",
+    poses: Poses = Field(
+        description="Ends with x_t; the whole history or any newest part that joins what the server has."
     )
     logits: list[float | None] | None = Field(
         None,
@@ -41,31 +39,21 @@ class StepRequest(Strict):
         description="Samples at t of the signals that the spec declares; one left out holds its last value.",
     )
     witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
-    occupied: list[Point] | None = Field(
+    occupied: Points | None = Field(
         None,
-        max_length=MOST_POINTS,
-        fail_fast=True,
         description="Points at which the robot's sensors see an obstacle now, map frame. They count at once.",
     )
-    free: list[Point] | None = Field(
-        None,
-        max_length=MOST_POINTS,
-        fail_fast=True,
-        description="Points at which the robot's sensors see free floor now, map frame.",
+    free: Points | None = Field(
+        None, description="Points at which the robot's sensors see free floor now, map frame."
     )
     explain: bool = Field(False, description="Say of each forbidden action what it would break.")
 
 
 LARGEST = 1.7976931348623157e308  # what is beyond, or not a number, is refused
 Finite = Annotated[float, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
-SentPose = Annotated[
-    list[Annotated[float, msgspec.Meta(ge=-1e8, le=1e8)]], msgspec.Meta(min_length=3, max_length=3)
-]
-
-
-SentPoint = Annotated[
-    list[Annotated[float, msgspec.Meta(ge=-1e8, le=1e8)]], msgspec.Meta(min_length=2, max_length=2)
-]
+SentCoordinate = Annotated[float, msgspec.Meta(ge=-1e8, le=1e8)]
+SentPose = Annotated[list[SentCoordinate], msgspec.Meta(min_length=3, max_length=3)]
+SentPoint = Annotated[list[SentCoordinate], msgspec.Meta(min_length=2, max_length=2)]
 SentPoints = Annotated[list[SentPoint], msgspec.Meta(max_length=MOST_POINTS)]
 
 
@@ -164,13 +152,7 @@ class CloseRequest(Strict):
     t: int | None = Field(
         None, ge=0, le=1_000_000, description="The last step reached. Default: the last one stored."
     )
-    poses: list[Pose] | None = Field(
-        None,
-        min_length=1,
-        max_length=10_001,
-        fail_fast=True,
-        description="Ends with x_t, joined as in a step.",
-    )
+    poses: Poses | None = Field(None, description="Ends with x_t, joined as in a step.")
 
     @model_validator(mode="after")
     def _both_or_neither(self) -> CloseRequest:

@@ -9,7 +9,6 @@ import logging
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 from specshield.errors import SpecshieldError
 from specshield.policy.methods import available
@@ -44,7 +43,8 @@ class TrainingWorker:
             if self._process.poll() is None:
                 return
             self._process = None
-        lock = os.open(_lock(self._settings.data_dir), os.O_RDWR | os.O_CREAT, 0o600)
+        self._settings.data_dir.mkdir(parents=True, exist_ok=True)
+        lock = os.open(self._settings.data_dir / "worker.lock", os.O_RDWR | os.O_CREAT, 0o600)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # It ends when this process does: its standard input is a pipe from here.
@@ -87,8 +87,3 @@ async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None, st
             log.error("%s", error)
             await asyncio.sleep(2.0)
         await asyncio.sleep(CHECK_EVERY)
-
-
-def _lock(data_dir: Path) -> Path:
-    data_dir.mkdir(parents=True, exist_ok=True)
-    return data_dir / "worker.lock"

@@ -15,10 +15,10 @@ from typing import Any
 from rq import Queue
 from rq.serializers import JSONSerializer
 
-from specshield.errors import StoreError
 from specshield.policy.methods import METHODS
+from specshield.service.library.claims import reached
 from specshield.service.settings import Settings
-from specshield.service.storage.connect import FAILURES, connect
+from specshield.service.storage.connect import connect
 from specshield.service.watch import logs
 
 ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
@@ -57,7 +57,7 @@ class Jobs:
         return self.redis.register_script(WRITE)
 
     def worker_there(self, method: str) -> bool:
-        return bool(self._try(lambda: self.redis.exists(_worker(method))))
+        return bool(reached(lambda: self.redis.exists(_worker(method))))
 
     def start(self, id: str, method: str) -> None:
         """Queue a run for this policy."""
@@ -68,17 +68,16 @@ class Jobs:
             self.redis.hset(_key(id), mapping=state)
             self._enqueue(id, attempt, method)
 
-        self._try(enqueue)
+        reached(enqueue)
         logs.tell("policy queued", policy_id=id, method=method)
 
     def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
+        settings = self._settings
         Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer).enqueue(
             "specshield.service.training.worker.train",
             id,
             attempt,
-            job_timeout=(
-                self._settings.training_timeout if learns(method) else self._settings.synthesis_timeout
-            ),
+            job_timeout=settings.training_timeout if learns(method) else settings.synthesis_timeout,
             result_ttl=0,
             failure_ttl=24 * 3600,
             at_front=at_front,
@@ -86,27 +85,25 @@ class Jobs:
 
     def get(self, id: str) -> Training:
         """How the training of a policy stands. One that the store knows nothing of counts as failed."""
-        found, alive = self._try(lambda: (self.redis.hgetall(_key(id)), self.redis.exists(_alive(id))))
+        found, alive = reached(lambda: (self.redis.hgetall(_key(id)), self.redis.exists(_alive(id))))
         state = {name.decode(): value.decode() for name, value in found.items()}
         status, error = state.get("status", "failed"), state.get("error") or None
         if status == "failed" and not state:
             error = "the store knows nothing of its training any more; ask for it again"
         if status == "training" and not alive:
-            status, error = (
-                "failed",
-                "its worker is gone; ask for it again, and the training goes on from its last checkpoint",
-            )
+            status = "failed"
+            error = "its worker is gone; ask for it again, and the training goes on from its last checkpoint"
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 
     def cancel(self, id: str) -> None:
         """Cancels the run. One that has begun stops within about a second, a queued one at its turn."""
         fields = {"attempt": "", "status": "failed", "error": "cancelled", "eta_s": ""}
-        self._try(lambda: self.redis.hset(_key(id), mapping=fields))
+        reached(lambda: self.redis.hset(_key(id), mapping=fields))
         logs.tell("policy cancelled", policy_id=id)
 
     def forget(self, id: str) -> None:
-        self._try(lambda: self.redis.unlink(_key(id)))
+        reached(lambda: self.redis.unlink(_key(id)))
 
     def counts(self) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], int]]:
         """By method and state: the runs that are queued or training now, and all that have ended."""
@@ -122,31 +119,31 @@ class Jobs:
                 *now, ended = pipe.execute()
             return now, ended
 
-        now, ended = self._try(ask)
+        now, ended = reached(ask)
         live = [(name, state) for name in methods for state in ("queued", "training")]
         told = {tuple(key.decode().split(" ", 1)): int(count) for key, count in ended.items()}
         return dict(zip(live, now, strict=True)), told
 
     def ended(self, method: str, state: str) -> None:
         """Counts a run that came to its end, `ready` or `failed`."""
-        self._try(lambda: self.redis.hincrby(ENDED, f"{method} {state}", 1))
+        reached(lambda: self.redis.hincrby(ENDED, f"{method} {state}", 1))
 
     def hand_back(self, id: str, attempt: str, method: str) -> None:
         """Queue a run whose worker stops before all others, unless it was cancelled or asked for again."""
         if self.report(id, attempt, status="queued", eta_s=""):
-            self._try(lambda: self._enqueue(id, attempt, method, at_front=True))
+            reached(lambda: self._enqueue(id, attempt, method, at_front=True))
 
     # --- for the run itself
 
     def report(self, id: str, attempt: str, **fields: Any) -> bool:
         """Notes how the run stands. False, with nothing noted, once it was cancelled or asked for again."""
         pairs = [part for pair in fields.items() for part in pair]
-        return bool(self._try(lambda: self._write(keys=[_key(id)], args=[attempt, *pairs])))
+        return bool(reached(lambda: self._write(keys=[_key(id)], args=[attempt, *pairs])))
 
     def sign_of_life(self, id: str, attempt: str) -> bool:
         """Says that the run is alive. False once it was cancelled or asked for again."""
-        self._try(lambda: self.redis.set(_alive(id), 1, ex=SIGN_OF_LIFE))
-        return bool(self._try(lambda: self.redis.hget(_key(id), "attempt")) == attempt.encode())
+        reached(lambda: self.redis.set(_alive(id), 1, ex=SIGN_OF_LIFE))
+        return bool(reached(lambda: self.redis.hget(_key(id), "attempt")) == attempt.encode())
 
     def worker_lives(self, methods: Sequence[str]) -> None:
         """Says that a worker for these methods is alive."""
@@ -155,13 +152,7 @@ class Jobs:
             for method in methods:
                 self.redis.set(_worker(method), 1, ex=SIGN_OF_LIFE)
 
-        self._try(live)
-
-    def _try(self, action: Any) -> Any:
-        try:
-            return action()
-        except FAILURES as error:
-            raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+        reached(live)
 
 
 def learns(method: str) -> bool:

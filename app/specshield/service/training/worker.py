@@ -136,12 +136,9 @@ class _Worker(Worker):
         raise SystemExit(0)
 
     def _killed(self, job: Job, pid: int, status: int, usage: Any) -> None:
-        how = (
-            f"by signal {os.WTERMSIG(status)}"
-            if status and os.WIFSIGNALED(status)
-            else f"with status {status}"
-        )
-        if status and os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
+        killed = status and os.WIFSIGNALED(status)
+        how = f"by signal {os.WTERMSIG(status)}" if killed else f"with status {status}"
+        if killed and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
         self._fail(
             job,
