@@ -20,8 +20,8 @@ from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield.caution.experience import FORMAT, Seen
 from specshield.shield.episode import Carry, Config, decide, make_shield
 from specshield.shield.surprise.vain import barred_by
-from specshield.shield.taught import Taught, on_map
-from specshield.shield.uncertainty import Uncertainty
+from specshield.shield.taught import Taught, on_map, wary
+from specshield.shield.uncertainty import Care, Uncertainty
 from specshield.task import make_task
 from specshield.world.learned import CONTACT, LearnedMap, learn
 from specshield.world.occupancy import OccupancyGrid
@@ -381,3 +381,13 @@ def test_whoever_pauses_within_the_time_that_is_left_is_there_in_time(steps, unc
             if decision.spec_status != "pending":
                 break
         assert decision.spec_status == "satisfied", pause
+
+
+@pytest.mark.parametrize("learn_map", [False, True])
+def test_ways_for_the_slack_are_asked_for_on_the_way_by_robots_that_may_be_inexact(learn_map):
+    uncertain, exact = (Config(learn_map=learn_map, uncertainty=u) for u in (Uncertainty(), None))
+    assert [wary(uncertain, Care(0.0, 0), Taught(), on_way).on_way for on_way in (True, False)] == [
+        True,
+        False,
+    ]
+    assert not wary(exact, Care(0.0, 3), Taught(), True).on_way

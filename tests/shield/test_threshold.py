@@ -9,12 +9,12 @@ import pytest
 
 from specshield.policy.reachability import policy as reachability
 from specshield.shield.caution.experience import learn
-from specshield.shield.caution.threshold import chances
+from specshield.shield.caution.threshold import MOST_SLIPS, _in_time, chances
 from specshield.shield.episode import Config, close, decide, make_shield
 from specshield.shield.feasibility import prefix_of
 from specshield.shield.judgement import judge
 from specshield.shield.proposal import Proposal
-from specshield.shield.uncertainty import Uncertainty
+from specshield.shield.uncertainty import Noise, Uncertainty
 from tests.oracles.cells import WAIT, Cells, ways
 
 VECTORS = json.loads((Path(__file__).parents[1] / "oracles/storm/vectors.json").read_text())
@@ -122,3 +122,33 @@ def test_a_g_whose_arithmetic_is_not_finite_before_it_begins_is_decided():
     found = decide(shield, [cells.pose(0, 0, 0)], np.zeros(len(shield.task.robot.actions)))
     assert found.mode == "shaped"
     assert found.feasible_mass > 0.0
+
+
+@pytest.mark.parametrize(
+    ("blocks", "moves", "waits", "free", "lost", "kept", "each"),
+    [
+        (1, 5, 5, 0, 3.0, 57.0, True),
+        (4, 8, 2, 0, 3.0, 57.0, True),
+        (10, 5, 1, 3, 0.5, 4.5, False),
+        (20, 8, 1, 5, 3.0, 57.0, True),
+        (3, 6, 0, 2, 50.0, 950.0, True),
+    ],
+)
+def test_being_in_time_is_as_likely_as_in_simulation(blocks, moves, waits, free, lost, kept, each):
+    """Blocks of moves and then waits. At the end of each, or of the last alone, the robot is `free` steps
+    late at most. The rate of slips is drawn from Beta(lost, kept), once a run.
+    """
+    motions, size = np.array(([0] * moves + [WAIT] * waits) * blocks), moves + waits
+    due = np.array([size * (i + 1) for i in range(blocks) if each or i == blocks - 1])
+    random, runs, kept_runs = np.random.default_rng(0), 4000, 0
+    for rate in random.beta(lost, kept, runs):
+        late, in_time = 0, True
+        for n, motion in enumerate(motions, 1):
+            late = max(late - 1, 0) if motion == WAIT else late + random.geometric(1.0 - rate) - 1
+            in_time = in_time and not (n in due and late > free)
+        kept_runs += in_time
+    noise, scratch = Noise(0.0, 0.0, 1.0, lost, kept), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
+    same = np.full(len(due), free), np.full(len(due), len(motions))
+    found = _in_time(noise, 0.0, True, due, *same, motions, WAIT, 0, scratch)
+    share = kept_runs / runs
+    assert abs(found - share) <= 3.0 * np.sqrt(max(share * (1.0 - share), 1.0 / runs) / runs) + 0.002

@@ -33,6 +33,7 @@ class Judged:
 
     tried: Futures
     part: Prefix  # as what can still be kept sees it
+    kept: Floats  # [N], rho of that along each future; -inf where it is set aside
     best: Best
     feasible_motion: Bools  # [M]
     feasible: Bools  # [A], S_t; false for a terminal action
@@ -79,14 +80,17 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
-        by_chance = shield.config.threshold_over == "episode"  # then all slacks count, not the most alone
-        if aimed.slack > 0 and (care.on_way or by_chance) and not violated and True in left.tolist():
-            for steps in range(aimed.slack, max(aimed.slack - LESS, 0) if by_chance else aimed.slack - 1, -1):
+        # With a threshold for the episode all slacks count, not the most alone.
+        by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
+        most = aimed.slack or aimed.most
+        if most > 0 and (care.on_way or by_chance) and not violated and True in left.tolist():
+            for steps in range(most, max(most - LESS, 0) if by_chance else most - 1, -1):
                 tried = _in_time(shield, prefix, tried, asked, steps)
             kept = tried.rho
             if care.barred is not None and not vain:
                 kept = _aside(shield, care.barred, prefix, tried, kept)
             aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, aimed)
+            values = best_of(tried, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
@@ -98,7 +102,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
     completion = int(robot.representative[first])
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
     asked_and_had = aimed.margin, aimed.slack, aimed.lowered
-    return Judged(tried, part, best, feasible, *by_action, completion, *asked_and_had, vain, left_out)
+    return Judged(tried, part, kept, best, feasible, *by_action, completion, *asked_and_had, vain, left_out)
 
 
 def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:
@@ -130,11 +134,15 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
     robot, sure = shield.task.robot, judged.feasible_motion & ~doubtful
     if not sure.any():
         sure = judged.feasible_motion & ~risky
-    if not sure.any() and judged.part.formula is shield.task.formula:
-        keeps = best_of(judged.tried, judged.tried.rho, len(risky))
+    if not sure.any():
+        keeps = best_of(judged.tried, judged.kept, len(risky))
         sure = (keeps.robustness > SATISFIED_ABOVE) & ~doubtful
         if sure.any():
-            judged = replace(judged, best=keeps, margin=0.0, slack=0)
+            robustness = np.append(judged.tried.rho[keeps.row], -np.inf)[robot.motion_of]
+            less = shield.config.margin > 0.0 or shield.config.slack > 0
+            judged = replace(
+                judged, best=keeps, robustness=robustness, margin=0.0, slack=0, margin_unattainable=less
+            )
     if not sure.any() or np.array_equal(sure, judged.feasible_motion):
         return judged
     completion = judged.completion

@@ -178,6 +178,7 @@ def wary(config: Config, care: Care, taught: Taught, on_way: bool) -> Care:
     least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
     if config.learn_map and config.uncertainty is not None:
         least = max(least, AROUND)
+    on_way = on_way and config.uncertainty is not None
     return Care(care.margin, least, care.noise, care.stride, care.chance, barred, on_way)
 
 

@@ -35,6 +35,8 @@ from specshield.task import Task, kept_with_task
 
 GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
+MOST_SLIPS, UNLIKELY = 64, 1e-9  # slips of one future that are looked at, and their probability; by hand
+
 
 def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: Bools) -> Floats:
     """V of each action [A]; of a terminal one, 0. doubts [M]: motions that are not to be drawn though some
@@ -108,7 +110,7 @@ def _chances(
     of each conjunct's window; a G of `parts` may begin before it.
     """
     count, spread = still.shape[0], spread_of(noise, stride)
-    buffer, late = np.empty(leaves.shape[1]), np.empty(motions.shape[1] + 2)
+    buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
     due, free, within = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
     for f in range(rho.shape[0]):
         if not rho[f] > SATISFIED_ABOVE:
@@ -174,39 +176,48 @@ def _in_time(
     """The probability that a robot which keeps to a future's motions (T - t,) is in time for all that is due.
 
     due, free, within (K,): of `_deadline`. slips: whether motions slip. dwells: no wait among the first so
-    many motions is left out. late: scratch; the probability that the robot is so many steps late, and was in
-    time for all that was due before. It repeats what was not executed, and leaves out waits where it is late.
-    How likely the next motion is to slip follows from how often motions slipped and did not; what was made up
-    for by waits is forgotten there.
+    many motions is left out. late (MOST_SLIPS + 1, MOST_SLIPS + 2): scratch; how likely it is that so many
+    motions slipped, and the robot is so many steps late and was in time for all that was due before. It
+    repeats what was not executed, and leaves out waits where it is late. More slips, and what is less likely
+    than UNLIKELY, count as being too late.
     """
-    last, made, most = 0, 0, 1
+    last, made, top = 0, 0, 0  # top: the most slips that are likely
     for c in range(due.shape[0]):
-        if due[c] > 0:
-            last = max(last, due[c])
-            most = max(most, int(free[c] + 4.0 * spread * math.sqrt(within[c])) + 1)
-    most = min(most, late.shape[0] - 1)
-    for k in range(most + 1):
-        late[k] = 1.0 if k == 0 else 0.0
+        last = max(last, due[c])
+    late[0, :] = 0.0
+    late[0, 0] = 1.0
     for n in range(1, last + 1):
         if motions[n - 1] == wait:
             if n > dwells:
-                late[0] += late[1]
-                for k in range(1, most):
-                    late[k] = late[k + 1]
+                for s in range(top + 1):
+                    late[s, 0] += late[s, 1]
+                    for k in range(1, s + 1):
+                        late[s, k] = late[s, k + 1]
         elif slips:
-            again = 0.0
-            for k in range(most):
-                here = late[k] + again
-                again = here * (noise.lost + k) / (noise.lost + noise.kept + k + made)
-                late[k] = here - again
+            s = 0
+            while s <= top:
+                share, most = (noise.lost + s) / (noise.lost + noise.kept + s + made), 0.0
+                if s == top and top < MOST_SLIPS:
+                    late[s + 1, :] = 0.0
+                for k in range(s + 1):
+                    again = late[s, k] * share
+                    late[s, k] -= again
+                    if s < MOST_SLIPS:
+                        late[s + 1, k + 1] += again
+                    most = max(most, again)
+                if s == top and top < MOST_SLIPS and most > UNLIKELY:
+                    top += 1
+                s += 1
             made += 1
         for c in range(due.shape[0]):
             if due[c] == n:
-                for k in range(most):
-                    late[k] *= 1.0 - above(free[c] - k, spread * math.sqrt(within[c]))
+                for s in range(top + 1):
+                    for k in range(s + 1):
+                        late[s, k] *= 1.0 - above(free[c] - k, spread * math.sqrt(within[c]))
     sure = 0.0
-    for k in range(most):
-        sure += late[k]
+    for s in range(top + 1):
+        for k in range(s + 1):
+            sure += late[s, k]
     return sure
 
 

@@ -17,14 +17,15 @@ SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
 
 @dataclass(frozen=True)
 class Begun:
-    """Proposes one way, motions [T - t]."""
+    """Proposes ways that begin at x_t, motions [N, T - t], or what is left of them later on."""
 
     task: Task
     motions: Ints
     id = "the way that was begun"
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        return Proposal(self.motions[None], int(self.motions[0]))
+        left = self.task.horizon + 1 - len(history)
+        return Proposal(self.motions[:, -left:], int(self.motions[0, -left]))
 
 
 def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:
@@ -39,8 +40,11 @@ def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:
     way = carry.witnesses[motion] if motion >= 0 else None
     if not way or not _is_at(poses[-1], poses[-2]) or _is_at(poses[-1], carry.next_poses[motion]):
         return shield
-    again = Begun(task, np.frombuffer(bytes([motion]) + way[:-1], np.uint8).astype(np.int64))
-    return replace(shield, proposers=(*shield.proposers, again))
+    wait, rows = bytes([max(task.robot.wait_motion, 0)]), [way[:-1]]
+    if task.robot.wait_motion >= 0 and wait in way:  # a robot that is late waits for less long
+        rows.append(way.replace(wait, b"", 1))
+    again = np.array([[motion, *row] for row in rows], np.int64)
+    return replace(shield, proposers=(*shield.proposers, Begun(task, again)))
 
 
 def _is_at(one: Floats, other: Floats) -> bool:
