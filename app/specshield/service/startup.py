@@ -24,8 +24,8 @@ from specshield import compiled
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
-KERNELS = 234  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
-TAKES = 40  # [s] of a first start on two quiet cores, reckoned from 66 s of CPU; `make wheels` prints it
+KERNELS = 239  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
+TAKES = 34  # [s] that a first start took on two quiet cores: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
 # [objects] more than there were, at which a collection looks for cycles among them. With Python's 700 it took
