@@ -32,6 +32,7 @@ from specshield.shield import decision as core
 from specshield.shield import episode
 from specshield.shield.decision import Shield
 from specshield.shield.signals import any_signal
+from specshield.shield.surprise.slip import SAME_POSE
 from specshield.task import Task, check_signals
 
 if TYPE_CHECKING:
@@ -235,7 +236,7 @@ class LocalSession:
         if self.t > 0:
             return x_t
         gap = [a - b for a, b in zip(x_t, self._initial, strict=True)]
-        if max(abs(gap[0]), abs(gap[1]), abs(wrap(gap[2]))) > episode.SAME_POSE:
+        if max(abs(gap[0]), abs(gap[1]), abs(wrap(gap[2]))) > SAME_POSE:
             raise HistoryConflict(
                 "the session began elsewhere", path="pose", got=list(x_t), expected=f"{list(self._initial)}"
             )

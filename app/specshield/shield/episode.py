@@ -40,7 +40,7 @@ from specshield.shield.judgement import (
 )
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.doubt import recovered, tried_again
-from specshield.shield.surprise.slip import with_begun
+from specshield.shield.surprise.slip import SAME_POSE, with_begun
 from specshield.shield.taught import doubtful, handed_on, on_map, teach, wary
 from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
 
@@ -48,7 +48,6 @@ __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "dec
 
 Signals = Mapping[str, Floats]
 Explainer = Callable[[Shield, Prefix, Judged | None, Bools], tuple[Explanation | None, ...]]
-SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
 
 
 def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> None:

@@ -138,7 +138,8 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
         keeps = best_of(judged.tried, judged.kept, len(risky))
         sure = (keeps.robustness > SATISFIED_ABOVE) & ~doubtful
         if sure.any():
-            robustness = np.append(judged.tried.rho[keeps.row], -np.inf)[robot.motion_of]
+            rho = np.where(keeps.row >= 0, judged.tried.rho[keeps.row], -np.inf)
+            robustness = np.append(rho, -np.inf)[robot.motion_of]
             less = shield.config.margin > 0.0 or shield.config.slack > 0
             judged = replace(
                 judged, best=keeps, robustness=robustness, margin=0.0, slack=0, margin_unattainable=less
