@@ -87,6 +87,21 @@ def test_nothing_is_certified_without_a_future_that_keeps_the_rule(name):
         assert "was not used at this step" in said
 
 
+class Raising(Exhaustive):
+    """Proposes every way, and raises where it is told of anything else."""
+
+    def on_body(self, *told):
+        raise RuntimeError
+
+    avoiding = foreseeing = earlier = on_body
+
+
+def test_a_proposer_that_raises_where_it_is_told_of_a_map_or_a_deadline_is_asked_as_it_is():
+    shield = make_shield([Raising(REACH)], Config(slack=1))
+    marked = {"carry": None, "occupied": [[0.5, 0.5]]}
+    assert decide(shield, [REACH.pose(0, 0, 0)], EVEN, **marked).feasible_mass > 0.0
+
+
 def test_what_was_wrong_is_said():
     said = {
         "rows too short": "policy 'liar' was not used at this step: its motions have the shape [4, 2]; "

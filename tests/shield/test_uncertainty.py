@@ -30,7 +30,7 @@ def test_motions_as_foreseen_let_go():
     noise = noise_of(STRETCH, walked(Seen(), [MOVES[0]] * 3))
     assert (noise.move, noise.turn) == (0.0, 0.0)
     slack = [
-        slack_for(noise_of(STRETCH, walked(Seen(), [MOVES[0]] * n)), 0.2, 40, 0.0025) for n in (0, 30, 300)
+        slack_for(noise_of(STRETCH, walked(Seen(), [MOVES[0]] * n)), 0.2, 40, 0.0025, 0) for n in (0, 30, 300)
     ]
     assert slack[0] >= 7 > slack[1] > slack[2]
 
@@ -82,7 +82,7 @@ def test_slack_covers_what_motions_may_cost(left, slips, lost, kept, move):
         tail = norm.sf(slack - k, scale=spread * math.sqrt(left)) if move else (k > slack).astype(float)
         return (1.0 - slips) * tail[0] + slips * float(number.pmf(k) @ tail)
 
-    found = slack_for(noise, 0.2, left, chance)
+    found = slack_for(noise, 0.2, left, chance, 0)
     fits = [slack for slack in range(left) if over(slack) <= chance * 1.02]
     assert found in (fits[0] if fits else left, next((s for s in fits if over(s) <= chance * 0.98), left))
 

@@ -174,7 +174,10 @@ def decide(
     remembered = None
     if seen is not None:
         follows = shield.config.learn_map and taught.followed.follows
-        done = np.eye(len(robot.actions))[action] if follows else answer.distribution
+        done = answer.distribution
+        if follows:
+            done = np.zeros(len(robot.actions))
+            done[action] = 1.0
         remembered = remember(shield, seen, done, moved, nexts, poses[-1])
     return Decision(
         t=t,

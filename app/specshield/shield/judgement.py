@@ -18,7 +18,8 @@ from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, flat, is_place
-from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, rho_of, together
+from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, rho_of, simulated, together
+from specshield.shield.proposal import adapted, ask
 from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
@@ -84,13 +85,15 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
         by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
         most = aimed.slack or aimed.most
         if most > 0 and (care.on_way or by_chance) and not violated and True in left.tolist():
+            known, wanted = len(tried.rho), np.ones_like(left) if by_chance else left
             for steps in range(most, max(most - LESS, 0) if by_chance else most - 1, -1):
-                tried = _in_time(shield, prefix, tried, asked, steps)
-            kept = tried.rho
-            if care.barred is not None and not vain:
-                kept = _aside(shield, care.barred, prefix, tried, kept)
-            aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, aimed)
-            values = best_of(tried, kept, motions).robustness
+                tried = _in_time(shield, prefix, tried, asked, steps, wanted)
+            if len(tried.rho) > known:
+                kept = tried.rho
+                if care.barred is not None and not vain:
+                    kept = _aside(shield, care.barred, prefix, tried, kept)
+                aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, aimed)
+                values = best_of(tried, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
@@ -113,16 +116,22 @@ def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept:
     return np.where(goes, -np.inf, kept)
 
 
-def _in_time(shield: Shield, prefix: Prefix, tried: Futures, margin: float, steps: int) -> Futures:
-    """`tried`, and the futures that policies propose for deadlines so many steps earlier. They may meet them
-    where a way that is just in time for the rule does not.
+def _in_time(
+    shield: Shield, prefix: Prefix, tried: Futures, margin: float, steps: int, wanted: Bools
+) -> Futures:
+    """`tried`, and the futures that policies propose for deadlines so many steps earlier, of the motions
+    `wanted` [M]. They may meet them where a way that is just in time for the rule does not.
     """
-    asked = [proposer.earlier(steps) for proposer in shield.proposers if hasattr(proposer, "earlier")]
-    if not asked:
+    rows, warnings = list[Ints](), list[str]()
+    for proposer in shield.proposers:
+        if hasattr(proposer, "earlier"):
+            hurried = adapted(proposer, "earlier", steps, wanted.copy())
+            proposal, wrong = ask(hurried, prefix.poses, prefix.signals, margin, len(wanted), prefix.steps, 0)
+            rows.extend([] if proposal is None else [proposal.motions])
+            warnings.extend([] if wrong is None else [wrong])
+    if not warnings and sum(map(len, rows)) == 0:
         return tried
-    return replace(
-        together(tried, futures(prefix, shield.body, asked, None, (margin,))), preferred=tried.preferred
-    )
+    return together(tried, simulated(prefix, shield.body, rows, tried.preferred, warnings))
 
 
 def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Judged:

@@ -57,18 +57,29 @@ def joined(*proposals: Proposal) -> Proposal:
     return Proposal(np.concatenate([each.motions for each in proposals]), proposals[0].preferred)
 
 
+def adapted(proposer: Proposer, how: str, *told: object) -> Proposer:
+    """What its method `how` returns, `on_body` for example; itself where it has none, or that raises."""
+    try:
+        found: Proposer = getattr(proposer, how)(*told) if hasattr(proposer, how) else proposer
+    except Exception:
+        log.warning("a policy failed in `%s`", how, exc_info=True)
+        return proposer
+    return found
+
+
 def ask(
-    proposer: Proposer, history: Floats, signals: Mapping[str, Floats], margin: float, count: int, steps: int
-) -> tuple[Proposal | None, str | None]:
+    proposer: Proposer, history: Floats, signals: Mapping[str, Floats], margin: float, count: int, steps: int,
+    least: int = 1,
+) -> tuple[Proposal | None, str | None]:  # fmt: skip
     """Asks a proposer; returns its proposal and None, or None and a sentence that says why it was not used.
 
-    Each row has to hold `steps` motions, all below `count`. The proposer gets copies of the history and the
-    signals, and its motions are copied: nothing that it does later reaches the decision.
+    Each of `least` rows or more has to hold `steps` motions, all below `count`. The proposer gets copies of
+    the history and the signals, and its motions are copied: nothing that it does later reaches the decision.
     """
     try:
         name = str(proposer.id)[:80]
         given = proposer.propose(history.copy(), {n: v.copy() for n, v in signals.items()}, margin)
-        motions, preferred = _checked(given, count, steps)
+        motions, preferred = _checked(given, count, steps, least)
     except _Refused as refused:
         return None, f"policy {name!r} was not used at this step: {refused}"
     except Exception as error:  # whatever a proposer does wrong, the step is still decided
@@ -81,17 +92,15 @@ class _Refused(Exception):
     """Its text says what is wrong with a proposal."""
 
 
-def _checked(given: object, count: int, steps: int) -> tuple[Ints, int]:
+def _checked(given: object, count: int, steps: int, least: int) -> tuple[Ints, int]:
     if not isinstance(given, Proposal):
         raise _Refused(f"it returned {type(given).__name__}; expected a Proposal")
     motions, preferred = given.motions, given.preferred
     if not isinstance(motions, np.ndarray) or motions.dtype.kind not in "iu":
         raise _Refused("its motions are not an array of integers")
-    if motions.ndim != 2 or motions.shape[1] != steps or not 0 < motions.size <= MAX_MOTIONS:
-        most = MAX_MOTIONS // steps
-        raise _Refused(
-            f"its motions have the shape {list(motions.shape)}; expected [N, {steps}], N from 1 to {most}"
-        )
+    if motions.ndim != 2 or motions.shape[1] != steps or not least * steps <= motions.size <= MAX_MOTIONS:
+        rows = f"N from {least} to {MAX_MOTIONS // steps}"
+        raise _Refused(f"its motions have the shape {list(motions.shape)}; expected [N, {steps}], {rows}")
     own = np.array(motions, np.int64, order="C")
     wrong = _first_outside(own, count)
     if wrong is not None:

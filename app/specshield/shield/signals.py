@@ -18,6 +18,7 @@ from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Prefix, prefix_of
 from specshield.shield.judgement import Judged, judge
+from specshield.shield.proposal import adapted
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Verdict
 
@@ -64,7 +65,7 @@ def _judged_at_worst(
     held = worst_signals(shield.task)
     if held is None:
         return None
-    proposers = tuple(p.foreseeing(held[0]) if hasattr(p, "foreseeing") else p for p in shield.proposers)
+    proposers = tuple(adapted(p, "foreseeing", held[0]) for p in shield.proposers)
     shield, prefix = replace(shield, proposers=proposers), replace(prefix, held=held)
     judged = judge(shield, prefix, tail, False, care)
     return (shield, prefix, judged) if judged.some else None

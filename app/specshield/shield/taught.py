@@ -24,6 +24,7 @@ from specshield.robot.dynamics import Body, displacement, displacements, make_bo
 from specshield.shield.caution.experience import was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
 from specshield.shield.feasibility import Prefix
+from specshield.shield.proposal import adapted
 from specshield.shield.surprise.contact import (
     NEAR,
     UNDER,
@@ -250,9 +251,9 @@ def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Float
     body, proposers = shield.body, shield.proposers
     if len(known):
         body = body_on(shield, known)
-        proposers = tuple(p.on_body(body, guess) if hasattr(p, "on_body") else p for p in proposers)
+        proposers = tuple(adapted(p, "on_body", body, guess) for p in proposers)
     if barred is not None and len(barred):
-        proposers = tuple(p.avoiding(barred) if hasattr(p, "avoiding") else p for p in proposers)
+        proposers = tuple(adapted(p, "avoiding", barred) for p in proposers)
     return shield if proposers is shield.proposers else replace(shield, body=body, proposers=proposers)
 
 

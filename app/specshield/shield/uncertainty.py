@@ -107,12 +107,14 @@ def margin_for(noise: Noise, stride: float, steps: int) -> float:
 
 
 @leaf
-def slack_for(noise: Noise, stride: float, left: int, chance: float) -> int:
-    """The fewest steps to keep free of `left` ones, so that these cost more of them but for `chance`."""
-    for free in range(left):
+def slack_for(noise: Noise, stride: float, left: int, chance: float, least: int) -> int:
+    """The fewest steps to keep free of `left` ones, `least` or more, so that these cost more of them but for
+    `chance`.
+    """
+    for free in range(least, left):
         if costs_above(noise, stride, left, free) <= chance:
             return free
-    return left
+    return max(left, least)
 
 
 @leaf

@@ -8,13 +8,14 @@ import pytest
 from specshield.policy.lattice import STEP_CODES, Corners
 from specshield.policy.reachability.beam import beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
+from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
 from specshield.robot.dynamics import motion_count
 from specshield.rule.progress import BROKEN, PENDING, SETTLED
-from tests.oracles.cells import FORWARD, LEFT, RIGHT, WAIT
-from tests.policy.reachability.corridor import EAST, RESTLESS, WEST, guide_of, make_corridor, pose
+from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, WAIT
+from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, WEST, guide_of, make_corridor, pose
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,11 @@ def begun(guide, first, motion, t=0):
     motions[0], poses[0] = motion, first
     update_progress(guide.rules, t + 1, *poses[0], scratch)
     return motions, poses, scratch
+
+
+def every(motions):
+    """Every first motion is wanted, however late."""
+    return np.ones(motions, np.bool_), -np.inf
 
 
 def corners():
@@ -122,7 +128,7 @@ def test_a_beam_gives_up_what_comes_too_late(visit):
 
 def test_a_continuation_after_each_first_motion(visit):
     motions, poses = np.empty((4, 10), np.int64), np.empty((4, 10, 3))
-    best = continue_all(visit, 12, 0.0, pose(0)[None], np.empty((1, 0)), motions, poses)
+    best = continue_all(visit, 12, 0.0, pose(0)[None], np.empty((1, 0)), *every(4), motions, poses)
     assert best == FORWARD
     assert motions[:, 0].tolist() == [FORWARD, LEFT, RIGHT, WAIT]
     np.testing.assert_allclose(poses[:, -1, 0], pose(5)[0])  # five cells in at most ten steps, after each
@@ -133,6 +139,21 @@ def test_a_robot_that_cannot_wait_is_there_at_the_one_step_asked_for():
     guide = guide_of(make_corridor("F[4,4] A", RESTLESS, A=5))
     assert guide.wait == -1
     motions, poses = np.empty((3, 4), np.int64), np.empty((3, 4, 3))
-    continue_all(guide, 12, 0.0, pose(3)[None], np.empty((1, 0)), motions, poses)
+    continue_all(guide, 12, 0.0, pose(3)[None], np.empty((1, 0)), *every(3), motions, poses)
     np.testing.assert_allclose(poses[:, -1, 0], pose(5)[0])
     assert sorted(motions[1].tolist()) == [FORWARD, FORWARD, LEFT, RIGHT]
+
+
+def test_ways_for_an_earlier_deadline_are_proposed_after_the_motions_that_are_asked_for():
+    """A is five cells from x_0, and asked for within 5 steps in place of 10."""
+
+    def earlier(formula, motion, heading=EAST, **more):
+        task = make_corridor(formula, **more)
+        wanted = np.arange(len(task.robot.motions)) == motion
+        policy = synthesise(task, Settings(pitch=CELL * 3)).earlier(5, wanted)
+        return policy.propose(pose(0, heading)[None], {}, 0.0).motions
+
+    assert earlier("F[0,10] A", FORWARD, A=5)[:, :5].tolist() == [[FORWARD] * 5]
+    assert earlier("F[0,10] A", LEFT, NORTH, A=5).shape == (0, 10)  # that is three turns and five cells
+    assert earlier("G[0,10] A", FORWARD, A=0).shape == (0, 10)  # nothing has a deadline
+    assert earlier("F[0,10] A", FORWARD, robot=RESTLESS, A=5).shape == (0, 10)

@@ -21,7 +21,7 @@ from specshield.policy.reachability.guide import (
     make_scratch,
     update_progress,
 )
-from specshield.policy.reachability.search import Starts, _by_slack, _first_steps, _join
+from specshield.policy.reachability.search import Starts, _by_slack, _first_steps, _join, _some_in_time
 from specshield.policy.reachability.tables import HOPELESS, is_broken, slack
 from specshield.policy.reachability.walk import CLIMB_GAIN, SETTLED_ALL, STUCK, climb, rejoin
 from specshield.policy.recall import forgive, recall
@@ -44,7 +44,7 @@ MAX_LEGS = 16  # searches on one way
 @kernel
 def continue_narrow(
     guide: Guide, narrow: Bools, top: Floats, effort: Floats, past: float, history: Floats, signals: Floats,
-    motions: Ints, poses: Floats,
+    wanted: Bools, lowest: float, motions: Ints, poses: Floats,
 ) -> int:  # fmt: skip
     """`continue_all` for a rule with narrow predicates: those of the obligations `narrow` (K,).
 
@@ -65,6 +65,8 @@ def continue_narrow(
     _first_steps(guide, t, history[t], status, run, motions, poses, starts, scratch)
     _by_slack(starts.slack, order)
     find_twins(poses, twin)
+    if not _some_in_time(wanted, twin, starts.slack, lowest):
+        return -1
     # The way from x_t itself, as if a motion before had led there.
     way, led, ways = np.full(motions.shape[1] + 1, -1), np.empty((motions.shape[1] + 1, 3)), 0
     led[0] = history[t]
@@ -76,7 +78,7 @@ def continue_narrow(
         starts.settled[base] = True
         known[0], ways = base, 1
     for m in order:
-        if twin[m] != m or m == base:
+        if twin[m] != m or m == base or not wanted[m]:
             continue
         copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
         if base < 0:  # no first motion leads on, as far as the search from x_t can tell

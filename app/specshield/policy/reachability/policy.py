@@ -24,7 +24,7 @@ from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattic
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
-from specshield.policy.reachability.guide import Guide, hurried, share_with_slack
+from specshield.policy.reachability.guide import HURRIED, Guide, hurried, share_with_slack
 from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
 from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.narrow import AFTER, FIRST, ON, continue_narrow
@@ -67,6 +67,7 @@ class ReachabilityPolicy:
     guess: bool = False  # whether that is one of several maps that one decision tries
     barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
     early: int = 0  # [steps] as `hurried` has it
+    wanted: Bools | None = None  # [M] the first motions to propose ways after; None: all of them
 
     @property
     def id(self) -> str:
@@ -92,9 +93,11 @@ class ReachabilityPolicy:
         """The policy for a robot that some motions led nowhere. barred [n, 6]: as `Guide` has it."""
         return self._but(self._body, barred=barred)
 
-    def earlier(self, steps: int) -> ReachabilityPolicy:
-        """The policy for deadlines that come so many steps earlier; the same for a robot that cannot wait."""
-        return self._but(self._body, early=steps)
+    def earlier(self, steps: int, wanted: Bools) -> ReachabilityPolicy:
+        """The policy for deadlines that come so many steps earlier, and the first motions `wanted` [M]. It
+        proposes nothing to a robot that cannot wait, nor where its tables say that it would come too late.
+        """
+        return self._but(self._body, early=steps, wanted=wanted)
 
     def _but(self, body: Body, **changed: Any) -> ReachabilityPolicy:
         """The policy with these fields changed, on this map."""
@@ -143,13 +146,17 @@ class ReachabilityPolicy:
         """effort: of the search for narrow predicates."""
         rules = self._rules._replace(signals=self._rules.signals.copy(), margin=margin)
         rows = signal_rows(self.task, signals, len(history))
+        shape = len(self.task.robot.motions), self.task.horizon + 1 - len(history)
+        chosen, least = (slice(None), -np.inf) if self.wanted is None else (self.wanted, HURRIED)
+        wanted = np.full(shape[0], True) if self.wanted is None else self.wanted.copy()
         proposals = []
         for past in pasts(rules, history, rows):
             guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
-            if self.early and guide.wait >= 0:
-                guide = hurried(guide, self.early, past, history, rows)
-            motions = np.empty((len(self.task.robot.motions), self.task.horizon + 1 - len(history)), np.int64)
-            poses, ways = np.empty((*motions.shape, 3)), np.empty_like(motions)
+            if self.early:
+                guide, sooner = hurried(guide, self.early, past, history, rows)
+                if not sooner:
+                    continue
+            motions, ways, poses = np.empty(shape, np.int64), np.empty(shape, np.int64), np.empty((*shape, 3))
             around = NO_WAY
             if self.guess:
                 around = go_around(guide, past, history, rows, NO_FIELDS, poses, ways, FEWER)
@@ -157,20 +164,23 @@ class ReachabilityPolicy:
                 ways[:], ways[:, 0] = guide.wait, np.arange(len(ways))
                 proposals.append(Proposal(ways, guide.wait))
                 continue
-            if self.narrow.any() and guide.wait >= 0:
+            if guide.wait >= 0 and True in self.narrow.tolist():
                 preferred = continue_narrow(
-                    guide, self.narrow, self._top, effort, past, history, rows, motions, poses
+                    guide, self.narrow, self._top, effort, past, history, rows, wanted, least, motions, poses
                 )
             else:
-                preferred = continue_all(guide, self.settings.beam, past, history, rows, motions, poses)
-            proposals.append(Proposal(motions, int(preferred)))
+                preferred = continue_all(
+                    guide, self.settings.beam, past, history, rows, wanted, least, motions, poses
+                )
+            if preferred >= 0:
+                proposals.append(Proposal(motions[chosen], int(preferred)))
             if not (self.guess or self.early) and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
                 if guide.wait >= 0 and not is_known(guide, past, history, rows, free):
                     around = go_around(guide, past, history, rows, self._fields, poses, ways, POSES)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))
-        return joined(*proposals)
+        return joined(*proposals or [Proposal(np.empty((0, shape[1]), np.int64), 0)])
 
     def weights(self) -> bytes:
         """The safetensors file."""

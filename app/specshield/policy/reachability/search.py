@@ -62,13 +62,16 @@ class Starts(NamedTuple):
 
 @kernel
 def continue_all(
-    guide: Guide, width: int, past: float, history: Floats, signals: Floats, motions: Ints, poses: Floats
-) -> int:
-    """Writes a continuation after each first motion into motions (M, T - t), and where it leads into poses
-    (M, T - t, 3); returns the motion of most slack.
+    guide: Guide, width: int, past: float, history: Floats, signals: Floats, wanted: Bools, lowest: float,
+    motions: Ints, poses: Floats,
+) -> int:  # fmt: skip
+    """Writes a continuation after each `wanted` (M,) first motion into motions (M, T - t), and where it leads
+    into poses (M, T - t, 3); returns the motion of most slack. -1, and nothing is written, where none that is
+    wanted has a slack of at least `lowest` [steps]; no beam looks for a way after one that has less.
 
     history (t + 1, 3), signals (t + 1, S). width: the poses that a beam keeps for each first motion. past:
-    the margin that the history is judged by. The rules' signals are left at their last row.
+    the margin that the history is judged by. The rules' signals are left at their last row. What is written
+    of motions that are not wanted need not be a way.
     """
     count, t, k_count = motions.shape[0], history.shape[0] - 1, guide.rules.kind.shape[0]
     status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
@@ -84,9 +87,11 @@ def continue_all(
     _first_steps(guide, t, history[t], status, run, motions, poses, starts, scratch)
     _by_slack(starts.slack, order)
     find_twins(poses, twin)
+    if not _some_in_time(wanted, twin, starts.slack, lowest):
+        return -1
     waits, base, ways = guide.wait >= 0, -1, 0
     for m in order:
-        if twin[m] != m:
+        if twin[m] != m or not (wanted[m] or base < 0):
             continue
         if not waits:  # beams find all its ways: until one does, it repeats the motion
             motions[m, 1:] = m
@@ -117,7 +122,8 @@ def continue_all(
         elif attempt == 2:
             share, band = SMALL_SHARE, 2.0 * HOPELESS
         if (attempt > 0 or not waits) and (attempt < 2 or small):
-            _beam_out(guide, t, share, width, band, order, twin, starts, motions, poses, scratch)
+            band = max(band, lowest)
+            _beam_out(guide, t, share, width, band, order, twin, wanted, starts, motions, poses, scratch)
     for same in range(count):
         if twin[same] != same:
             copy_way(motions, poses, twin[same], same)
@@ -144,6 +150,16 @@ def _first_steps(
         starts.slack[m] = slack(
             body, rules, tables, x, y, theta, t + 1, scratch.status, scratch.run, scratch.corners
         )
+
+
+@leaf
+def _some_in_time(wanted: Bools, twin: Ints, slacks: Floats, lowest: float) -> bool:
+    """Whether a motion that is wanted (M,) has a slack of at least `lowest`. Twins are wanted together."""
+    some = False
+    for m in range(wanted.shape[0]):
+        wanted[twin[m]] |= wanted[m]
+        some = some or (wanted[m] and slacks[m] >= lowest)
+    return some
 
 
 @leaf
@@ -224,15 +240,14 @@ def _take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats,
 
 @kernel
 def _beam_out(
-    guide: Guide, t: int, share: int, width: int, band: float, order: Ints, twin: Ints, starts: Starts,
-    motions: Ints, poses: Floats, scratch: Scratch,
+    guide: Guide, t: int, share: int, width: int, band: float, order: Ints, twin: Ints, wanted: Bools,
+    starts: Starts, motions: Ints, poses: Floats, scratch: Scratch,
 ) -> None:  # fmt: skip
-    """Looks for a way after every first motion that has none yet and a slack of at least `band` [steps]."""
-    steps = motions.shape[1] - 1
-    roots = np.array(
-        [m for m in order if twin[m] == m and not starts.settled[m] and starts.slack[m] >= band],
-        dtype=np.int64,
-    )
+    """Looks for a way after every `wanted` (M,) first motion that has none yet and a slack of at least `band`
+    [steps].
+    """
+    steps, sought = motions.shape[1] - 1, wanted & ~starts.settled & (starts.slack >= band)
+    roots = np.array([m for m in order if twin[m] == m and sought[m]], dtype=np.int64)
     if steps == 0:
         return
     few = ROOTS if guide.wait >= 0 else MAX_ROOTS

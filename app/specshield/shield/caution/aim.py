@@ -116,8 +116,8 @@ def _ask(
     for k in range(still.shape[0]):
         if still[k] and parts.kind[k] == EVENTUALLY:
             left = parts.b[k] + parts.horizon[k] - t
-            wanted = max(least, slack_for(noise, stride, left, chance))
-            asked[k] = min(wanted, (parts.b[k] - parts.a[k]) // 2)
+            half = (parts.b[k] - parts.a[k]) // 2
+            asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             if soonest < 0 or left < first:
                 soonest, first = k, left
     return (asked[soonest] if soonest >= 0 else 0), (asked.max() if asked.size else 0)

@@ -48,4 +48,4 @@ def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:
 
 
 def _is_at(one: Floats, other: Floats) -> bool:
-    return bool(np.abs(one - other).max() <= SAME_POSE)
+    return all(abs(a - b) <= SAME_POSE for a, b in zip(one.tolist(), other.tolist(), strict=True))
