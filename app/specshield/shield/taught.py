@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from specshield.arrays import Bools, Floats
-from specshield.compiled import leaf
+from specshield.compiled import kernel, leaf
 from specshield.quick import quick
 from specshield.robot.barred import NOTHING_BARRED, is_barred
 from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
@@ -34,6 +34,7 @@ from specshield.shield.surprise.contact import (
     cells_under,
     contact_of,
     is_near,
+    moved_on,
 )
 from specshield.shield.surprise.vain import barred_by, did_nothing, halts_at, led_nowhere, worked
 from specshield.shield.uncertainty import Care
@@ -119,6 +120,11 @@ def teach(
     if config.map_memory is not None:
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
+        told = known is NONE and occupied is None and free is None and not stuck and followed.drawn >= 0
+        if told and _goes_as_told(shield.body, poses[-2], carry.next_poses[followed.drawn], poses[-1]):
+            return Taught(
+                followed=moved_on(followed)
+            ), ()  # as nearly every step does: there is no more to it
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
         drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
         halts = halts_at(stuck, poses[-1], drawn, near)
@@ -170,6 +176,16 @@ def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tupl
     half_way[2] = before[2]
     half = overlap(body, half_way[0], half_way[1], half_way[2]) > UNDER
     return half, overlap(body, after[0], after[1], after[2]) > UNDER
+
+
+@kernel
+def _goes_as_told(body: Body, before: Floats, foreseen: Floats, after: Floats) -> bool:
+    """Whether the robot is where f leads, but for rounding, and covered no obstacle on the way. Poses (3,)."""
+    near = abs(foreseen[0] - after[0]) <= SAME_PLACE and abs(foreseen[1] - after[1]) <= SAME_PLACE
+    if not near or abs(wrap(foreseen[2] - after[2])) > SAME_PLACE:
+        return False
+    half, whole = _covers(body, before, after, np.empty(3))
+    return not half and not whole
 
 
 def wary(config: Config, care: Care, taught: Taught, on_way: bool) -> Care:

@@ -57,7 +57,7 @@ def contact_of(
     """
     drawn = followed.drawn
     if drawn >= 0 and is_near(foreseen[drawn : drawn + 1], after, near):
-        return -1, _moved(followed)
+        return -1, moved_on(followed)
     if is_near(before[None], after, near):  # it stands where it stood
         if drawn < 0 or not followed.follows:
             return -1, followed
@@ -68,12 +68,12 @@ def contact_of(
         return -1, replace(followed, follows=False, halted=-1, met=0)
     short = _short(body, before, after, foreseen, near)
     if not short.any():
-        return -1, _moved(followed)
+        return -1, moved_on(followed)
     motion = drawn if drawn >= 0 and short[drawn] else int(np.argmax(short))
     return motion, replace(followed, halted=-1, met=1)
 
 
-def _moved(followed: Followed) -> Followed:
+def moved_on(followed: Followed) -> Followed:
     """After a motion that met nothing."""
     return replace(followed, halted=-1, met=0) if followed.halted >= 0 or followed.met else followed
 
