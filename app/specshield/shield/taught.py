@@ -180,7 +180,7 @@ def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tupl
 
 @kernel
 def _goes_as_told(body: Body, before: Floats, foreseen: Floats, after: Floats) -> bool:
-    """Whether the robot is where f leads, but for rounding, and covered no obstacle on the way. Poses (3,)."""
+    """Whether the robot is where f leads, but for rounding, and covers no obstacle. Poses (3,)."""
     near = abs(foreseen[0] - after[0]) <= SAME_PLACE and abs(foreseen[1] - after[1]) <= SAME_PLACE
     if not near or abs(wrap(foreseen[2] - after[2])) > SAME_PLACE:
         return False
