@@ -14,9 +14,7 @@ from pathlib import Path
 import httpx
 from playwright.sync_api import sync_playwright
 
-from specshield.client import ShieldClient
-from specshield.sim.campaign import run
-from specshield.sim.cases import load_case
+from specshield.sim.campaign import robots, run
 from specshield.sim.service import own_server
 
 CASE, SEED, STEP = "case2", 0, 42  # the step that is shown: on its way to the second region
@@ -26,8 +24,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="The pictures that README and docs show.")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     out = parser.parse_args().out
-    with own_server() as url, ShieldClient(url, timeout=10.0) as client:
-        campaign = run(client, load_case(CASE), 1, SEED)
+    with own_server() as url, robots(url) as several:
+        campaign = run(several, CASE, 1, SEED)
         session = campaign.shielded[0].session
         with httpx.Client(base_url=url, timeout=60.0) as asked:
             drawn = asked.get(f"/v1/policies/{CASE}/image.svg").raise_for_status().content

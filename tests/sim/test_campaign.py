@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
-from specshield.client import ShieldClient
 from specshield.drawing import colors
 from specshield.sim import canvas, picture, report
-from specshield.sim.campaign import run
+from specshield.sim.campaign import robots, run
 from specshield.stl import parse
 from tests.oracles.judge import margin
 
@@ -20,8 +19,8 @@ SEED = 0
 
 @pytest.fixture(scope="module")
 def campaign(server, case):
-    with ShieldClient(server.url, timeout=10.0) as client:
-        yield run(client, case, RUNS, seed=SEED)
+    with robots(server.url) as several:
+        yield run(several, case.name, RUNS, seed=SEED)
 
 
 def test_with_the_shield_the_rule_is_kept_and_without_it_broken(campaign, case):
@@ -52,8 +51,8 @@ def padded(episode, case):
 
 
 def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
-    with ShieldClient(server.url, timeout=10.0) as client:
-        again = run(client, case, 1, seed=SEED)
+    with robots(server.url) as several:
+        again = run(several, case.name, 1, seed=SEED)
     for name in ("shielded", "unshielded"):
         first, second = getattr(campaign, name)[0], getattr(again, name)[0]
         assert second.poses == first.poses

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import cache
+from multiprocessing import get_context
 
 import numpy as np
 
 from specshield.client import Session, ShieldClient
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
-from specshield.sim.cases import Case
+from specshield.sim.cases import Case, load_case
 from specshield.sim.episodes import Episode, with_shield, without_shield
 from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import Pose
+from specshield.sim.service import follow_parent
 
+PATIENCE = 10.0  # [s] for one decision: other work may share the machine
 DRAWS = 100  # starts tried for one episode before giving up
 
 
@@ -39,39 +44,59 @@ class Campaign:
         return [episode for episode in self.shielded if episode.spec_status != "satisfied"]
 
 
+def robots(url: str) -> Executor:
+    """A process for each core that drives robots, through clients of the service at `url`: the models of
+    several robots would wait for each other in one.
+    """
+    return ProcessPoolExecutor(os.cpu_count() or 1, get_context("spawn"), _begin_process, (url,))
+
+
 def run(
-    client: ShieldClient,
-    case: Case,
+    robots: Executor,
+    case: str,
     runs: int,
     seed: int,
     on_progress: Callable[[int], None] = lambda _: None,
     named: bool = False,
 ) -> Campaign:
-    """`runs` pairs of episodes, the i-th decided by `seed` and i alone. on_progress: how many are done.
+    """`runs` pairs of episodes of a case, the i-th decided by `seed` and i alone. on_progress: how many are
+    done.
 
     named: whether the sessions' ids say what they are, such as `case1-0-shielded` and `case1-0-alone`: for a
     server that has no others.
     """
-
-    def pair(i: int) -> tuple[Episode, Episode, int]:
-        own = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-        ids = [f"{case.name}-{i}-{how}" if named else None for how in ("shielded", "alone")]
-        session, start, refused = begin(client, case, case.name, own, ids[0])
-        model = load_learned(case.instruction)
-        shielded = with_shield(session, case, model, start, own)
-        return shielded, without_shield(client, case, model, start, own, id=ids[1]), refused
-
-    with ThreadPoolExecutor(os.cpu_count() or 1) as robots:
-        futures = [robots.submit(pair, i) for i in range(runs)]
-        try:
-            for done, finished in enumerate(as_completed(futures), 1):
-                finished.result()
-                on_progress(done)
-        except BaseException:
-            robots.shutdown(wait=False, cancel_futures=True)
-            raise
+    futures = [robots.submit(_pair, case, i, seed, named) for i in range(runs)]
+    try:
+        for done, finished in enumerate(as_completed(futures), 1):
+            finished.result()
+            on_progress(done)
+    except BaseException:
+        robots.shutdown(wait=False, cancel_futures=True)
+        raise
     pairs = [future.result() for future in futures]
-    return Campaign(case, seed, [p[0] for p in pairs], [p[1] for p in pairs], sum(p[2] for p in pairs))
+    refused = sum(p[2] for p in pairs)
+    return Campaign(load_case(case), seed, [p[0] for p in pairs], [p[1] for p in pairs], refused)
+
+
+_client: ShieldClient | None = None  # of a process that drives robots
+_case = cache(load_case)
+
+
+def _begin_process(url: str) -> None:
+    global _client
+    follow_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
+    _client = ShieldClient(url, timeout=PATIENCE)
+
+
+def _pair(name: str, i: int, seed: int, named: bool) -> tuple[Episode, Episode, int]:
+    assert _client is not None
+    case, own = _case(name), int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
+    ids = [f"{name}-{i}-{how}" if named else None for how in ("shielded", "alone")]
+    session, start, refused = begin(_client, case, name, own, ids[0])
+    model = load_learned(case.instruction)
+    shielded = with_shield(session, case, model, start, own)
+    return shielded, without_shield(_client, case, model, start, own, id=ids[1]), refused
 
 
 def begin(

@@ -7,16 +7,14 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 
-from specshield.client import ShieldClient
 from specshield.sim import picture, report
-from specshield.sim.campaign import Campaign, run
-from specshield.sim.cases import Case, case_names, load_case
+from specshield.sim.campaign import Campaign, robots, run
+from specshield.sim.cases import case_names
 from specshield.sim.progress import StatusLine, duration
 from specshield.sim.service import own_server
-
-PATIENCE = 10.0  # [s] for one decision: other work may share the machine
 
 
 def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
@@ -28,8 +26,8 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
     began, status = time.monotonic(), StatusLine()
     status.say("starting the service ...")
     with own_server(say=status.say) as url:
-        with ShieldClient(url, timeout=PATIENCE) as client:
-            campaigns = [_campaign(client, load_case(name), runs, seed, status) for name in case_names()]
+        with robots(url) as several:
+            campaigns = [_campaign(several, name, runs, seed, status) for name in case_names()]
         status.clear()
         _tell(campaigns, runs, seed, out)
         print(f"{time.monotonic() - began:.0f} s")
@@ -61,11 +59,11 @@ def _tell(campaigns: Sequence[Campaign], runs: int, seed: int, out: Path) -> Non
         print(f"picture: {path}")
 
 
-def _campaign(client: ShieldClient, case: Case, runs: int, seed: int, status: StatusLine) -> Campaign:
+def _campaign(several: Executor, case: str, runs: int, seed: int, status: StatusLine) -> Campaign:
     began = time.monotonic()
 
     def show(done: int) -> None:
         left = (time.monotonic() - began) / done * (runs - done)
-        status.say(f"{case.name}: {done} of {runs} episodes, {duration(left)} left")
+        status.say(f"{case}: {done} of {runs} episodes, {duration(left)} left")
 
-    return run(client, case, runs, seed, show, named=True)
+    return run(several, case, runs, seed, show, named=True)
