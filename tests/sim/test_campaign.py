@@ -20,7 +20,7 @@ SEED = 0
 
 @pytest.fixture(scope="module")
 def campaign(server, case):
-    with ShieldClient(server.url, timeout=10.0) as client:
+    with ShieldClient(server.url, timeout=60.0) as client:
         yield run(client, case, RUNS, seed=SEED)
 
 
@@ -52,7 +52,7 @@ def padded(episode, case):
 
 
 def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
-    with ShieldClient(server.url, timeout=10.0) as client:
+    with ShieldClient(server.url, timeout=60.0) as client:
         again = run(client, case, 1, seed=SEED)
     for name in ("shielded", "unshielded"):
         first, second = getattr(campaign, name)[0], getattr(again, name)[0]
