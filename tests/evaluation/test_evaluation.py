@@ -245,6 +245,8 @@ def test_workers_make_the_same_records_though_one_is_killed(serial, redis, threa
             assert process.poll() is None
             assert not result.done(), result.exception()
             time.sleep(0.01)
+        # Somebody waits for a campaign: its runs are made at the priority that the worker was started with.
+        assert os.getpriority(os.PRIO_PROCESS, found[0]) == os.getpriority(os.PRIO_PROCESS, 0)
         os.kill(found[0], signal.SIGKILL)
         assert same(returned(result, process)) == same(serial)
     finally:

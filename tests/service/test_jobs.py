@@ -139,6 +139,10 @@ def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
     wait_for(lambda: read(client, policy)["eta_s"])
     assert 0.0 < read(client, policy)["progress"] < 1.0
     ((run, _),) = children(learner_of(server))
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    threads = {int(id): os.getpriority(os.PRIO_PROCESS, int(id)) for id in os.listdir(f"/proc/{run}/task")}
+    assert threads[run] == min(own + 10, 19)  # below servers, and this but once
+    assert min(threads.values()) == own  # signs of life do not wait until the machine is quiet
     assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
     found = read(client, policy)
     assert (found["status"], found["error"]) == ("failed", "cancelled")
