@@ -8,6 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
+from tests.serving import HUNG
+
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 OPTIONS = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
@@ -22,7 +24,7 @@ def browsing(**options) -> Iterator:
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
         page = browser.new_page(**{"viewport": {"width": 1280, "height": 860}, **options})
-        page.set_default_timeout(60_000)
+        page.set_default_timeout(1e3 * HUNG)
         page.on("console", lambda message: message.type == "error" and complaints.append(message.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))
         yield page, complaints

@@ -41,7 +41,7 @@ class Cluster:
     def fail(self) -> None:
         """Kills the first master once its replica has all that it has, and waits for the replica."""
         _kill(self.first, self.nodes[0], self.nodes[3])
-        wait_for(self.promoted, 60.0)
+        wait_for(self.promoted)
 
     def promoted(self) -> bool:
         """Whether the replica has become a master, and all slots are served."""
@@ -60,7 +60,7 @@ def cluster(folder: Path) -> Iterator[Cluster]:
             options += ("--cluster-node-timeout", "2000", "--repl-diskless-sync-delay", "0", *DURABLE)
             processes.append(stack.enter_context(running(folder / str(port), *options)))
         nodes = [stack.enter_context(redis.Redis(port=port)) for port in ports]
-        wait_for(lambda: all(_answers(node) for node in nodes), 20.0)
+        wait_for(lambda: all(_answers(node) for node in nodes))
         share = 16384 // 3 + 1
         for i, node in enumerate(nodes[:3]):
             last = min((i + 1) * share, 16384) - 1
@@ -70,13 +70,12 @@ def cluster(folder: Path) -> Iterator[Cluster]:
             bus = nodes[ports.index(other)].config_get("cluster-port")["cluster-port"]
             nodes[0].execute_command("CLUSTER", "MEET", "127.0.0.1", other, bus)
         wait_for(
-            lambda: all(b"cluster_state:ok" in node.execute_command("CLUSTER", "INFO") for node in nodes),
-            20.0,
+            lambda: all(b"cluster_state:ok" in node.execute_command("CLUSTER", "INFO") for node in nodes)
         )
         first = nodes[0].execute_command("CLUSTER", "MYID").decode()
         nodes[3].execute_command("CLUSTER", "REPLICATE", first)
-        wait_for(lambda: nodes[3].info("replication")["master_link_status"] == "up", 20.0)
-        wait_for(lambda: all(node.execute_command("CLUSTER", "REPLICAS", first) for node in nodes), 20.0)
+        wait_for(lambda: nodes[3].info("replication")["master_link_status"] == "up")
+        wait_for(lambda: all(node.execute_command("CLUSTER", "REPLICAS", first) for node in nodes))
         hosts = ",".join(f"127.0.0.1:{port}" for port in ports[:3])
         yield Cluster(f"redis+cluster://{hosts}", processes[0], nodes)
 
@@ -94,7 +93,7 @@ class Watched:
     def fail(self) -> None:
         """Kills the server once its replica has all that it has, and waits for the replica."""
         _kill(self.first, self.server, self.replica)
-        wait_for(self.promoted, 60.0)
+        wait_for(self.promoted)
 
     def promoted(self) -> bool:
         """Whether the sentinel names the one that was the replica."""
@@ -111,7 +110,7 @@ def watched(folder: Path) -> Iterator[Watched]:
         follows = ("--replicaof", f"127.0.0.1 {first}", "--repl-diskless-sync-delay", "0")
         stack.enter_context(running(folder / "second", "--port", str(second), *follows, *DURABLE))
         replica = stack.enter_context(redis.Redis(port=second))
-        wait_for(lambda: _answers(replica) and replica.info()["master_link_status"] == "up", 20.0)
+        wait_for(lambda: _answers(replica) and replica.info()["master_link_status"] == "up")
         told = folder / "sentinel.conf"
         told.write_text(
             f"port {port}\nsentinel monitor shield 127.0.0.1 {first} 1\n"
@@ -120,7 +119,7 @@ def watched(folder: Path) -> Iterator[Watched]:
         stack.enter_context(running(folder, str(told), "--sentinel"))
         sentinel = stack.enter_context(redis.Redis(port=port))
         server = stack.enter_context(redis.Redis(port=first))
-        wait_for(lambda: _answers(sentinel) and sentinel.sentinel_slaves("shield"), 20.0)
+        wait_for(lambda: _answers(sentinel) and sentinel.sentinel_slaves("shield"))
         url = f"redis+sentinel://127.0.0.1:{port}/shield"
         yield Watched(url, process, server, replica, sentinel)
 
@@ -143,13 +142,13 @@ def behind_tls(folder: Path) -> Iterator[str]:
     with running(folder, *options):
         url = f"rediss://127.0.0.1:{port}/0?ssl_ca_certs={folder / 'ca.pem'}"
         node = redis.Redis.from_url(url)
-        wait_for(lambda: _answers(node), 20.0)
+        wait_for(lambda: _answers(node))
         yield url
 
 
 def _kill(process: subprocess.Popen[bytes], server: redis.Redis, replica: redis.Redis) -> None:
     written = server.info("replication")["master_repl_offset"]
-    wait_for(lambda: replica.info("replication")["slave_repl_offset"] >= written, 20.0)
+    wait_for(lambda: replica.info("replication")["slave_repl_offset"] >= written)
     process.kill()
     process.wait()
 

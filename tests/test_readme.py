@@ -11,7 +11,7 @@ from specshield.sim import report
 from specshield.sim.campaign import Campaign
 from specshield.sim.cases import load_case
 from specshield.sim.episodes import Episode
-from tests.serving import serving
+from tests.serving import HUNG, serving
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "http.md")
@@ -29,7 +29,7 @@ def run(server, *command):
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HUNG,
     )
     assert done.returncode == 0, done.stderr
     assert not done.stderr

@@ -14,7 +14,7 @@ from specshield.client import ShieldClient
 from specshield.errors import InputError, Unsupported
 from specshield.registry import Registry
 from tests.service.world import LOGITS, ROBOT, SPEC, START, cells
-from tests.serving import serving
+from tests.serving import HUNG, serving
 
 EXAMPLE = Path(__file__).parent / "registry_example"
 
@@ -63,7 +63,7 @@ def test_a_method_a_format_and_a_preference_of_another_package_serve(tmp_path):
     path = os.pathsep.join([str(EXAMPLE), *filter(None, [os.environ.get("PYTHONPATH")])])
     with (
         serving(tmp_path, PYTHONPATH=path, SPECSHIELD_WORKER="true") as server,
-        ShieldClient(server.url, timeout=20.0) as client,
+        ShieldClient(server.url, timeout=60.0) as client,
     ):
         rows = ["".join("#" if occupied else "." for occupied in row) for row in cells()[::-1]]
         room = client.maps.create(format="drawing", rows=rows)
@@ -76,7 +76,7 @@ def test_a_method_a_format_and_a_preference_of_another_package_serve(tmp_path):
         with pytest.raises(errors.PolicyError, match=r"options\.motion: the robot has no such motion"):
             client.policies.create(room.id, formula, **ask, options={"motion": 9})
         made = client.policies.create(room.id, formula, **ask)
-        assert client.policies.wait(made.id, timeout=120.0, interval=0.2).status == "ready"
+        assert client.policies.wait(made.id, timeout=HUNG, interval=0.2).status == "ready"
 
         session = client.sessions.create(policy_id=made.id, initial_pose=START, shaping="eager")
         plain = client.sessions.create(policy_id=made.id, initial_pose=START)
@@ -87,7 +87,7 @@ def test_a_method_a_format_and_a_preference_of_another_package_serve(tmp_path):
             np.testing.assert_allclose(eager.distribution, weighed / weighed.sum(), atol=1e-12)
             pose = eager.next_poses[0]
 
-        described = httpx.get(f"{server.url}/openapi.json").text
+        described = httpx.get(f"{server.url}/openapi.json", timeout=None).text
         for name in ("ahead", "drawing", "eager"):
             assert f'"{name}"' in described
         assert "Repeats one motion, whatever the rule." in described

@@ -149,7 +149,6 @@ def worker(
     Other packages may have jobs of their own: each entry point of the group specshield.queues is named like
     the queue that its jobs wait in.
     """
-    os.nice(10)  # below servers on the same machine, and below what decides their steps (heavy/heavy.py)
     from specshield.service.training.worker import serve as work
 
     work(_settings(), until_eof, [queue.name for queue in entry_points(group="specshield.queues")], learner)

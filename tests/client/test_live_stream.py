@@ -12,7 +12,7 @@ from specshield import errors
 from specshield.client import AsyncShieldClient, ShieldClient
 from tests.service.test_keys import on_keys
 from tests.service.world import grid_json, send_policy
-from tests.serving import free_port, serving, wait_for
+from tests.serving import HUNG, free_port, serving, wait_for
 
 POSE = (4.5, 5.0, 0.0)
 
@@ -37,7 +37,7 @@ class Watcher(threading.Thread):
                 self.found.append(decision)
 
     def joined(self):
-        self.join(120.0)
+        self.join(HUNG)
         assert not self.is_alive()
         return self.found
 
@@ -84,7 +84,7 @@ def test_one_client_watches_many_sessions_and_still_steps(server):
         assert session.step(first.next_poses[first.execute], model(session, 9)).t == 1
         for events in watching:
             events.close()
-        wait_for(lambda: "specshield_watchers 0.0" in httpx.get(f"{server.url}/metrics").text, 60.0)
+        wait_for(lambda: "specshield_watchers 0.0" in httpx.get(f"{server.url}/metrics", timeout=None).text)
         client.sessions.delete(session.id)
 
 
@@ -137,7 +137,7 @@ def test_a_rate_limit_in_a_stream_is_that_of_http(keyed):
         while not limited(lambda: session.step(POSE, model(session, 0))):
             pass
         t = session.t
-        wait_for(lambda: not limited(lambda: session.step(POSE, model(session, 0))), 60.0)
+        wait_for(lambda: not limited(lambda: session.step(POSE, model(session, 0))))
         assert (session.t, len(client._streams._open)) == (t + 1, 1)
 
 
@@ -167,5 +167,5 @@ def test_a_server_that_comes_back_is_found_again_by_its_robots_and_their_watcher
                     other.sessions.get(session.id).close()
                     assert watcher.joined() == plain(decisions)
                 else:
-                    wait_for(lambda seen=found: len(seen) == 3, 60.0)
+                    wait_for(lambda seen=found: len(seen) == 3)
                     server.kill()

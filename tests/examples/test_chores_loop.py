@@ -132,7 +132,7 @@ def begin(request, server, case):
     if request.param == "in process":
         yield lambda pose: LocalShield.shipped(case.name).session(initial_pose=pose)
         return
-    with ShieldClient(server.url, timeout=10.0) as client:
+    with ShieldClient(server.url, timeout=60.0) as client:
         yield lambda pose: client.sessions.create(policy_id=case.name, initial_pose=pose)
 
 

@@ -120,7 +120,7 @@ def test_a_loop_that_goes_on_through_outage_bump_and_restart(tmp_path: Path) -> 
         session = robot_loop.Notes.read(notes).session
         with ShieldClient(server.url, timeout=30.0) as client:
             verdict = robot_loop.drive(client, robot, model, notes)
-        with ShieldClient(server.url, timeout=10.0) as client:
+        with ShieldClient(server.url, timeout=60.0) as client:
             states = client.sessions.get(session).trajectory()
     assert verdict.spec_status == "satisfied"
     assert not notes.exists()

@@ -23,6 +23,7 @@ from specshield.integrations.gymnasium import ShieldWrapper  # noqa: E402
 from specshield.local import LocalShield  # noqa: E402
 from specshield.sim.cases import load_case  # noqa: E402
 from specshield.sim.robot import SimulatedRobot  # noqa: E402
+from tests.serving import HUNG  # noqa: E402
 
 EXAMPLE = Path(minigrid_rooms.__file__)
 START = (4.5, 5.0, 0.0)
@@ -75,7 +76,7 @@ def test_the_checker_of_gymnasium_passes() -> None:
 
 def test_the_example() -> None:
     done = subprocess.run(
-        [sys.executable, str(EXAMPLE), "2"], capture_output=True, text=True, check=True, timeout=300
+        [sys.executable, str(EXAMPLE), "2"], capture_output=True, text=True, check=True, timeout=HUNG
     )
     bot, chance = done.stdout.splitlines()
     assert bot == "the bot: the rule was kept in 2 of 2 episodes, the mission done in 2"

@@ -12,6 +12,7 @@ from specshield.service.access.site import is_loopback, names_server
 from specshield.service.settings import read_settings
 from tests.service.test_bad_input import PGM, YAML, problem
 from tests.service.world import grid_json
+from tests.serving import HUNG
 
 ALLOWED = frozenset({"robots.example", "lab:8443"})
 
@@ -138,7 +139,7 @@ def serve(*options, **environment):
         env={"PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path), **environment},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HUNG,
     )
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr

@@ -335,7 +335,7 @@ def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
         answers = [step(t).content for t in range(3)]
         session = client.get("/v1/sessions/robot").json()
         trajectory = client.get("/v1/sessions/robot/trajectory").content
-        wait_for(archived, 60.0)
+        wait_for(archived)
         assert client.get("/v1/sessions/robot").json() == session
         assert client.get("/v1/sessions/robot/trajectory").content == trajectory
         assert [item["id"] for item in client.get("/v1/sessions").json()["items"]] == ["robot"]
@@ -346,11 +346,11 @@ def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
 
         assert step(3).status_code == 200
         assert client.get("/v1/sessions/robot").json()["next_t"] == 4
-        wait_for(archived, 60.0)
+        wait_for(archived)
         last = {"t": 4, "poses": ahead(4)[-1:]}
         closed = client.post("/v1/sessions/robot/close", json=last)
         assert closed.status_code == 200
-        wait_for(archived, 60.0)
+        wait_for(archived)
         assert client.post("/v1/sessions/robot/close", json=last).json() == closed.json()
         assert client.delete("/v1/sessions/robot").status_code == 204
         assert client.get("/v1/sessions/robot").status_code == 404

@@ -5,6 +5,7 @@ from concurrent.futures import Future
 import pytest
 
 from specshield.service.heavy.background import Background
+from tests.serving import HUNG
 
 
 def test_calls_are_made_in_turn_and_their_errors_are_told():
@@ -22,6 +23,6 @@ def test_calls_are_made_in_turn_and_their_errors_are_told():
 def test_a_program_that_ends_does_not_wait_for_a_call():
     program = (
         "import time\nfrom specshield.service.heavy.background import Background\n"
-        "Background('test').submit(time.sleep, 3600)\n"
+        "Background('test').submit(time.sleep, 7200)\n"
     )
-    subprocess.run([sys.executable, "-c", program], timeout=300, check=True)
+    subprocess.run([sys.executable, "-c", program], timeout=HUNG, check=True)

@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from tests.service.world import grid_json
-from tests.serving import RunningServer, serving, wait_for
+from tests.serving import HUNG, RunningServer, serving, wait_for
 
 MOST = 12  # connections of the server below
 
@@ -30,19 +30,19 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
         "SPECSHIELD_MAX_HEADER_BYTES": "4096",
     }
     with serving(folder, ready=False, **settings) as server:
-        wait_for(lambda: _alive(server), 120.0)
+        wait_for(lambda: _alive(server))
         yield server
 
 
 def _alive(server: RunningServer) -> bool:
     with contextlib.suppress(httpx.TransportError):
-        return httpx.get(f"{server.url}/livez", timeout=20.0).status_code == 200
+        return httpx.get(f"{server.url}/livez", timeout=HUNG).status_code == 200
     return False
 
 
 def _connect(server: RunningServer) -> socket.socket:
     parts = urlsplit(server.url)
-    return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=60.0)
+    return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=HUNG)
 
 
 def _answer(connection: socket.socket) -> tuple[int, dict[str, Any]]:
@@ -96,12 +96,12 @@ def test_silent_connections_make_room_for_those_who_ask(small: RunningServer) ->
     with contextlib.ExitStack() as held:
         for _ in range(2 * MOST):
             held.enter_context(_connect(small))
-        assert httpx.get(f"{small.url}/livez", timeout=60.0).status_code == 200
+        assert httpx.get(f"{small.url}/livez", timeout=HUNG).status_code == 200
 
 
 def test_those_at_work_keep_their_connections_when_new_ones_are_refused(small: RunningServer) -> None:
     with contextlib.ExitStack() as held:
-        working = [held.enter_context(httpx.Client(base_url=small.url, timeout=60.0)) for _ in range(MOST)]
+        working = [held.enter_context(httpx.Client(base_url=small.url, timeout=HUNG)) for _ in range(MOST)]
         for robot in working:
             assert robot.get("/livez").status_code == 200
         status, problem = _answer(held.enter_context(_connect(small)))
@@ -144,7 +144,7 @@ def test_a_client_that_goes_away_in_an_upload_is_no_failure(server: Any, client:
     def gone() -> bool:
         return 'status="499"' in client.get("/metrics").text
 
-    wait_for(gone, 60.0)
+    wait_for(gone)
     assert server.log.read_text().count("Traceback") == before
     assert list((server.data_dir / "incoming").glob("*")) == []
 

@@ -8,6 +8,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from tests.serving import HUNG
+
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 ATTACKS = """<!doctype html><body><iframe name="sink"></iframe><img src="/wait"><script>
@@ -72,7 +74,7 @@ def page(client):
 
         def do_GET(self):
             if self.path == "/wait":
-                self.server.done.wait(300.0)
+                self.server.done.wait(HUNG)
                 self.send_response(204)
                 self.end_headers()
                 return
@@ -125,7 +127,7 @@ def see(url, folder, *options):
         ],
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=HUNG,
     )  # fmt: skip
     return done.stdout
 

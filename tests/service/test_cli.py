@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from tests.serving import HUNG
+
 WITHOUT = """
 import sys
 class Without:
@@ -30,7 +32,7 @@ main()
 )
 def test_what_is_not_installed_is_said(parts, arguments, told):
     code = WITHOUT.format(parts=parts, arguments=arguments)
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HUNG)
     assert run.returncode == 1
     assert told in run.stderr
     assert "Traceback" not in run.stderr
@@ -94,7 +96,7 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HUNG,
     )
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
@@ -114,7 +116,7 @@ def test_why_the_store_does_not_start_is_said_in_one_line(tmp_path, more):
         env={**kept, "SPECSHIELD_DATA_DIR": str(tmp_path)},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HUNG,
     )
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
@@ -130,7 +132,7 @@ def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):
             env={**os.environ, "SPECSHIELD_DATA_DIR": str(tmp_path)},
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=HUNG,
         )
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()

@@ -16,6 +16,7 @@ from specshield.service import description
 from specshield.service.app import create_app
 from specshield.service.examples import POLICY
 from specshield.service.settings import Settings
+from tests.serving import HUNG
 
 COMMITTED = Path(__file__).parents[2] / "openapi.json"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -210,7 +211,7 @@ def test_the_page_is_there_without_the_internet(server, tmp_path):
         ],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HUNG,
     )
     for shown in ("/v1/sessions/{session_id}/steps", "Decide one step", "Check a formula"):
         assert shown in page.stdout.replace("​", ""), page.stderr[-2000:]
@@ -220,7 +221,7 @@ def test_the_page_is_there_without_the_internet(server, tmp_path):
 
 
 def test_the_page_asks_nobody_else(server):
-    page = httpx.get(f"{server.url}/docs").text
+    page = httpx.get(f"{server.url}/docs", timeout=None).text
     for link in re.findall(r'(?:src|href)="([^"]+)"', page):
         assert link.startswith("/"), link
-        assert httpx.get(server.url + link).status_code == 200
+        assert httpx.get(server.url + link, timeout=None).status_code == 200

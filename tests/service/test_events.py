@@ -12,7 +12,7 @@ from typing import Any
 import httpx
 
 from tests.service.world import ahead
-from tests.serving import serving, wait_for
+from tests.serving import HUNG, serving, wait_for
 
 END = "end"
 
@@ -109,11 +109,11 @@ def test_a_stream_ends_though_a_switch_passed_the_last_steps_over(server, client
     session = begin()
     reader = Reader(server.url, session["id"], after=-1)
     assert step(session, 0, ahead(0)).status_code == 200
-    wait_for(lambda: reader.found, 60.0)
+    wait_for(lambda: reader.found)
     asked = {"t": 4, "policy_id": session["policy_ids"][0], "clock": "restart", "poses": ahead(0) * 4}
     assert client.post(f"/v1/sessions/{session['id']}/switch", json=asked).status_code == 200
     assert client.post(f"/v1/sessions/{session['id']}/close", json={}).status_code == 200
-    reader.join(60.0)
+    reader.join(HUNG)
     assert [t for t, _ in reader.found] == [0, END]
     assert json.loads(reader.found[-1][1])["next_t"] == 4
 
@@ -122,13 +122,13 @@ def test_a_switch_is_told_however_long_before_the_next_step_it_is_made(server, c
     session = begin()
     reader = Reader(server.url, session["id"], after=-1)
     assert step(session, 0, ahead(0)).status_code == 200
-    wait_for(lambda: reader.found, 60.0)
+    wait_for(lambda: reader.found)
     asked = {"t": 1, "policy_id": session["policy_ids"][0], "clock": "restart"}
     assert client.post(f"/v1/sessions/{session['id']}/switch", json=asked).status_code == 200
     time.sleep(2.0)  # the stream knows of the switch by now; it has to be told if not, too
     assert step(session, 3, ahead(3)[1:]).status_code == 200
     client.post(f"/v1/sessions/{session['id']}/close", json={})
-    reader.join(60.0)
+    reader.join(HUNG)
     assert [t for t, _ in reader.found] == [0, "switch", 3, END]
 
 
@@ -136,14 +136,14 @@ def test_two_switches_with_no_step_between_are_both_told(server, client, begin, 
     session = begin()
     reader = Reader(server.url, session["id"], after=-1)
     assert step(session, 0, ahead(0)).status_code == 200
-    wait_for(lambda: reader.found, 60.0)
+    wait_for(lambda: reader.found)
     for t in (2, 4):
         asked = {"t": t, "policy_id": session["policy_ids"][0], "clock": "restart", "poses": ahead(0) * 2}
         assert client.post(f"/v1/sessions/{session['id']}/switch", json=asked).status_code == 200
         time.sleep(2.0)  # the stream knows of it by now
     assert step(session, 5, ahead(0) * 2).status_code == 200
     client.post(f"/v1/sessions/{session['id']}/close", json={})
-    reader.join(60.0)
+    reader.join(HUNG)
     assert [t for t, _ in reader.found] == [0, "switch", "switch", 5, END]
 
 
@@ -160,8 +160,8 @@ def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_i
             local.join()
             assert [t for t, _ in local.found] == [0, 1, 2]
             assert [t for t, _ in read(other.url, session, after=0, most=2)] == [1, 2]
-            wait_for(lambda: len(reader.found) == 3, 60.0)  # a server that stops tells nothing more
-        reader.join(30.0)
+            wait_for(lambda: len(reader.found) == 3)  # a server that stops tells nothing more
+        reader.join(HUNG)
         assert not reader.is_alive()
         assert [t for t, _ in reader.found] == [0, 1, 2]
 

@@ -347,6 +347,6 @@ def test_the_image_of_a_map_is_the_map(client):
     Image.fromarray(shades).save(buffer, "PNG")
     parts = {"metadata": ("m", YAML), "image": ("i", buffer.getvalue())}
     id = client.post("/v1/maps", files=parts).json()["id"]
-    shown = httpx.get(f"{client.base_url}/v1/maps/{id}/image.png")
+    shown = httpx.get(f"{client.base_url}/v1/maps/{id}/image.png", timeout=None)
     assert (np.asarray(Image.open(io.BytesIO(shown.content)).convert("L")) == shades).all()
     assert client.delete(f"/v1/maps/{id}").status_code == 204

@@ -149,7 +149,7 @@ def test_a_map_far_from_its_frames_origin_is_drawn_on_as_any(own):
     """As maps in UTM are. What a browser keeps of a number in an SVG would be half a metre off there."""
     sent = grid_json()
     sent["info"]["origin"]["position"] |= {"x": 448251.25, "y": 5411932.75}
-    id = httpx.post(f"{own.url}/v1/maps", json=sent).json()["id"]
+    id = httpx.post(f"{own.url}/v1/maps", json=sent, timeout=None).json()["id"]
     with browsing() as (page, complaints):
         page.goto(f"{own.url}/#/maps/{id}")
         page.locator(".walls image").wait_for(state="attached")
@@ -270,7 +270,7 @@ def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path):
 
 
 def test_its_files_are_small_tagged_and_allow_nothing_from_elsewhere(server):
-    with httpx.Client(base_url=server.url, verify=False) as client:
+    with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         page = client.get("/")
         assert page.headers["content-type"].startswith("text/html")
         assert page.headers["content-encoding"] == "gzip"

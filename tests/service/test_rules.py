@@ -12,7 +12,7 @@ import pytest
 from specshield.client import ShieldClient
 from specshield.errors import InfeasibleStart
 from tests.service.world import ROBOT, START, grid_json
-from tests.serving import serving
+from tests.serving import HUNG, serving
 
 WITHIN, UNTIL = 30, 45  # steps
 SAFE = {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}
@@ -31,9 +31,9 @@ def client(server):
 
 
 def make(server, client, formula, regions=None, signals=None, method="planner"):
-    map_id = httpx.post(f"{server.url}/v1/maps", json=grid_json(), timeout=120.0).json()["id"]
+    map_id = httpx.post(f"{server.url}/v1/maps", json=grid_json(), timeout=None).json()["id"]
     policy = client.policies.create(map_id, formula, regions, signals=signals, robot=ROBOT, method=method)
-    return client.policies.wait(policy.id, timeout=300.0, interval=0.1)
+    return client.policies.wait(policy.id, timeout=HUNG, interval=0.1)
 
 
 def is_safe(pose):
@@ -64,7 +64,9 @@ def test_whenever_the_event_rises_the_robot_is_soon_safe(server, client):
                 assert decision.reason is None
                 assert decision.any_signal, "so it was promised at the start"
                 pose = decision.next_poses[decision.execute]
-            assert httpx.get(f"{server.url}/v1/sessions/{session.id}").json()["any_signal"] is True
+            assert (
+                httpx.get(f"{server.url}/v1/sessions/{session.id}", timeout=None).json()["any_signal"] is True
+            )
             safe.append(is_safe(pose))
             assert session.close(pose).spec_status == "satisfied"
         risen = [t for t in range(UNTIL + 1) if events[t] > 0.5]
@@ -89,13 +91,13 @@ def test_a_rule_that_looks_at_the_first_state_alone(server, client, formula):
     with client.sessions.create(policy_id=policy.id, initial_pose=inside) as session:
         decision = session.step(inside, logits, explain=True)
         assert (decision.mode, decision.spec_status) == ("prior", "satisfied")
-        assert b"<svg" in httpx.get(f"{server.url}/v1/sessions/{session.id}/image.svg", timeout=120.0).content
+        assert b"<svg" in httpx.get(f"{server.url}/v1/sessions/{session.id}/image.svg", timeout=None).content
         pose = decision.next_poses[decision.execute]
         session.switch(policy_id=longer.id, clock="restart")
         pose = session.step(pose, logits).next_poses[0]
         session.switch(policy_id=policy.id, clock="restart")
         assert session.step(pose, logits).spec_status == "satisfied"
-    picture = httpx.get(f"{server.url}/v1/policies/{policy.id}/image.svg", timeout=120.0)
+    picture = httpx.get(f"{server.url}/v1/policies/{policy.id}/image.svg", timeout=None)
     assert picture.status_code == 200
     if "Safe" in formula:
         with pytest.raises(InfeasibleStart):

@@ -56,11 +56,11 @@ def test_what_was_acknowledged_survives_the_kill_of_store_and_server(tmp_path):
         session = begin(client)
         answers = [step(client, session, t).content for t in range(3)]
         os.kill(store_pid(tmp_path), signal.SIGKILL)
-        wait_for(lambda: step(client, session, 3).status_code == 200, 10.0)  # started again by the server
+        wait_for(lambda: step(client, session, 3).status_code == 200)  # started again by the server
         answers.append(step(client, session, 3).content)
         pids = store_pid(tmp_path), keeper_pid(tmp_path)
         server.kill()
-        wait_for(lambda: not any(map(runs, pids)), 5.0)  # nothing is left behind
+        wait_for(lambda: not any(map(runs, pids)))  # nothing is left behind
 
     with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
         assert [step(client, session, t).content for t in range(4)] == answers
@@ -90,7 +90,7 @@ def test_the_store_ends_with_its_keeper(tmp_path):
     embedded.join()
     pid = store_pid(tmp_path)
     os.kill(keeper_pid(tmp_path), signal.SIGKILL)
-    wait_for(lambda: not runs(pid), 5.0)
+    wait_for(lambda: not runs(pid))
     assert not embedded.joined()
     embedded.join()
     assert store_pid(tmp_path) != pid
@@ -107,7 +107,7 @@ def test_a_store_stays_until_its_last_user_is_gone(tmp_path):
     assert runs(pid)
     assert second.joined()
     second.leave()
-    wait_for(lambda: not runs(pid), 5.0)
+    wait_for(lambda: not runs(pid))
 
 
 def test_a_store_that_nobody_wants_any_more_leaves_at_once_however_young(tmp_path):
@@ -160,18 +160,18 @@ def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_superv
         with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
             session = begin(client)
         answers = [
-            httpx.post(f"{server.url}/v1/sessions/{session['id']}/steps", json=body).content
+            httpx.post(f"{server.url}/v1/sessions/{session['id']}/steps", json=body, timeout=None).content
             for body in [STEP] * 8
         ]
         assert len(set(answers)) == 1
-        told = httpx.get(f"{server.url}/metrics").text
+        told = httpx.get(f"{server.url}/metrics", timeout=None).text
         assert 'specshield_decisions_total{mode="shaped"} 1.0' in told
         route = 'method="POST",route="/v1/sessions/{session_id}/steps",status="200"'
         assert f"specshield_requests_total{{{route}}} 8.0" in told
         pids = [store_pid(tmp_path), *children(server.process.pid)]
         assert len(pids) >= 3
         server.kill()
-        wait_for(lambda: not any(map(runs, pids)), 10.0)
+        wait_for(lambda: not any(map(runs, pids)))
 
 
 STEP = {"t": 0, "poses": [START], "logits": LOGITS}
@@ -185,7 +185,7 @@ def test_a_store_that_is_away_is_said_to_be_and_nothing_hangs(tmp_path):
     dead = f"unix://{tmp_path / 'nothing'}"
     with (
         serving(tmp_path, ready=False, REDIS_URL=dead) as server,
-        httpx.Client(base_url=server.url, verify=False) as client,
+        httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
     ):
         while not alive(client) or client.get("/v1/sessions").json()["type"] == "starting":
             assert server.process.poll() is None
@@ -228,7 +228,7 @@ def test_a_store_of_ones_own_and_sessions_that_expire(tmp_path):
                 for key in keys:
                     connection.pexpire(key, 1)  # as if the rest had passed
                 path = f"/v1/sessions/{session['id']}"
-                wait_for(lambda: client.get(path).status_code == 404, 60.0)
+                wait_for(lambda: client.get(path).status_code == 404)
                 assert client.get("/v1/sessions").json() == {"items": [], "next": None}
                 assert connection.keys(f"specshield:*{session['id']}*") == []
                 assert begin(client)["next_t"] == 0  # there is room again
@@ -267,7 +267,7 @@ def test_an_answer_that_is_late_is_not_written_into_the_next_session_of_its_name
 def test_the_key_opens_what_it_should(tmp_path):
     with (
         serving(tmp_path, SPECSHIELD_API_KEY="s3cret") as server,
-        httpx.Client(base_url=server.url, verify=False) as client,
+        httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
     ):
         for path in ("/livez", "/readyz", "/docs", "/openapi.json"):
             assert client.get(path).status_code == 200
@@ -291,7 +291,7 @@ def test_a_server_that_fails_says_no_more_than_that(tmp_path):
         assert (response.status_code, response.json()["type"]) == (500, "internal-error")
         assert response.headers["content-type"] == "application/problem+json"
         assert "ValidationError" not in response.text
-        wait_for(lambda: "ValidationError" in server.log.read_text(), 5.0)
+        wait_for(lambda: "ValidationError" in server.log.read_text())
         assert client.get("/readyz").status_code == 200
 
 

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import httpx
 
 from tests.service.world import START, ahead, grid_json, policy_files
+from tests.serving import HUNG
 
 
 def test_maps_and_policies_have_names_that_are_accepted_wherever_their_ids_are(client):
@@ -95,7 +96,7 @@ def test_several_sessions_are_told_in_one_stream(server, client, begin, step):
     assert step(sessions[0], 1, ahead(1)).status_code == 200
     for session in sessions:
         client.post(f"/v1/sessions/{session['id']}/close", json={})
-    reader.join(30.0)
+    reader.join(HUNG)
     assert not reader.is_alive(), "it ends when all of them are over"
     told = [(item["session"], item.get("t", "over")) for item in found]
     assert sorted(told, key=str) == sorted(

@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import httpx
@@ -14,6 +13,7 @@ import pytest
 
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
+from tests.serving import HUNG, wait_for
 
 SPECSHIELD = (sys.executable, "-m", "specshield.cli")
 
@@ -38,13 +38,6 @@ def gone(pid):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
         return True
-
-
-def until(condition, seconds=120.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 def test_demo_prints_the_table_and_draws_each_case(tmp_path):
@@ -76,14 +69,17 @@ def test_demo_leaves_its_page_up_when_asked(tmp_path):
     try:
         page = next(line for line in running.stdout if line.startswith("page of both")).split(": ", 1)[1]
         url, _, ids = page.strip().partition("/#/floor?sessions=")
-        told = [httpx.get(f"{url}/v1/sessions/{id}/trajectory").json()["items"] for id in ids.split(",")]
+        told = [
+            httpx.get(f"{url}/v1/sessions/{id}/trajectory", timeout=None).json()["items"]
+            for id in ids.split(",")
+        ]
         assert all(told)
         assert told[0][0]["pose"] == told[1][0]["pose"], "from the same start, with the shield and without"
         assert told[0][0]["decision"] is not None
         assert told[1][0]["decision"] is None
-        assert "specshield" in httpx.get(url).text
+        assert "specshield" in httpx.get(url, timeout=None).text
         running.send_signal(signal.SIGINT)
-        assert running.wait(60) == 0
+        assert running.wait(HUNG) == 0
     finally:
         running.kill()
 
@@ -105,16 +101,16 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
     )
     try:
         if command == "demo":
-            until(lambda: children(running.pid))
+            wait_for(lambda: children(running.pid))
             (server,) = children(running.pid)
-            until(lambda: children(server))  # the store's keeper
+            wait_for(lambda: children(server))  # the store's keeper
             started = [server, *children(server)]
         else:
-            until(lambda: len(children(running.pid)) >= 3)  # two workers and what tracks their semaphores
+            wait_for(lambda: len(children(running.pid)) >= 3)  # two workers and what tracks their semaphores
             started = children(running.pid)
         os.kill(running.pid, how)
-        assert running.wait(60) != 0
-        until(lambda: all(map(gone, started)), 30.0)
+        assert running.wait(HUNG) != 0
+        wait_for(lambda: all(map(gone, started)))
     finally:
         running.kill()
 
@@ -137,7 +133,7 @@ def test_train_resumes_after_a_kill_and_writes_a_policy_that_serves(tmp_path):
     ]
     arguments += ["--option", "units=8", "--option", "evaluate_every=100", "--option", "evaluation_starts=50"]
     command = subprocess.Popen([*SPECSHIELD, *arguments], stderr=subprocess.DEVNULL)
-    until((out / "checkpoint" / "state.safetensors").exists)
+    wait_for((out / "checkpoint" / "state.safetensors").exists)
     command.kill()
     command.wait()
     assert not (out / "card.json").exists()

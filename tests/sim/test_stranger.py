@@ -11,11 +11,12 @@ import pytest
 
 from specshield.policy.dqn.environment import free_poses
 from tests.oracles.judge import margin
+from tests.serving import HUNG
 
 
 def post(url, body):
     request = urllib.request.Request(url, json.dumps(body).encode(), {"Content-Type": "application/json"})
-    with urllib.request.urlopen(request, timeout=30) as response:
+    with urllib.request.urlopen(request, timeout=HUNG) as response:
         return json.load(response)
 
 

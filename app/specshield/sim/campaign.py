@@ -21,7 +21,7 @@ from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import Pose
 from specshield.sim.service import follow_parent
 
-PATIENCE = 10.0  # [s] for one decision: other work may share the machine
+PATIENCE = 60.0  # [s] for one decision: other work may share the machine
 DRAWS = 100  # starts tried for one episode before giving up
 
 

@@ -170,6 +170,7 @@ def train(id: str, attempt: str) -> None:
         return  # cancelled, or asked for again
     logs.tell("making a policy", policy_id=id)
     with _regularly(live):
+        os.nice(10)  # this thread and those it starts: below servers and heavy/heavy.py; not signs of life
         try:
             _train(settings, jobs, id, attempt, cancelled)
             done: dict[str, Any] = {"status": "ready", "progress": 1, "eta_s": 0}
