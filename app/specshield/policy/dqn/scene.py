@@ -14,8 +14,8 @@ from scipy import ndimage
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
 from specshield.policy.geodesic import geodesic_distance
+from specshield.policy.progress import ALWAYS, PENDING, STACK, Rules, make_rules, read_predicates, value_count
 from specshield.robot.dynamics import Body, longest_motions, make_body
-from specshield.rule.progress import ALWAYS, PENDING, STACK, Rules, make_rules, read_predicates, value_count
 from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import VALUE
 from specshield.task import Task

@@ -22,6 +22,8 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
+from specshield.policy.progress import ALWAYS, Rules, make_rules
+from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import HURRIED, Guide, hurried, share_with_slack
@@ -32,13 +34,11 @@ from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.sight import look_closely
 from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, state_count, step_tables
 from specshield.policy.reachability.tables import Tables
-from specshield.policy.recall import pasts
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, make_body, simulate
-from specshield.rule.progress import ALWAYS, Rules, make_rules, signal_rows
-from specshield.rule.values import initial_signals
+from specshield.rule.values import initial_signals, signal_rows
 from specshield.rule.view import look, rate, view_of
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE
