@@ -26,7 +26,7 @@ from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.proposal import ask
 from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Until
-from specshield.stl.fragment import is_predicate
+from specshield.stl.conjunction import is_predicate
 
 # Chosen by hand; an explanation costs some 10 ms.
 DEPTH = 2  # motions after which a witness is met again
