@@ -1,22 +1,118 @@
-"""What of the history still matters to a formula: its obligations, and how far each of them has come."""
+"""The formula's progress along a trajectory: which of its obligations are settled, and which are broken.
 
-from specshield.policy.progress.rules import (
-    ALWAYS,
-    BROKEN,
-    EVENTUALLY,
-    EVENTUALLY_ALWAYS,
-    PENDING,
-    SETTLED,
-    STACK,
-    Rules,
-    advance,
-    make_rules,
-    read_predicates,
-    replay,
-    value_count,
-)
+pi_phi sees time and pose, but phi depends on the history: a charger may have been visited already. The
+progress is all of the history that still matters to a formula of the paper's fragment.
+"""
 
-__all__ = [
-    "ALWAYS", "BROKEN", "EVENTUALLY", "EVENTUALLY_ALWAYS", "PENDING", "SETTLED", "STACK", "Rules", "advance",
-    "make_rules", "read_predicates", "replay", "value_count",
-]  # fmt: skip
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from specshield.arrays import Floats, Int8s, Ints, copy_row
+from specshield.compiled import kernel, leaf
+from specshield.errors import FragmentError
+from specshield.policy.progress.obligations import obligations
+from specshield.rule.values import REGIONS, fill_place, fill_signals, initial_signals, places, regions_of
+from specshield.stl.program import STACK_SIZE, Programs, compile_predicates, evaluate_packed
+from specshield.task import Task
+from specshield.world.regions import PackedRegions
+
+EVENTUALLY, ALWAYS, EVENTUALLY_ALWAYS = 0, 1, 2
+KINDS = {"eventually": EVENTUALLY, "always": ALWAYS, "eventually_always": EVENTUALLY_ALWAYS}
+PENDING, SETTLED, BROKEN = 0, 1, 2
+MAX_OBLIGATIONS = 8
+STACK = STACK_SIZE
+
+
+class Rules(NamedTuple):
+    """A formula's K obligations as flat arrays."""
+
+    kind: Ints  # [K]
+    a: Ints  # [K] windows in absolute steps, closed
+    b: Ints
+    c1: Ints
+    c2: Ints
+    last: Ints  # [K] the step by which the obligation is decided
+    programs: Programs  # of the K predicates, over `values` (rule/values.py)
+    regions: PackedRegions
+    signals: Floats  # [S] the value each signal holds
+    margin: float  # an obligation holds where its predicate's robustness is above this
+
+
+def make_rules(task: Task, margin: float = 0.0) -> Rules:
+    """Compiles the task's formula. Raises FragmentError outside the paper's fragment or MAX_OBLIGATIONS."""
+    parts = obligations(task.formula)
+    if len(parts) > MAX_OBLIGATIONS:
+        expected = f"at most {MAX_OBLIGATIONS}; or method 'planner', which takes any formula"
+        raise FragmentError("too many obligations", got=len(parts), expected=expected)
+    rows = [(KINDS[p.kind], p.a, p.b, p.c1, p.c2, p.c1 + p.b) for p in parts]
+    kind, a, b, c1, c2, last = np.array(rows, np.int64).reshape(-1, 6).T.copy()
+    programs = compile_predicates([part.predicate for part in parts], places(task))
+    return Rules(kind, a, b, c1, c2, last, programs, regions_of(task), initial_signals(task), margin)
+
+
+@leaf
+def value_count(rules: Rules) -> int:
+    return int(REGIONS + rules.regions.starts.shape[0] - 1 + rules.signals.shape[0])
+
+
+@leaf
+def read_predicates(
+    rules: Rules, x: float, y: float, theta: float, values: Floats, stack: Floats, out: Floats
+) -> None:
+    """The robustness of each obligation's predicate at a pose, into `out`, shape (K,)."""
+    fill_place(rules.regions, x, y, theta, values)
+    fill_signals(rules.regions, rules.signals, values)
+    for k in range(rules.kind.shape[0]):
+        out[k] = evaluate_packed(k, rules.programs, values, stack)
+
+
+@leaf
+def advance(rules: Rules, t: int, predicates: Floats, status: Int8s, run: Ints) -> None:
+    """Takes the state at step t into the progress, in place.
+
+    predicates (K,) at x_t; status (K,): PENDING, SETTLED or BROKEN; run (K,): how many steps, this one
+    included, an eventually-always predicate has held without a break since its earliest window could begin.
+    """
+    for k in range(rules.kind.shape[0]):
+        if status[k] != PENDING:
+            continue
+        holds = predicates[k] > rules.margin
+        if rules.kind[k] == EVENTUALLY:
+            if holds and rules.a[k] <= t <= rules.b[k]:
+                status[k] = SETTLED
+            elif t >= rules.b[k]:
+                status[k] = BROKEN
+        elif rules.kind[k] == ALWAYS:
+            if not holds and rules.a[k] <= t <= rules.b[k]:
+                status[k] = BROKEN
+            elif t >= rules.b[k]:
+                status[k] = SETTLED
+        else:
+            # F[a,c1] G[c2,b]: the predicate holds on [s + c2, s + b] for some witness time s in [a, c1].
+            run[k] = run[k] + 1 if holds and t >= rules.a[k] + rules.c2[k] else 0
+            if run[k] > rules.b[k] - rules.c2[k] and t >= rules.a[k] + rules.b[k]:
+                status[k] = SETTLED
+            elif t + 1 - run[k] > rules.c1[k] + rules.c2[k]:
+                status[k] = BROKEN
+
+
+@kernel
+def replay(rules: Rules, past: float, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
+    """The progress after the states x_0..x_t, by the margin `past`. poses (t + 1, 3), signals (t + 1, S).
+
+    Overwritten: status, run (K,), and rules.signals, which is left at the last row: the values that are held.
+    """
+    values, stack = np.empty(value_count(rules)), np.empty(STACK)
+    predicates = np.empty(rules.kind.shape[0])
+    status[:] = PENDING
+    run[:] = 0
+    for t in range(poses.shape[0]):
+        copy_row(signals[t], rules.signals)
+        read_predicates(rules, poses[t, 0], poses[t, 1], poses[t, 2], values, stack, predicates)
+        if past != rules.margin:  # which `advance` goes by
+            for k in range(predicates.shape[0]):
+                predicates[k] = np.inf if predicates[k] > past else -np.inf
+        advance(rules, t, predicates, status, run)
