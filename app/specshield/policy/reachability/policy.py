@@ -15,7 +15,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats
 from specshield.errors import MapError, PolicyError
-from specshield.policy.card import Card, make_card
+from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
@@ -50,14 +50,12 @@ FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs n
 
 
 @dataclass(frozen=True, eq=False)
-class ReachabilityPolicy:
+class ReachabilityPolicy(Carded):
     """Proposes what the tables (tables.py) lead to (search.py).
 
     narrow [K]: the obligations whose predicates the lattice can hardly see (sight.py).
     """
 
-    task: Task
-    card: Card
     settings: Settings
     tables: Tables
     narrow: Bools
@@ -66,14 +64,6 @@ class ReachabilityPolicy:
     barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
     early: int = 0  # [steps] as `hurried` has it
     wanted: Bools | None = None  # [M] the first motions to propose ways after; None: all of them
-
-    @property
-    def id(self) -> str:
-        return str(self.card["id"])
-
-    @cached_property
-    def _body(self) -> Body:
-        return make_body(self.task.robot, self.task.grid)
 
     @cached_property
     def _rules(self) -> Rules:
