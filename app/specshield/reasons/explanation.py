@@ -19,8 +19,9 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.reasons.lateness import in_words, late_by, samples_of, steps, values_of
+from specshield.reasons.still_open import still_open
 from specshield.robot.dynamics import motion_count, step
-from specshield.rule.residual import again, left_over, still_open
+from specshield.rule.residual import again, left_over
 from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
