@@ -101,7 +101,7 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
-    from specshield.service.drain import GRACE
+    from specshield.service.leaving import GRACE
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs

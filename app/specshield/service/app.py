@@ -21,12 +21,13 @@ from specshield.service.bounds import body
 from specshield.service.bounds.bodies import Bodies
 from specshield.service.bounds.protocol import raise_file_limit
 from specshield.service.description import TAGS, described
-from specshield.service.drain import drain_at_sigterm
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.leaving import drain_at_sigterm
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
-from specshield.service.middleware import Guard, Observe
+from specshield.service.middleware.guard import Guard
+from specshield.service.middleware.observe import Observe
 from specshield.service.routes import events, maps, pictures, policies, robots, sessions, specs, system
 from specshield.service.routes.steps import StepRoute
 from specshield.service.routes.stream import StreamRoute

@@ -14,12 +14,12 @@ from specshield.policy.methods import METHODS
 from specshield.service import examples
 from specshield.service.access.keys import Key
 from specshield.service.access.owners import Caller, Owner
+from specshield.service.bounds.body import received
 from specshield.service.heavy.uploads import PARTS, is_multipart
 from specshield.service.library.policies import Record
-from specshield.service.routes.uploads import TOO_MUCH, received
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.policies import PolicyList, PolicyRequest, PolicyResponse
-from specshield.service.state import Cursor, Limit, Server, ServerState, json_content, problems
+from specshield.service.state import TOO_MUCH, Cursor, Limit, Server, ServerState, json_content, problems
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
@@ -153,7 +153,7 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
 
     def show() -> dict[str, Any]:
         found, following = server.policies.page(owner, cursor, limit)
-        names = server.policies.names(owner)
+        names = server.claims.names("policies", owner)
         return {"items": [_listed(server, record, names) for record in found], "next": following}
 
     return await asyncio.to_thread(show)

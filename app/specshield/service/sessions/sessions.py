@@ -17,7 +17,7 @@ import numpy as np
 
 from specshield import handover
 from specshield.arrays import Floats
-from specshield.errors import FragmentError, InputError, LimitReached, NotFound, SpecshieldError
+from specshield.errors import InputError, LimitReached, NotFound, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
 from specshield.service.access.keys import OPEN, Key
@@ -41,7 +41,7 @@ from specshield.service.sessions.session import (
     over,
     pack,
 )
-from specshield.service.sessions.shields import Shields, refused
+from specshield.service.sessions.shields import Shields, prepared
 from specshield.service.sessions.state import State, pack_carry
 from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
@@ -83,12 +83,8 @@ class Sessions:
         settings = self._checked(request)
         preference = None
         if request.shaping != PROJECTION:
-            try:
-                asked = request.shaping, request.policies, request.initial_pose, key.name
-                preparing = await self._run(self._shields.prepared, *asked)
-                preference = await asyncio.shield(asyncio.wrap_future(preparing))
-            except FragmentError as error:
-                raise refused(request.shaping, error) from None
+            asked = request.shaping, request.policies, request.initial_pose, key.name
+            preference = await prepared(self._run, self._shields, *asked)
         ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
         try:
             config, begun, status, rows = await self._begun(request, settings, preference, key.name)

@@ -144,10 +144,7 @@ class Watchers:
             while places and not self._stopping():
                 told = []
                 for feed, t in [(feed, t) for feed, t in places.items() if t < feed.end or feed.over]:
-                    if t < feed.start:
-                        found, t = await self._older(feed, t)
-                    else:
-                        found, t = feed.since(t), max(t, feed.end)
+                    found, t = await self._since(feed, t)
                     told += [each.whole for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
@@ -191,10 +188,7 @@ class Watchers:
             yield FIRST
             while not self._stopping():
                 changed = feed.changed
-                if t < feed.start:
-                    found, t = await self._older(feed, t)
-                else:
-                    found, t = feed.since(t), max(t, feed.end)
+                found, t = await self._since(feed, t)
                 if found:
                     yield b"".join(each.event for each in found)
                 if t < feed.end:
@@ -261,8 +255,10 @@ class Watchers:
             feed.add(state, found, state.next_t, state.next_t)
         feed.version = None
 
-    async def _older(self, feed: Feed, t: int) -> tuple[list[Told], int]:
-        """Decisions from step t on, and the step that follows them."""
+    async def _since(self, feed: Feed, t: int) -> tuple[list[Told], int]:
+        """Decisions from step t on, and the step that follows them; what is not kept is read."""
+        if t >= feed.start:
+            return feed.since(t), max(t, feed.end)
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
         if new is None:
             dump = await self._store.dump(feed.id)
