@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from evaluation.shipped import shipped
 from specshield.shield.episode import decide, make_shield
-from specshield.sim.cases import load_case, shipped
+from specshield.sim.cases import load_case
 
 
 def serve(case_name: str, method: str) -> None:
