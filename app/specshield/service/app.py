@@ -42,7 +42,7 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
 from specshield.service.storage.marker import check_files
 from specshield.service.storage.objects import open_objects
-from specshield.service.training.children import TrainingWorker, tend, wants_worker
+from specshield.service.training.children import TrainingWorker, tend
 from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
@@ -116,7 +116,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     claims = Claims(lambda: jobs.redis, settings)
     library = Maps(settings, claims)
     known = Policies(settings, library, claims)
-    worker = TrainingWorker(settings) if wants_worker(settings) else None
+    trains = settings.redis_url is None if settings.worker is None else settings.worker
+    worker = TrainingWorker(settings) if trains else None
     heavy, startup = Heavy(settings), Startup()
 
     def check() -> None:

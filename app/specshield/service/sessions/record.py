@@ -123,11 +123,6 @@ def decode(content: bytes) -> StepRecord:
     return _decoder.decode(content)
 
 
-def row_of(content: bytes) -> Floats:
-    """A stored row: pose and signals."""
-    return np.frombuffer(content, "<f8")
-
-
 def digest(content: bytes) -> bytes:
     """SHA-256 of a record or a config."""
     return hashlib.sha256(content).digest()

@@ -27,9 +27,9 @@ from specshield.service.sessions.session import (
     columns,
     contended,
     describe,
-    missing,
     over,
     pack,
+    there,
 )
 from specshield.service.sessions.shields import Shields, prepared
 from specshield.service.sessions.state import pack_carry
@@ -61,9 +61,7 @@ class Switches:
         StepConflict, SessionFinished, LimitReached.
         """
         for _ in range(RACES):
-            found = await self._store.load(id, request.t - 1 if request.t else None)
-            if found is None:
-                raise missing(id)
+            found = there(await self._store.load(id, request.t - 1 if request.t else None), id)
             session = Session.of(found)
             ids = await self._run(lambda: [self._policies.find(key, owner).id for key in request.policies])
             if _is_last(session, request, ids):

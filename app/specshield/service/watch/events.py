@@ -22,7 +22,7 @@ from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.sessions import rules
 from specshield.service.sessions.record import StepRecord
-from specshield.service.sessions.session import Session, missing
+from specshield.service.sessions.session import Session, there
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import News, Store
 from specshield.service.watch.feed import (
@@ -173,9 +173,7 @@ class Watchers:
                     del self._feeds[feed.id]
 
     async def _begin(self, id: str) -> Feed:
-        found = await self._store.load(id)
-        if found is None:
-            raise missing(id)
+        found = there(await self._store.load(id), id)
         session = Session.of(found)
         state = session.state
         return Feed(
