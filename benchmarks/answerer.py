@@ -2,7 +2,7 @@
 
     python -P benchmarks/answerer.py CASE METHOD      # one JSON document a line, in and out
 
-It takes nothing from this folder, so that with another PYTHONPATH it times another checkout.
+It takes nothing but the package itself, so that with another PYTHONPATH it times another checkout.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from specshield.policy.methods import load_policy
 from specshield.shield.episode import decide, make_shield
-from specshield.sim.cases import load_case, shipped
+from specshield.shipped import MODELS
+from specshield.sim.cases import load_case
 
 
 def serve(case_name: str, method: str) -> None:
@@ -29,7 +31,9 @@ def serve(case_name: str, method: str) -> None:
     nanoseconds of CPU that one decision took.
     """
     case = load_case(case_name)
-    shield = make_shield([shipped(case, method)])
+    folder = MODELS / (case.name if method == "reachability" else f"{case.name}-{method}")
+    card = json.loads((folder / "card.json").read_text())
+    shield = make_shield([load_policy(folder / "policy.safetensors", card, case.task)])
     poses: list[list[float]] = []
     carry = None
     call: Callable[[], Any] = list

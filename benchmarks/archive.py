@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.states import along
+from evaluation.shipped import shipped
 from specshield.service.sessions import record
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.state import State, pack_carry
@@ -33,7 +34,7 @@ from specshield.service.storage.objects import open_objects
 from specshield.service.storage.store import Dump, keys
 from specshield.shield import episode
 from specshield.shield.decision import make_shield
-from specshield.sim.cases import load_case, shipped
+from specshield.sim.cases import load_case
 
 TTL = 7 * 24 * 3600  # [s] the server's own
 ROOM = 200  # sessions that are in the store at a time, as many as would be robots that are alive

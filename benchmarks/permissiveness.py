@@ -23,15 +23,16 @@ from numpy.typing import NDArray
 
 from benchmarks.judge import Judge
 from benchmarks.worlds import KINDS, NEAR, SHAPES, explore, make_world, sample
+from evaluation.shipped import shipped
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
+from specshield.policy.progress import STACK, advance, make_rules, read_predicates, replay, value_count
 from specshield.policy.reachability.policy import ReachabilityPolicy, Settings, synthesise
 from specshield.policy.reachability.tables import slack
 from specshield.robot.dynamics import Body, in_collision, motion_count, simulate, step
-from specshield.rule.progress import STACK, advance, make_rules, read_predicates, replay, value_count
 from specshield.shield.episode import Config, Decision, Shield, decide, make_shield, start
 from specshield.shield.proposal import Proposer
-from specshield.sim.cases import Case, case_names, load_case, shipped
+from specshield.sim.cases import Case, case_names, load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 

@@ -19,7 +19,8 @@ from specshield.policy.dqn.network import NAMES
 from specshield.policy.dqn.observation import DISTANCE_UNIT, SAFE, TIME_UNIT
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.dqn.scene import make_scene
-from specshield.stl import SATISFIED_ABOVE, Atom, obligations, robustness
+from specshield.policy.progress.obligations import obligations
+from specshield.stl import SATISFIED_ABOVE, Atom, robustness
 
 Ints = NDArray[np.int64]
 

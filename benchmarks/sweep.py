@@ -17,11 +17,11 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.observation import PER_MOTION, observation_size
 from specshield.policy.dqn.policy import Policy
+from specshield.policy.progress import make_rules
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import STRETCH, Robot
 from specshield.robot.actions import Action
 from specshield.robot.dynamics import make_body, motion_count
-from specshield.rule.progress import make_rules
 from specshield.shield.episode import decide, make_shield
 from specshield.sim.cases import load_case
 from specshield.stl import SATISFIED_ABOVE, robustness_bounds

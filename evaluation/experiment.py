@@ -15,6 +15,7 @@ from evaluation.disturbance import MOVED, believed, check
 from evaluation.houses import load_house_case
 from evaluation.methods import Decoding, Method, Shielded, Simplex
 from evaluation.models import named
+from evaluation.shipped import shipped
 from evaluation.slacks import Adaptive, proportional
 from evaluation.tasks import MainTask, main_task
 from specshield import __version__
@@ -27,7 +28,7 @@ from specshield.shield.decision import Config, ThresholdOver
 from specshield.shield.episode import Shield, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MODELS
-from specshield.sim.cases import Case, case_name, case_names, load_case, shipped
+from specshield.sim.cases import Case, case_name, case_names, load_case
 from specshield.sim.learned.model import WEIGHTS, read
 from specshield.sim.model import FoundationModel
 from specshield.task import Task

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from evaluation.shipped import shipped
 from specshield.shield.episode import Shield, make_shield
-from specshield.sim.cases import Case, case_names, load_case, shipped
+from specshield.sim.cases import Case, case_names, load_case
 from tests.serving import RunningServer, serving
 
 

@@ -10,7 +10,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from specshield.service.drain import GRACE
+from specshield.service.leaving import GRACE
 from specshield.service.settings import Settings
 
 DOCKER = Path(__file__).parent.parent / "docker"

@@ -80,6 +80,7 @@ def _commands() -> Iterator[Callable[..., None]]:
     """The commands below, and those that other packages register as entry points."""
     from specshield.commands.check_drive import check_drive
     from specshield.commands.export import export
+    from specshield.commands.watch import watch
 
     yield from (serve, demo, policy, run_policy, watch, doctor, train, worker, verify, openapi)
     yield from (export, check_drive)
@@ -101,7 +102,7 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
-    from specshield.service.drain import GRACE
+    from specshield.service.leaving import GRACE
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs
@@ -245,20 +246,6 @@ def run_policy(
     from specshield.commands.run import run as drive
 
     raise typer.Exit(drive(policy, target, seed, out))
-
-
-def watch(
-    session: Annotated[str, typer.Argument(help="Id of a session.")],
-    url: Annotated[str, typer.Option(help="The server.")] = "http://127.0.0.1:8000",
-    after: Annotated[
-        int | None, typer.Option(help="Begin after this step. [default: from the first]")
-    ] = None,
-    limit: Annotated[int | None, typer.Option(help="Stop after so many decisions.", min=1)] = None,
-) -> None:
-    """Show the decisions of a session as they are made, a line each."""
-    from specshield.commands.watch import watch as follow
-
-    raise typer.Exit(follow(session, url, after, limit))
 
 
 def doctor(

@@ -18,7 +18,7 @@ from redis import Redis
 from rq import Queue, Worker
 from rq.serializers import JSONSerializer
 
-from evaluation import calibration, campaigns, experiment, results
+from evaluation import calibration, campaigns, experiment, results, shipped
 from evaluation.evaluation import evaluate, read
 from evaluation.experiment import Experiment
 from evaluation.houses import RULE, load_house_case, located
@@ -127,10 +127,10 @@ def test_records_are_not_mixed_with_those_of_another_map_policy_or_model(tmp_pat
     def changed(name, spoil):
         maps, models = tmp_path / name / "maps", tmp_path / name / "models"
         shutil.copytree(cases.MAPS, maps)
-        shutil.copytree(cases.MODELS, models)
+        shutil.copytree(shipped.MODELS, models)
         spoil(maps, models)
         with monkeypatch.context() as patched:
-            patched.setattr(cases, "MODELS", models)
+            patched.setattr(shipped, "MODELS", models)
             patched.setattr(experiment, "MODELS", models)
             patched.setattr(experiment, "load_case", lambda case: load_case(case, maps))
             experiment._setting.cache_clear()

@@ -10,9 +10,9 @@ import numpy as np
 
 from specshield.lookahead.goals import Goals
 from specshield.lookahead.lattice import make_planes
+from specshield.policy.progress import make_rules
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body
-from specshield.rule.progress import make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

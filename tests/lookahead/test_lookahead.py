@@ -16,9 +16,9 @@ from specshield.lookahead.goals import make_goals
 from specshield.lookahead.lattice import blocked_at, make_planes
 from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.lookahead.surrogate import WANDER, StandIn, end_chance, follow, price_left, step_price
+from specshield.policy.progress import make_rules
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, step
-from specshield.rule.progress import make_rules
 from specshield.shield.shaping import log_softmax, restrict
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import MOTIONS, STATES, Cells

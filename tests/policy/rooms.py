@@ -10,9 +10,9 @@ from specshield.policy.card import make_card
 from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.observation import make_state, observation_size, place
 from specshield.policy.dqn.policy import Policy
+from specshield.policy.progress import PENDING, make_rules
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, motion_count, successors
-from specshield.rule.progress import PENDING, make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

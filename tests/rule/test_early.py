@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from specshield.reasons.still_open import still_open
 from specshield.rule.early import conjunction_of, find_open, rate_open
-from specshield.rule.residual import still_open
 from specshield.rule.view import rate, view_of
 from specshield.shield.feasibility import prefix_of
 from specshield.stl import robustness

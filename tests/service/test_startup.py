@@ -30,7 +30,7 @@ def held(tmp_path):
 
 def test_a_server_takes_in_nothing_before_it_is_ready_that_no_first_decision_needs():
     """And the parent of several servers nothing of what they decide with."""
-    parent = "import specshield.cli, uvicorn, specshield.service.drain, specshield.service.storage.embedded"
+    parent = "import specshield.cli, uvicorn, specshield.service.leaving, specshield.service.storage.embedded"
     for imports, unneeded in (
         ("import specshield.service.app", "torch valkey specshield.lookahead.lookahead"),
         (parent, "torch valkey specshield.lookahead numba fastapi"),

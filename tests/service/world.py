@@ -11,9 +11,9 @@ from safetensors.numpy import save
 
 from specshield.policy.card import make_card
 from specshield.policy.dqn.observation import observation_size
+from specshield.policy.progress import make_rules
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body, motion_count
-from specshield.rule.progress import make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

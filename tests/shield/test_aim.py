@@ -9,7 +9,7 @@ from specshield.policy.dqn.network import make_network
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.planner import policy as planner
 from specshield.policy.reachability import policy as reachability
-from specshield.rule.residual import still_open
+from specshield.reasons.still_open import still_open
 from specshield.shield.episode import Config, decide, make_shield
 from specshield.shield.proposal import Proposal
 from specshield.shield.uncertainty import Uncertainty

@@ -8,12 +8,13 @@ from itertools import product
 import numpy as np
 import pytest
 
+from evaluation.shipped import shipped
 from specshield.policy.planner import policy as planner
 from specshield.policy.reachability import policy as reachability
 from specshield.robot import robot_from_json
 from specshield.robot.dynamics import motion_count, simulate
 from specshield.shield.episode import decide, make_shield
-from specshield.sim.cases import load_case, shipped
+from specshield.sim.cases import load_case
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 

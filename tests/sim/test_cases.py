@@ -3,9 +3,10 @@ import json
 import numpy as np
 import pytest
 
+from evaluation.shipped import shipped
 from specshield import errors
 from specshield.shipped import MAPS
-from specshield.sim.cases import case_name, load_case, shipped
+from specshield.sim.cases import case_name, load_case
 from specshield.stl import parse
 
 

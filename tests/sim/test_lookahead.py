@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evaluation.shipped import shipped
 from specshield.lookahead import lookahead
 from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.policy.dqn.environment import free_poses
@@ -13,7 +14,7 @@ from specshield.service.sessions.state import pack_carry
 from specshield.shield.decision import Config
 from specshield.shield.episode import close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
-from specshield.sim.cases import load_case, shipped
+from specshield.sim.cases import load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 

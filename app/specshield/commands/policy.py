@@ -40,10 +40,9 @@ def policy(
     with client_of(url, status, worker=True) as client:
         world = _map(client, map, assets)
         spec = client.specs.validate(rule, places, map_id=world.id)
-        print(
-            f"map     {world.name or world.id[:12]}: {_metres(world)}; "
-            f"rooms: {', '.join(world.rooms) or 'none'}"
-        )
+        wide, high = world.width * world.resolution, world.height * world.resolution
+        size = f"{wide:.1f} x {high:.1f} m at {world.resolution:g} m"
+        print(f"map     {world.name or world.id[:12]}: {size}; rooms: {', '.join(world.rooms) or 'none'}")
         print(f"rule    {spec.formula}, over {spec.horizon} steps", flush=True)
         asked = client.policies.create(world.id, rule, places, robot=machine, method=method, name=name)
         status.say(f"making the policy by {method} ...")
@@ -67,11 +66,6 @@ def policy(
 def _show(status: StatusLine, found: Policy) -> None:
     left = "" if found.eta_s is None else f", about {duration(found.eta_s)} left"
     status.say(f"{found.status}: {found.progress:4.0%}{left}")
-
-
-def _metres(world: Map) -> str:
-    wide, high = world.width * world.resolution, world.height * world.resolution
-    return f"{wide:.1f} x {high:.1f} m at {world.resolution:g} m"
 
 
 def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import os
+from typing import TYPE_CHECKING, Annotated
 
-from specshield.client import Decision, ShieldClient
+import typer
+
+if TYPE_CHECKING:  # every command line reads this module
+    from specshield.client import Decision
 
 HEAD = "    t mode           action       rule  feasible      KL   rho m   off by m"
 
 
-def watch(session: str, url: str, after: int | None, limit: int | None) -> int:
-    """Prints one line a decision until the session ends, or `limit` lines. The exit status is 0."""
+def watch(
+    session: Annotated[str, typer.Argument(help="Id of a session.")],
+    url: Annotated[str, typer.Option(help="The server.")] = "http://127.0.0.1:8000",
+    after: Annotated[
+        int | None, typer.Option(help="Begin after this step. [default: from the first]")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(help="Stop after so many decisions.", min=1)] = None,
+) -> None:
+    """Show the decisions of a session as they are made, a line each."""
+    from specshield.client import ShieldClient
+
     with ShieldClient(url, api_key=os.environ.get("SPECSHIELD_API_KEY")) as client:
         found = client.sessions.get(session)
         print(f"session {found.id}: {found.info.spec['formula']}")
@@ -21,7 +34,6 @@ def watch(session: str, url: str, after: int | None, limit: int | None) -> int:
                 print(f"      {warning}", flush=True)
             if seen == limit:
                 break
-    return 0
 
 
 def line(decision: Decision) -> str:

@@ -119,7 +119,7 @@ class LocalSession:
         made = episode.decide(
             self._rule.shield,
             self._rule.since([*self._poses, x_t]),
-            None if logits is None else _log(logits),
+            None if logits is None else [-math.inf if z is None else z for z in logit_values(logits)],
             over,
             self._rule.signals(held),
             self._carry,
@@ -266,10 +266,6 @@ class LocalSession:
         if decision.explanations is not None:
             told["explanations"] = [_told(why) for why in decision.explanations]
         return {name: value for name, value in told.items() if value is not None or name not in ASKED}
-
-
-def _log(logits: Logits) -> list[float]:
-    return [-math.inf if value is None else value for value in logit_values(logits)]
 
 
 def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool, explain: bool) -> Decision:

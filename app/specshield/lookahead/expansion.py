@@ -15,8 +15,8 @@ from specshield.lookahead.desirability import UNKEEPABLE, desirability
 from specshield.lookahead.goals import Goals
 from specshield.lookahead.lattice import Planes, is_blocked
 from specshield.lookahead.surrogate import follow, price_left, step_price
+from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, value_count
 from specshield.robot.dynamics import Body, step
-from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
 
 DEPTH = 2  # exact steps before the lattice is asked; chosen by hand, nothing measured
 

@@ -11,10 +11,7 @@ from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
 from specshield.policy.lattice import Corners, pose_of
-from specshield.policy.reachability.tables import Tables, slack
-from specshield.policy.shape import heading_count
-from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
-from specshield.rule.progress import (
+from specshield.policy.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
     PENDING,
@@ -24,6 +21,9 @@ from specshield.rule.progress import (
     read_predicates,
     value_count,
 )
+from specshield.policy.reachability.tables import Tables, slack
+from specshield.policy.shape import heading_count
+from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 
 COARSE_PITCH = 0.4  # [m] as fine as the stand-ins deserve; chosen by hand, nothing measured
 MOST_HEADINGS = 24  # one for each 15 degrees; chosen by hand, nothing measured

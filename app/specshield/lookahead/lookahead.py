@@ -31,10 +31,11 @@ from specshield.lookahead.goals import Goals, make_goals
 from specshield.lookahead.lattice import Planes, blocked_at, make_planes
 from specshield.lookahead.preferences import AHEADS, PreferenceKind
 from specshield.lookahead.surrogate import WANDER, stand_in_for
+from specshield.policy.progress import SETTLED, Rules, make_rules, replay
 from specshield.policy.reachability.policy import ReachabilityPolicy, synthesise
 from specshield.portable import exp, inner
 from specshield.robot.dynamics import Body, make_body
-from specshield.rule.progress import SETTLED, Rules, make_rules, replay, signal_rows
+from specshield.rule.values import signal_rows
 from specshield.shield.proposal import Proposer
 from specshield.task import Task
 

@@ -5,14 +5,33 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from specshield.robot import robot_to_json
+from specshield.robot.dynamics import Body, make_body
 from specshield.task import Task
 from specshield.world.regions import region_to_json
 
 Card = dict[str, Any]
 FORMAT = 1  # the version of the card's members; no other version exists yet, so nothing reads it
+
+
+@dataclass(frozen=True, eq=False)
+class Carded:
+    """What all policies have that come with a card."""
+
+    task: Task
+    card: Card
+
+    @property
+    def id(self) -> str:
+        return str(self.card["id"])
+
+    @cached_property
+    def _body(self) -> Body:
+        return make_body(self.task.robot, self.task.grid)
 
 
 def policy_id(task_hash: str, method: str, options: Mapping[str, Any], seed: int) -> str:

@@ -15,9 +15,9 @@ from scipy.ndimage import distance_transform_edt
 from specshield.arrays import Bools
 from specshield.compiled import kernel
 from specshield.policy.lattice import pose_of
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, STACK, Rules, read_predicates, value_count
 from specshield.policy.shape import headings_of, side_of
 from specshield.robot.dynamics import Body, longest_motions, swing_radius
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
 from specshield.task import Task

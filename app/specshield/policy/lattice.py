@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from specshield.arrays import Bools, Bytes, Codes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
+from specshield.policy.progress import STACK, Rules, read_predicates, value_count
 from specshield.policy.shape import heading_count
 from specshield.robot.dynamics import (
     TOUCH,
@@ -29,7 +30,6 @@ from specshield.robot.dynamics import (
     swing_radius,
     unhindered,
 )
-from specshield.rule.progress import STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING
 from specshield.stl.program import VALUE
 from specshield.world.regions import turns_with_robot

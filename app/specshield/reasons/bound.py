@@ -138,7 +138,8 @@ class _Ahead:
         self, poses: Floats, met: Ints, step: int, soonest: Sequence[float]
     ) -> tuple[str | None, list[Need]]:
         """Why from none of these poses all goals can be met in time, as `refuted` has it."""
-        apart = [[self._between(a, b) for b in self.goals] for a in self.goals]
+        # apart: the fewest steps from a place where one goal is met to one where the other is
+        apart = [[self._steps(float(b.far[a.where].min())) for b in self.goals] for a in self.goals]
         steps = np.column_stack(
             [np.empty((len(poses), 0)), *(self._nearest(goal, poses) for goal in self.goals)]
         )
@@ -171,10 +172,6 @@ class _Ahead:
         moved = [poses + np.array([dx, dy, 0.0]) for dx in (-EDGE, EDGE) for dy in (-EDGE, EDGE)]
         ways = np.min([goal.far[self.ground.squares(each)] for each in moved], axis=0)
         return np.array([self._steps(way) for way in ways.tolist()])
-
-    def _between(self, a: Goal, b: Goal) -> float:
-        """The fewest steps from a place where one is met to one where the other is."""
-        return self._steps(float(b.far[a.where].min()))
 
     def _steps(self, way: float) -> float:
         if way <= 0.0 or way == math.inf:

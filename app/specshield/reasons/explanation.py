@@ -19,14 +19,15 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.reasons.lateness import in_words, late_by, samples_of, steps, values_of
+from specshield.reasons.still_open import still_open
 from specshield.robot.dynamics import motion_count, step
-from specshield.rule.residual import again, left_over, still_open
+from specshield.rule.residual import again, left_over
 from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix
 from specshield.shield.judgement import Judged
 from specshield.shield.proposal import ask
 from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Until
-from specshield.stl.fragment import is_predicate
+from specshield.stl.conjunction import is_predicate
 
 # Chosen by hand; an explanation costs some 10 ms.
 DEPTH = 2  # motions after which a witness is met again

@@ -14,7 +14,7 @@ from specshield.errors import SampleError
 from specshield.robot.dynamics import simulate
 from specshield.shield.decision import Shield
 from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Implies, Until, robustness
-from specshield.stl.fragment import is_predicate
+from specshield.stl.conjunction import is_predicate
 
 
 def samples_of(

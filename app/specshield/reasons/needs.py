@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from specshield.stl import Always, And, Eventually, Formula, Implies, Not, Or, Until
-from specshield.stl.fragment import is_predicate
+from specshield.stl.conjunction import is_predicate
 
 MOST_ALTERNATIVES = 32  # with more, nothing is needed: each would have to be refuted by itself
 MOST_INSTANTS = 8  # steps of a G at which an F below it is asked for

@@ -7,6 +7,8 @@ that evaluates predicates fills it here, so that the places mean the same to all
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from specshield.arrays import Floats
@@ -31,6 +33,14 @@ def regions_of(task: Task) -> PackedRegions:
 def initial_signals(task: Task) -> Floats:
     """The values that the signals hold before their first samples, shape (S,)."""
     return np.array(list(task.signals.values()), np.float64)
+
+
+def signal_rows(task: Task, signals: Mapping[str, Floats], n: int) -> Floats:
+    """The signals' first n samples in the order of the task, shape (n, S). signals {name: [..n]}."""
+    rows = np.empty((n, len(task.signals)))
+    for i, name in enumerate(task.signals):
+        rows[:, i] = task.signal(name, signals, n)
+    return rows
 
 
 @inlined

@@ -21,12 +21,13 @@ from specshield.service.bounds import body
 from specshield.service.bounds.bodies import Bodies
 from specshield.service.bounds.protocol import raise_file_limit
 from specshield.service.description import TAGS, described
-from specshield.service.drain import drain_at_sigterm
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.leaving import drain_at_sigterm
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
-from specshield.service.middleware import Guard, Observe
+from specshield.service.middleware.guard import Guard
+from specshield.service.middleware.observe import Observe
 from specshield.service.routes import events, maps, pictures, policies, robots, sessions, specs, system
 from specshield.service.routes.steps import StepRoute
 from specshield.service.routes.stream import StreamRoute
@@ -41,7 +42,7 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
 from specshield.service.storage.marker import check_files
 from specshield.service.storage.objects import open_objects
-from specshield.service.training.children import TrainingWorker, tend, wants_worker
+from specshield.service.training.children import TrainingWorker, tend
 from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
@@ -115,7 +116,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     claims = Claims(lambda: jobs.redis, settings)
     library = Maps(settings, claims)
     known = Policies(settings, library, claims)
-    worker = TrainingWorker(settings) if wants_worker(settings) else None
+    trains = settings.redis_url is None if settings.worker is None else settings.worker
+    worker = TrainingWorker(settings) if trains else None
     heavy, startup = Heavy(settings), Startup()
 
     def check() -> None:

@@ -9,6 +9,7 @@ from fastapi import Depends, Query, Request
 
 from specshield.service.access.keys import Keys
 from specshield.service.heavy.heavy import Heavy
+from specshield.service.leaving import Streams
 from specshield.service.library.claims import Claims
 from specshield.service.library.files import Recent
 from specshield.service.library.maps import Maps
@@ -17,13 +18,13 @@ from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
 from specshield.service.startup import Startup
 from specshield.service.storage.store import Store
-from specshield.service.streams import Streams
 from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import Jobs
 from specshield.service.watch.events import Watchers
 from specshield.service.watch.gauges import Gauges
 
 PICTURES = 32  # kept in memory, of 5 to 500 kB each
+TOO_MUCH = {"_503": "`busy`: too much is asked of the server just now; ask again after `Retry-After`."}
 
 
 @dataclass

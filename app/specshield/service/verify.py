@@ -102,8 +102,9 @@ def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, 
                 again, following = projected, other
         carry = following
         if record.encode(again) != content:
-            names = StepRecord.__struct_fields__
-            yield t, [name for name in names if _differ(getattr(again, name), getattr(kept, name))]
+            made_now, found_there = msgspec.structs.asdict(again), msgspec.structs.asdict(kept)
+            packed = msgspec.msgpack.encode
+            yield t, [name for name in made_now if packed(made_now[name]) != packed(found_there[name])]
 
 
 def _again(
@@ -127,10 +128,6 @@ def _again(
         kept.explain, kept.tables,
     )  # fmt: skip
     return made, pack_carry(decision.carry).unpacked()
-
-
-def _differ(a: object, b: object) -> bool:
-    return msgspec.msgpack.encode(a) != msgspec.msgpack.encode(b)
 
 
 def _shields(found: Chain, settings: Settings) -> list[Shield]:

@@ -24,13 +24,13 @@ from numba.core.compiler import Flags
 from specshield.policy.dqn.network import make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
+from specshield.policy.progress import make_rules
 from specshield.policy.reachability.around.field import distances, goal_cells
 from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, motion_count
-from specshield.rule.progress import make_rules
 from specshield.service.sessions import record
 from specshield.shield import episode
 from specshield.shield.decision import Config, make_shield

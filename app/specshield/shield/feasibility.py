@@ -17,7 +17,7 @@ from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import inlined, kernel
 from specshield.quick import quick
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
-from specshield.rule.progress import signal_rows
+from specshield.rule.values import signal_rows
 from specshield.rule.view import View, look, rate, read_step, recall_prefix, value_count, view_of
 from specshield.shield.proposal import Proposer, ask
 from specshield.stl import SATISFIED_ABOVE, Formula, robustness_bounds

@@ -14,11 +14,9 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.errors import NotFound
 from specshield.policy.geodesic import geodesic_distance
-from specshield.policy.methods import load_policy
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import Body, make_body
-from specshield.shield.proposal import Proposer
-from specshield.shipped import MAPS, MODELS
+from specshield.shipped import MAPS
 from specshield.task import Task, make_task
 from specshield.world.map_server import load_map
 from specshield.world.regions import Region, region_from_json
@@ -55,23 +53,6 @@ class Case:
 
 def case_names(folder: Path = MAPS) -> list[str]:
     return sorted(path.name.removesuffix(".regions.json") for path in folder.glob("*.regions.json"))
-
-
-def shipped(case: Case, method: str) -> Proposer:
-    """The policy that came for a case: `models/<case>` is computed, `models/<case>-dqn` is learned.
-
-    Raises NotFound where there is none.
-    """
-    folder = MODELS / (case.name if method == "reachability" else f"{case.name}-{method}")
-    if not (folder / "card.json").is_file():
-        raise NotFound(
-            f"no policy came for {case.name}",
-            path="method",
-            got=method,
-            expected=f"a folder {folder.name} in models/",
-        )
-    card = json.loads((folder / "card.json").read_text())
-    return load_policy(folder / "policy.safetensors", card, case.task)
 
 
 def case_name(said: str) -> str:

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from specshield.drawing import colors
+from specshield.policy.progress.obligations import obligations
 from specshield.sim import canvas
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode
 from specshield.sim.robot import Pose
-from specshield.stl import SATISFIED_ABOVE, obligations, region_named, robustness
+from specshield.stl import SATISFIED_ABOVE, region_named, robustness
 from specshield.world.regions import signed_distance
 
 SCALE = 110  # pixels a metre

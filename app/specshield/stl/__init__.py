@@ -1,5 +1,6 @@
-"""Signal Temporal Logic over discrete time: text, robustness, bounds on prefixes, the synthesis fragment."""
+"""Signal Temporal Logic over discrete time: text, robustness, bounds on prefixes, conjunctions."""
 
+from specshield.stl.conjunction import conjuncts
 from specshield.stl.formula import (
     BODY_WORDS,
     Abs,
@@ -23,13 +24,12 @@ from specshield.stl.formula import (
     is_name,
     region_named,
 )
-from specshield.stl.fragment import Obligation, conjuncts, obligations
 from specshield.stl.parser import parse
 from specshield.stl.robustness import SATISFIED_ABOVE, Verdict, robustness, robustness_bounds, verdict
 
 __all__ = [
     "BODY_WORDS", "SATISFIED_ABOVE", "Abs", "Always", "And", "Arithmetic", "Atom", "Comparison",
-    "Eventually", "Formula", "Implies", "Name", "Neg", "Node", "Not", "Number", "Obligation", "Or", "Term",
-    "Until", "Verdict", "body_name", "conjuncts", "is_name", "obligations", "parse", "region_named",
+    "Eventually", "Formula", "Implies", "Name", "Neg", "Node", "Not", "Number", "Or", "Term",
+    "Until", "Verdict", "body_name", "conjuncts", "is_name", "parse", "region_named",
     "robustness", "robustness_bounds", "verdict",
 ]  # fmt: skip

@@ -78,19 +78,9 @@ def unseen_bounds(formula: Formula) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def verdict(formula: Formula, prefix: Mapping[str, ArrayLike], margin: float = SATISFIED_ABOVE) -> Verdict:
-    """Whether the prefix of one trajectory, samples [n], decides that rho > margin.
-
-    A verdict other than "pending" is the verdict on every continuation too.
-    """
-    lo, hi = robustness_bounds(formula, prefix)
-    if lo.ndim:
-        raise SampleError(
-            "a verdict is about one trajectory, not a batch",
-            got=list(lo.shape),
-            expected="samples of shape [n]",
-        )
-    return "satisfied" if lo > margin else "violated" if hi <= margin else "pending"
+def verdict(low: float, high: float) -> Verdict:
+    """What bounds on rho say of the formula. Unless it is "pending", every continuation has this verdict."""
+    return "satisfied" if low > SATISFIED_ABOVE else "violated" if high <= SATISFIED_ABOVE else "pending"
 
 
 @dataclass(frozen=True)

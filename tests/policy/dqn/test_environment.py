@@ -8,9 +8,9 @@ import pytest
 from specshield.errors import MapError
 from specshield.policy.dqn.environment import Environment, begin_episode, free_poses
 from specshield.policy.dqn.scene import make_scene
+from specshield.policy.progress import ALWAYS, BROKEN, PENDING, SETTLED
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import in_collision, make_body, step
-from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.policy.rooms import CRAWLER, CUSTOM, corridor, flat, in_state

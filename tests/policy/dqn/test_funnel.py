@@ -10,7 +10,7 @@ import pytest
 
 from specshield.policy.dqn.funnel import decay_rate, gamma, make_funnels, reward
 from specshield.policy.dqn.scene import make_scene
-from specshield.rule.progress import BROKEN, PENDING, SETTLED
+from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from tests.policy.rooms import corridor, flat, in_state
 
 FORMULA = "F[10,20] West and G[0,44] not Hole and F[4,8] G[2,6] East"

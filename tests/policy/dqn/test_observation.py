@@ -10,8 +10,8 @@ import pytest
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.dqn.observation import PER_MOTION, arrive, observation_size, observe, outcome
 from specshield.policy.dqn.scene import make_scene
+from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from specshield.robot import STRETCH
-from specshield.rule.progress import BROKEN, PENDING, SETTLED
 from tests.policy.rooms import CUSTOM, corridor, flat, in_state
 
 HALF = math.sqrt(0.5)

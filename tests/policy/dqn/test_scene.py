@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from specshield.policy.dqn.scene import current_goal, distance_to, make_scene, predicates_at
-from specshield.rule.progress import BROKEN, PENDING, SETTLED
+from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from tests.policy.rooms import REGIONS, corridor, flat
 
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from specshield.policy.progress import make_rules
 from specshield.policy.reachability.guide import Guide
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import make_body
-from specshield.rule.progress import make_rules
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import CELL, ROBOT, WAIT

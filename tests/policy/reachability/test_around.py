@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from specshield.policy.heap import Heap
+from specshield.policy.progress import PENDING, SETTLED, make_rules
 from specshield.policy.reachability.around.field import distances, goal_cells, spare_on
 from specshield.policy.reachability.around.search import Tree, _slot_of
 from specshield.policy.reachability.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.barred import in_vain
 from specshield.robot.dynamics import make_body, simulate
-from specshield.rule.progress import PENDING, SETTLED, make_rules
 from specshield.stl import robustness
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid

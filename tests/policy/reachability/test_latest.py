@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.policy.lattice import NO_TIME, holds_at, make_lattice
+from specshield.policy.progress import ALWAYS, make_rules
 from specshield.policy.reachability.latest import Phase, latest_times, masks_of, phases_of
 from specshield.robot.dynamics import make_body
-from specshield.rule.progress import ALWAYS, make_rules
 from tests.oracles.cells import CELL
 from tests.policy.reachability.corridor import EAST, NORTH, SOUTH, WEST, make_corridor
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.policy.lattice import holds_at, make_lattice
+from specshield.policy.progress import make_rules
 from specshield.policy.reachability.stepwise import (
     BROKEN_STATE,
     digits_of,
@@ -13,7 +14,6 @@ from specshield.policy.reachability.stepwise import (
     transitions,
 )
 from specshield.robot.dynamics import make_body
-from specshield.rule.progress import make_rules
 from tests.oracles.cells import CELL
 from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, make_corridor
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from specshield.policy.lattice import STEP_CODES, Corners
+from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from specshield.policy.reachability.beam import beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise
@@ -13,7 +14,6 @@ from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
 from specshield.robot.dynamics import motion_count
-from specshield.rule.progress import BROKEN, PENDING, SETTLED
 from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, WAIT
 from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, WEST, guide_of, make_corridor, pose
 

@@ -26,8 +26,8 @@ from specshield.policy.dqn.observation import (
     place,
 )
 from specshield.policy.dqn.scene import Scene, make_scene, predicates_at
+from specshield.policy.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, advance
 from specshield.robot.dynamics import Body, in_collision, motion_count, successors
-from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, advance
 from specshield.task import Task
 
 FROM_THE_START = 0.5  # share of the episodes that begin at t = 0; chosen by hand, nothing was measured

@@ -27,7 +27,7 @@ from specshield.arrays import Floats, Ints
 from specshield.compiled import leaf
 from specshield.policy.dqn.observation import State
 from specshield.policy.dqn.scene import Scene, current_goal, distance_to
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 
 # Chosen by hand; nothing was measured.
 CAP = 0.15  # [m] robustness of an `always` beyond which more is no better, and rho_max inside a goal

@@ -45,7 +45,7 @@ class Settings:
 
 
 def _check(task: Task, options: Settings) -> None:
-    from specshield.rule.progress import make_rules
+    from specshield.policy.progress import make_rules
 
     make_rules(task)
     if task.horizon < 1:

@@ -10,8 +10,7 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.dqn.scene import Scene, between, blend, current_goal, distance_to
-from specshield.robot.dynamics import Body, displacement, motion_count
-from specshield.rule.progress import (
+from specshield.policy.progress import (
     ALWAYS,
     BROKEN,
     EVENTUALLY_ALWAYS,
@@ -23,6 +22,7 @@ from specshield.rule.progress import (
     read_predicates,
     value_count,
 )
+from specshield.robot.dynamics import Body, displacement, motion_count
 from specshield.rule.values import fill_pose, fill_region
 from specshield.stl.program import evaluate_packed
 

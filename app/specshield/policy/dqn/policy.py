@@ -11,22 +11,23 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Floats, Ints
-from specshield.policy.card import Card
+from specshield.policy.card import Card, Carded
 from specshield.policy.dqn.network import Network, make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.rollout import propose_all
 from specshield.policy.dqn.scene import Scene, make_scene
-from specshield.policy.recall import pasts
+from specshield.policy.progress import make_rules
+from specshield.policy.progress.recall import pasts
 from specshield.policy.tensors import read_tensors
 from specshield.policy.undo import undoing_motions
 from specshield.robot.dynamics import Body, make_body, motion_count
-from specshield.rule.progress import make_rules, signal_rows
+from specshield.rule.values import signal_rows
 from specshield.shield.proposal import Proposal, joined
 from specshield.task import Task
 
 
 @dataclass(frozen=True, eq=False)
-class Policy:
+class Policy(Carded):
     """The greedy policy of a Q-network, pi_phi(x, t) = argmax_a Q(x, a, t), which also sees the progress.
 
     After the motion that it prefers, it proposes its own rollout. After another motion it proposes to undo
@@ -34,14 +35,8 @@ class Policy:
     literal: its own rollout after every motion, as in the paper, which is slower, and J is 1 less often.
     """
 
-    task: Task
-    card: Card
     network: Network
     literal: bool = False
-
-    @property
-    def id(self) -> str:
-        return str(self.card["id"])
 
     @cached_property
     def scene(self) -> Scene:

@@ -10,9 +10,9 @@ from specshield.policy.detour import copy_way, find_sibling, find_twins, join
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
 from specshield.policy.dqn.observation import State, arrive, make_state, observe, outcome, place
 from specshield.policy.dqn.scene import Scene
-from specshield.policy.recall import recall
+from specshield.policy.progress import BROKEN, PENDING, SETTLED, Rules, advance
+from specshield.policy.progress.recall import recall
 from specshield.robot.dynamics import motion_count, step, successors
-from specshield.rule.progress import BROKEN, PENDING, SETTLED, Rules, advance
 
 
 @leaf

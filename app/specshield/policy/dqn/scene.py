@@ -14,8 +14,8 @@ from scipy import ndimage
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
 from specshield.policy.geodesic import geodesic_distance
+from specshield.policy.progress import ALWAYS, PENDING, STACK, Rules, make_rules, read_predicates, value_count
 from specshield.robot.dynamics import Body, longest_motions, make_body
-from specshield.rule.progress import ALWAYS, PENDING, STACK, Rules, make_rules, read_predicates, value_count
 from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import VALUE
 from specshield.task import Task
@@ -43,7 +43,7 @@ class Scene(NamedTuple):
 
 
 def make_scene(task: Task) -> Scene:
-    """Prepares a task once. Raises FragmentError for a formula outside the fragment of stl/fragment.py."""
+    """Prepares a task once. Raises FragmentError as `obligations` does."""
     grid, body, rules = task.grid, make_body(task.robot, task.grid), make_rules(task)
     poses = np.insert(grid.centres.reshape(-1, 2), 2, 0.0, axis=1)
     holds = predicates_at(rules, poses).reshape(grid.height, grid.width, -1) > rules.margin

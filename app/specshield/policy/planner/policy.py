@@ -30,7 +30,7 @@ from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Bools, Codes, Floats, Int32s
 from specshield.errors import PolicyError
-from specshield.policy.card import Card, make_card
+from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch
 from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of
 from specshield.policy.options import options_to_json, read_options
@@ -40,14 +40,13 @@ from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
+from specshield.policy.progress.recall import residuals
 from specshield.policy.reachability.sight import BESIDE, about
-from specshield.policy.recall import residuals
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
+from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turns_in_place
-from specshield.rule.progress import signal_rows
-from specshield.rule.residual import bounds_after, still_open
-from specshield.rule.values import REGIONS, initial_signals, places, regions_of
+from specshield.rule.values import REGIONS, initial_signals, places, regions_of, signal_rows
 from specshield.rule.view import look
 from specshield.rule.worst import worst_signals
 from specshield.shield.proposal import Proposal, joined
@@ -67,7 +66,7 @@ FIELDS_SHARE = 0.3  # of the time that making a policy takes, about
 
 
 @dataclass(frozen=True, eq=False)
-class PlannerPolicy:
+class PlannerPolicy(Carded):
     """Plans at every decision.
 
     chosen [L, 2]: of each literal of the formula, which field leads to it freely, and which keeps to what has
@@ -75,20 +74,10 @@ class PlannerPolicy:
     values.
     """
 
-    task: Task
-    card: Card
     settings: Settings
     fields: Fields
     chosen: Int32s
     foreseen: Floats | None = None
-
-    @property
-    def id(self) -> str:
-        return str(self.card["id"])
-
-    @cached_property
-    def _body(self) -> Body:
-        return make_body(self.task.robot, self.task.grid)
 
     @cached_property
     def _world(self) -> World:

@@ -14,10 +14,10 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import reads_heading
+from specshield.policy.progress import advance
 from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, read_due
 from specshield.policy.reachability.tables import SAFE, UNKNOWN, is_broken, score, slack_at
 from specshield.robot.dynamics import around, motion_count, step_from
-from specshield.rule.progress import advance
 
 MAX_ROOTS = 62  # bits of a tag, which is an int64
 

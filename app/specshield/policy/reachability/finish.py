@@ -16,10 +16,10 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Int8s, Int32s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.heap import Heap, pop, push
+from specshield.policy.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, predicate_at, read_due
 from specshield.policy.reachability.tables import is_broken, slack
 from specshield.robot.dynamics import around, motion_count, step_from
-from specshield.rule.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 
 # Chosen by hand; python -m benchmarks.narrow measures what they find.
 NEAR = 6.0  # [steps] from where the slack is highest: nearer than this, poses are told apart by the grain

@@ -9,10 +9,10 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
 from specshield.policy.lattice import Corners
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
+from specshield.policy.progress.recall import recall
 from specshield.policy.reachability.tables import Tables, goals_settled, slack
-from specshield.policy.recall import recall
 from specshield.robot.dynamics import Body
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
 from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
 from specshield.stl.program import VALUE, evaluate_packed
 

@@ -23,8 +23,8 @@ import numpy as np
 from specshield.arrays import Bytes, Codes, Int32s, Ints, Singles
 from specshield.compiled import kernel
 from specshield.policy.lattice import INVALID, NO_TIME, STEP_CODES, Lattice, bilinear, number_cells
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 from specshield.policy.reachability.tables import Tables
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
 SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged (chosen by hand)
 MAX_SWEEPS = 100_000  # far more than any map needs; it only bounds the loop

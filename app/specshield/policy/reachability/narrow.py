@@ -12,6 +12,8 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_way, find_twins
+from specshield.policy.progress import SETTLED
+from specshield.policy.progress.recall import forgive, recall
 from specshield.policy.reachability.finish import Search, finish
 from specshield.policy.reachability.guide import (
     Guide,
@@ -21,13 +23,10 @@ from specshield.policy.reachability.guide import (
     make_scratch,
     update_progress,
 )
-from specshield.policy.reachability.search import Starts, _by_slack, _first_steps, _join, _some_in_time
+from specshield.policy.reachability.search import Starts, _by_slack, _first_steps, _join, _some_in_time, _take
 from specshield.policy.reachability.tables import HOPELESS, is_broken, slack
 from specshield.policy.reachability.walk import CLIMB_GAIN, SETTLED_ALL, STUCK, climb, rejoin
-from specshield.policy.recall import forgive, recall
 from specshield.policy.undo import IMPOSSIBLE
-from specshield.robot.dynamics import step
-from specshield.rule.progress import SETTLED
 
 # Searches for one way, each tried where those before it failed. Columns: how many steps before the robot is
 # near it begins, how many poses it makes, what they are told apart by [m], and the least slack that they may
@@ -138,11 +137,7 @@ def _go(
                 break
         if taken == 0:
             return False
-        for _ in range(taken):
-            x, y, theta = step(guide.body, poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2], motions[n])
-            poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
-            n += 1
-            update_progress(guide.rules, t + n, x, y, theta, scratch)
+        n = _take(guide, t, n, motions[n : n + taken], motions, poses, scratch)
     return False
 
 

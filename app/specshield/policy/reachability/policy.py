@@ -12,33 +12,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from safetensors.numpy import save as save_tensors
 
-from specshield.arrays import Bools, Floats, Int32s
+from specshield.arrays import Bools, Floats
 from specshield.errors import MapError, PolicyError
-from specshield.policy.card import Card, make_card
+from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
+from specshield.policy.progress import ALWAYS, Rules, make_rules
+from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import HURRIED, Guide, hurried, share_with_slack
-from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of, time_tables
+from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of
 from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.narrow import AFTER, FIRST, ON, continue_narrow
 from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.sight import look_closely
 from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, state_count, step_tables
+from specshield.policy.reachability.stored import read_tables, stored
 from specshield.policy.reachability.tables import Tables
-from specshield.policy.recall import pasts
-from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
-from specshield.policy.tensors import named_arrays, read_tensors
+from specshield.policy.shape import lattice_shape
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, make_body, simulate
-from specshield.rule.progress import ALWAYS, Rules, make_rules, signal_rows
-from specshield.rule.values import initial_signals
+from specshield.rule.values import initial_signals, signal_rows
 from specshield.rule.view import look, rate, view_of
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE
@@ -52,14 +50,12 @@ FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs n
 
 
 @dataclass(frozen=True, eq=False)
-class ReachabilityPolicy:
+class ReachabilityPolicy(Carded):
     """Proposes what the tables (tables.py) lead to (search.py).
 
     narrow [K]: the obligations whose predicates the lattice can hardly see (sight.py).
     """
 
-    task: Task
-    card: Card
     settings: Settings
     tables: Tables
     narrow: Bools
@@ -68,14 +64,6 @@ class ReachabilityPolicy:
     barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
     early: int = 0  # [steps] as `hurried` has it
     wanted: Bools | None = None  # [M] the first motions to propose ways after; None: all of them
-
-    @property
-    def id(self) -> str:
-        return str(self.card["id"])
-
-    @cached_property
-    def _body(self) -> Body:
-        return make_body(self.task.robot, self.task.grid)
 
     @cached_property
     def _rules(self) -> Rules:
@@ -184,13 +172,7 @@ class ReachabilityPolicy:
 
     def weights(self) -> bytes:
         """The safetensors file."""
-        names = ("cell", "bits") if len(self.tables.bits) else ("cell", "code", "table")
-        tensors: dict[str, NDArray[Any]] = {name: getattr(self.tables, name) for name in names}
-        if self.narrow.any():
-            tensors["narrow"] = self.narrow.astype(np.uint8)
-        if self.tables.pitch > self.settings.pitch:
-            tensors["pitch"] = np.array([self.tables.pitch])
-        return save_tensors(tensors)
+        return stored(self.tables, self.narrow, self.settings.pitch)
 
     def feasible_start(self) -> float:
         """The share of poses drawn over free space (the same each time) from which the rule can be kept.
@@ -257,72 +239,8 @@ def synthesise(
 def load_reachability(weights: bytes | Path, card: Card, task: Task) -> ReachabilityPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_options(Settings, card.get("options", {}))
-    rules = make_rules(task)
-    goals, tensors = np.flatnonzero(rules.kind != ALWAYS), read_tensors(weights)
-    narrow = _narrow_of(tensors.pop("narrow", None), len(rules.kind))
-    pitch = _pitch_of(tensors, task, settings)
-    if task.robot.wait_motion < 0:
-        cell, bits = named_arrays(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
-        headings = _checked_headings(bits.shape[2])
-        size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
-        _check_fit(cell, side_of(task.grid, pitch), bits.shape[1], bits.shape == size, f"bits {list(size)}")
-        tables = step_tables(rules, task.horizon, cell, bits, pitch)
-        return ReachabilityPolicy(task, card, settings, tables, narrow)
-    cell, code, table = named_arrays(
-        tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
-    )
-    phases, headings = phases_of(rules, task.horizon), _checked_headings(code.shape[2])
-    fits = table.shape == (len(phases), 1 << len(goals)) and table.min() >= -1 and table.max() < code.shape[0]
-    wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {1 << len(goals)}]"
-    _check_fit(cell, side_of(task.grid, pitch), code.shape[1], fits, wanted)
-    tables = time_tables(rules, goals, phases, cell, code, table, pitch)
+    tables, narrow = read_tables(weights, task, settings.pitch)
     return ReachabilityPolicy(task, card, settings, tables, narrow)
-
-
-def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, settings: Settings) -> float:
-    """The lattice's pitch [m]: one that had to grow is in the file, the others go by the number of cells."""
-    kept, cell = tensors.pop("pitch", None), tensors.get("cell")
-    if kept is not None:
-        found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
-        if not settings.pitch <= found <= COARSEST * settings.pitch:
-            raise PolicyError(
-                "the array 'pitch' is of another kind", path="weights.pitch", got=found,
-                expected=f"float64, one number from {settings.pitch:g} to {COARSEST * settings.pitch:g}",
-            )  # fmt: skip
-        return found
-    fine = settings.pitch / 3.0
-    return fine if cell is not None and cell.shape == side_of(task.grid, fine) else settings.pitch
-
-
-def _checked_headings(headings: int) -> int:
-    if not 4 <= headings <= MAX_HEADINGS:
-        raise PolicyError(
-            "the tables do not fit the task", path="weights", got=f"{headings} headings",
-            expected=f"4 to {MAX_HEADINGS} headings",
-        )  # fmt: skip
-    return headings
-
-
-def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
-    """The obligations that a file names as narrow. Files of rules without any do not have the tensor."""
-    if tensor is None:
-        return np.zeros(count, np.bool_)
-    if tensor.dtype != np.uint8 or tensor.shape != (count,):
-        raise PolicyError(
-            "the array 'narrow' is of another kind", path="weights.narrow",
-            got=f"{tensor.dtype} {list(tensor.shape)}", expected=f"uint8 [{count}]",
-        )  # fmt: skip
-    narrow: Bools = tensor == 1
-    return narrow
-
-
-def _check_fit(cell: Int32s, shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
-    if not fits or cell.shape != shape or cell.min(initial=-1) < -1 or cell.max(initial=-1) >= rows:
-        raise PolicyError(
-            "the tables do not fit the task", path="weights",
-            got=f"cell {list(cell.shape)} and tables of {rows} cells",
-            expected=f"cell {list(shape)}, {wanted}",
-        )  # fmt: skip
 
 
 def check(task: Task, settings: Settings) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_way, find_sibling, find_twins
+from specshield.policy.progress.recall import forgive, recall
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search
 from specshield.policy.reachability.guide import (
     Guide,
@@ -27,7 +28,6 @@ from specshield.policy.reachability.guide import (
 )
 from specshield.policy.reachability.tables import HOPELESS, SAFE, goals_settled, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
-from specshield.policy.recall import forgive, recall
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
 from specshield.robot.dynamics import displacement, simulate, step
 

@@ -17,8 +17,8 @@ from scipy.ndimage import maximum_filter1d
 from specshield.arrays import Bools, Bytes, Floats
 from specshield.compiled import kernel
 from specshield.policy.lattice import Lattice, pose_of
+from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, value_count
 from specshield.robot.dynamics import Body
-from specshield.rule.progress import ALWAYS, STACK, Rules, read_predicates, value_count
 from specshield.rule.values import HEADING, REGIONS, region_count
 from specshield.stl.program import VALUE
 

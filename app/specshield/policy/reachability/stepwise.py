@@ -24,9 +24,9 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Floats, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import Lattice, corner
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 from specshield.policy.reachability.sight import cells_about
 from specshield.policy.reachability.tables import Tables
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
 
 MAX_BYTES = 100_000_000  # of the tables
 BROKEN_STATE = -1

@@ -18,8 +18,8 @@ from specshield.policy.lattice import (
     leads_back,
     read_corners,
 )
+from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 from specshield.robot.dynamics import Body, displacement
-from specshield.rule.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
 SAFE = 1e6  # in place of a slack [steps], where nothing is left to do

@@ -12,6 +12,7 @@ from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import SHORTEST_MOVE
+from specshield.policy.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 from specshield.policy.reachability.guide import (
     Guide,
     Scratch,
@@ -25,7 +26,6 @@ from specshield.policy.reachability.guide import (
 from specshield.policy.reachability.tables import HOPELESS, goals_settled, is_broken, score, slack
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import step
-from specshield.rule.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 
 # Chosen by hand; nothing measured.
 STUCK_AFTER = 5  # [steps] without a gain after which a climb is taken to go round in a circle

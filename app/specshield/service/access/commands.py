@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import aclosing
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
@@ -51,8 +52,8 @@ def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = 
     """What the action answers, with the store open meanwhile. Raises StoreError."""
     from specshield.service.access.keys import Keys
     from specshield.service.settings import read_settings
+    from specshield.service.storage.connect import connect
     from specshield.service.storage.embedded import EmbeddedStore
-    from specshield.service.storage.store import Store
 
     settings = settings or read_settings()
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
@@ -61,11 +62,8 @@ def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = 
     url = embedded.url if embedded is not None else str(settings.redis_url)
 
     async def act() -> R:
-        store = Store(url, settings.store_timeout, settings.session_ttl)
-        try:
-            return await action(Keys(store.redis))
-        finally:
-            await store.aclose()
+        async with aclosing(connect(url, socket_timeout=settings.store_timeout)) as store:
+            return await action(Keys(store))
 
     try:
         return asyncio.run(act())

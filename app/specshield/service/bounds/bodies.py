@@ -15,8 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from specshield.errors import BodyTooLarge, InputError, RequestTimeout, SpecshieldError
 from specshield.service import problems
 from specshield.service.access.site import UPLOADS
-from specshield.service.bounds.body import FREE, Body
-from specshield.service.bounds.budget import Budget
+from specshield.service.bounds.body import FREE, Body, Budget
 from specshield.service.bounds.protocol import ARRIVED
 from specshield.service.problems import CLIENT_GONE
 from specshield.service.settings import Settings

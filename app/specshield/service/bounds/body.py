@@ -1,4 +1,6 @@
-"""One request's body as it comes in: in memory while it is small, in a file beyond that."""
+"""One request's body as it comes in: in memory while it is small, in a file beyond that. What all of them
+together may hold is bounded.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,31 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from specshield.service.bounds.budget import Budget
+from starlette.requests import Request
+
+from specshield.errors import Busy
 
 FREE = 64 << 10  # [bytes] of each body that no budget counts: a step fits, whatever others send
 IN_MEMORY = 1 << 20  # [bytes] of a body that are held in memory before they go to its file
+
+
+class Budget:
+    """Bytes that requests may hold at once, all of them together."""
+
+    def __init__(self, limit: int) -> None:
+        self._left = limit
+
+    def take(self, size: int) -> None:
+        """Raises Busy where there is no room for so many bytes."""
+        if size > self._left:
+            raise Busy(
+                "the server holds as many bytes of requests as it may",
+                expected="the request again, in a while",
+            )
+        self._left -= size
+
+    def give(self, size: int) -> None:
+        self._left += size
 
 
 @dataclass
@@ -61,6 +84,12 @@ class Body:
         if self.path is not None:
             with contextlib.suppress(OSError):
                 self.path.unlink()
+
+
+def received(request: Request) -> Body:
+    """The body of an upload, which bodies.py has taken in."""
+    body: Body = request.scope["state"]["body"]
+    return body
 
 
 def clear(folder: Path) -> None:

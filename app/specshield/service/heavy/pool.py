@@ -141,10 +141,12 @@ class Pool:
             raise _too_expensive("the process that worked on it ended") from None
         finally:
             child.key, child.since = key, time.monotonic()
-            if keep:
-                self._put_back(child)
-            else:
+            if not keep:
                 self._let_go(child)
+            else:
+                self._idle.append(child)
+                if self._sweeping is None:
+                    self._sweeping = asyncio.get_running_loop().call_later(self._idle_for, self._sweep)
         if isinstance(error, MemoryError):
             raise _too_expensive(f"it took more than {self._memory >> 20} MiB")
         if error is not None:
@@ -189,11 +191,6 @@ class Pool:
         except BaseException:
             writer.close()
             raise
-
-    def _put_back(self, child: _Child) -> None:
-        self._idle.append(child)
-        if self._sweeping is None:
-            self._sweeping = asyncio.get_running_loop().call_later(self._idle_for, self._sweep)
 
     def _let_go(self, child: _Child) -> None:
         child.kill()

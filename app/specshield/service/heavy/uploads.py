@@ -24,6 +24,7 @@ from specshield.drawing.windows import windows
 from specshield.errors import BodyTooLarge, FormulaError, FragmentError, InputError, PolicyError
 from specshield.policy.methods import METHODS
 from specshield.policy.options import options_to_json, read_options
+from specshield.policy.progress.obligations import obligations
 from specshield.service.access.keys import Key
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
@@ -174,7 +175,7 @@ def explain(maps: Maps, settings: Settings, content: bytes, owner: str) -> dict[
 
 def _methods(formula: stl.Formula) -> list[str]:
     try:
-        stl.obligations(formula)
+        obligations(formula)
     except FragmentError:
         return ["planner"]
     return ["dqn", "planner", "reachability"]

@@ -25,7 +25,7 @@ from specshield.errors import (
     NotFound,
     StoreError,
 )
-from specshield.service.access.keys import Key
+from specshield.service.access.keys import OPEN, Key
 from specshield.service.library import files
 from specshield.service.settings import Settings
 from specshield.service.storage.connect import FAILURES
@@ -199,8 +199,20 @@ class Claims:
 class Claimed:
     """What maps and policies share. claims: whose they are; needed to find, add and delete."""
 
-    def __init__(self, kind: str, claims: Claims | None) -> None:
-        self._kind, self._given = kind, claims
+    def __init__(self, kind: str, claims: Claims | None, settings: Settings) -> None:
+        self._kind, self._given, self._folder = kind, claims, files.kept(settings, kind)
+
+    def adopt(self) -> None:
+        """Gives what nobody has, of a time before owners, to the owner without a name."""
+        for id in files.ids(self._folder):
+            if self._claims.unowned(self._kind, id):
+                size = files.weight_of(self._folder / id)
+                with self._claims.adding(self._kind, id, OPEN, size, self._map_of(id)):
+                    pass
+
+    def _map_of(self, id: str) -> str:
+        """Of a policy the map, as `Claims.adding` takes it."""
+        return ""
 
     @property
     def _claims(self) -> Claims:
@@ -214,6 +226,12 @@ class Claimed:
 
 def _key(*parts: str) -> str:
     return ":".join(("specshield:{library}", *parts))
+
+
+def missing(kind: str, key: str) -> NotFound:
+    what = "map" if kind == "maps" else "policy"
+    expected = f"an id or name from /v1/{kind}"
+    return NotFound(f"there is no {what} {key!r}", path=f"{what}_id", got=key, expected=expected)
 
 
 def taken(name: str, id: str) -> NameTaken:

@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 from specshield.errors import InputError, InsufficientStorage
 from specshield.service.library.mirror import Mirror
 from specshield.service.settings import Settings
-from specshield.service.storage.objects import open_objects
+from specshield.service.storage.objects import open_objects, sync, write_through
 
 HASH = re.compile(r"[0-9a-f]{64}")
 PAGE_BYTES = 256 << 10  # chosen by hand: read and shown in a few ms
@@ -101,9 +101,9 @@ def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".draft-"))
     try:
         for name, content in files.items():
-            _write(draft / name, content)
+            write_through(draft / name, content)
         os.rename(draft, folder)
-        _sync(folder.parent)
+        sync(folder.parent)
     except OSError:
         if not folder.is_dir():
             raise
@@ -133,9 +133,9 @@ def write_file(path: Path, content: bytes) -> None:
 
 def _write_file(path: Path, content: bytes) -> None:
     draft = path.with_name(f".draft-{path.name}")
-    _write(draft, content)
+    write_through(draft, content)
     os.replace(draft, path)
-    _sync(path.parent)
+    sync(path.parent)
 
 
 def remove_folder(folder: Path) -> None:
@@ -239,18 +239,3 @@ class Recent(Generic[V]):
     def drop(self, key: Hashable) -> None:
         with self._lock:
             self._used -= self._values.pop(key, (None, 0))[1]
-
-
-def _write(path: Path, content: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

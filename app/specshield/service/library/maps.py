@@ -19,9 +19,9 @@ from typing import Any
 from PIL import Image
 
 from specshield.errors import InUse, MapError, NotFound, SpecshieldError
-from specshield.service.access.keys import OPEN, Key
+from specshield.service.access.keys import Key
 from specshield.service.library import files
-from specshield.service.library.claims import Claimed, Claims
+from specshield.service.library.claims import Claimed, Claims, missing
 from specshield.service.settings import Settings
 from specshield.task import parse_regions
 from specshield.world.map_server import dump_map, load_map
@@ -62,8 +62,7 @@ class Maps(Claimed):
     """The calls block: they read and write files."""
 
     def __init__(self, settings: Settings, claims: Claims | None = None) -> None:
-        super().__init__("maps", claims)
-        self._folder = files.kept(settings, "maps")
+        super().__init__("maps", claims, settings)
         self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
         self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
@@ -75,7 +74,7 @@ class Maps(Claimed):
             return found
         if files.HASH.fullmatch(key) and files.there(self._folder / key):
             return self._recent.get(key, lambda: self._read(key))
-        raise _missing(key)
+        raise missing("maps", key)
 
     def shipped(self, key: str) -> Map | None:
         """One that came with the server, by its id, its name, or the hash of its grid."""
@@ -99,7 +98,7 @@ class Maps(Claimed):
                 with suppress(NotFound):  # deleted at this moment
                     if self._stored(id)["grid"] == key:
                         return self.get(id)
-        raise _missing(key)
+        raise missing("maps", key)
 
     def show(self, key: str, owner: str) -> dict[str, Any]:
         """The map as JSON, which can be had without reading the cells. Raises NotFound."""
@@ -171,13 +170,6 @@ class Maps(Claimed):
                 shown.append(self._shown(key) | ({"name": names[key]} if key in names else {}))
         return shown, following
 
-    def adopt(self) -> None:
-        """Gives the maps that nobody has, of a time before owners, to the owner without a name."""
-        for id in files.ids(self._folder):
-            if self._claims.unowned("maps", id):
-                with self._claims.adding("maps", id, OPEN, files.weight_of(self._folder / id)):
-                    pass
-
     def _own(self, owner: str) -> list[str]:
         """Ids that the owner has; one whose files are not there was not written to the end."""
         return [id for id in self._claims.ids("maps", owner) if files.there(self._folder / id)]
@@ -193,7 +185,7 @@ class Maps(Claimed):
         folder = self._folder / id
         found: dict[str, Any] | None = files.find_json(folder / "map.json") if files.there(folder) else None
         if found is None:
-            raise _missing(id)
+            raise missing("maps", id)
         return found
 
     def _read(self, id: str) -> Map:
@@ -203,13 +195,7 @@ class Maps(Claimed):
             image = next(path for kind in ("png", "pgm") if (path := folder / f"map.{kind}").is_file())
             return Map(id, load_map((folder / "map.yaml").read_text(), image.read_bytes()), rooms)
         except (FileNotFoundError, StopIteration):
-            raise _missing(id) from None
-
-
-def _missing(key: str) -> NotFound:
-    return NotFound(
-        f"there is no map {key!r}", path="map_id", got=key, expected="an id or name from /v1/maps"
-    )
+            raise missing("maps", id) from None
 
 
 def _shipped(folder: Path) -> Iterator[Map]:

@@ -18,9 +18,9 @@ from specshield.policy.card import policy_id
 from specshield.policy.methods import METHODS, load_policy
 from specshield.policy.options import read_options
 from specshield.robot import robot_from_json
-from specshield.service.access.keys import OPEN, Key
+from specshield.service.access.keys import Key
 from specshield.service.library import files
-from specshield.service.library.claims import Claimed, Claims
+from specshield.service.library.claims import Claimed, Claims, missing
 from specshield.service.library.maps import Maps
 from specshield.service.settings import Settings
 from specshield.shield.proposal import Proposer
@@ -58,10 +58,9 @@ class Policies(Claimed):
     """The calls block on files. A key is an id, or the name of a policy that came with the server."""
 
     def __init__(self, settings: Settings, maps: Maps, claims: Claims | None = None) -> None:
-        super().__init__("policies", claims)
+        super().__init__("policies", claims, settings)
         self._maps, self._models = maps, settings.models_dir
         self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
-        self._folder = files.kept(settings, "policies")
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
         self._named = {str(record.name): record for record in self._shipped()}
 
@@ -74,7 +73,7 @@ class Policies(Claimed):
         there = files.HASH.fullmatch(key) and files.there(folder)
         stored = files.find_json(folder / "policy.json") if there else None
         if stored is None:
-            raise _missing(key)
+            raise missing("policies", key)
         card = files.find_json(folder / "card.json")
         return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
 
@@ -82,7 +81,7 @@ class Policies(Claimed):
         """One that this owner may see. Raises NotFound."""
         found = self.record(key if key in self._named else self._id_of(key, owner))
         if found.name is None and not self._claims.holds("policies", found.id, owner):
-            raise _missing(key)
+            raise missing("policies", key)
         return found
 
     def still_there(self, ids: Sequence[str], owner: str) -> None:
@@ -90,7 +89,7 @@ class Policies(Claimed):
         shipped = {record.id for record in self._named.values()}
         for id in ids:
             if id not in shipped and not self._claims.settled("policies", id, owner):
-                raise _missing(id)
+                raise missing("policies", id)
 
     def task(self, about: Description) -> Task:
         """Raises NotFound for the map, RobotError, and what `make_task` raises."""
@@ -158,10 +157,6 @@ class Policies(Claimed):
 
     def name_of(self, record: Record, owner: str) -> str | None:
         return record.name or self._claims.name_of("policies", record.id, owner)
-
-    def names(self, owner: str) -> dict[str, str]:
-        """{id: name} of the policies that this owner has named."""
-        return self._claims.names("policies", owner)
 
     def made_here(self, id: str) -> Record | None:
         """The policy of this id, if anybody asked for it."""
@@ -265,13 +260,8 @@ class Policies(Claimed):
         found = [self.made_here(key) for key in keys]  # None: deleted at this moment
         return [record for record in found if record is not None], following
 
-    def adopt(self) -> None:
-        """Gives the policies that nobody has, of a time before owners, to the owner without a name."""
-        for id in files.ids(self._folder):
-            if self._claims.unowned("policies", id):
-                size, record = files.weight_of(self._folder / id), self.record(id)
-                with self._claims.adding("policies", id, OPEN, size, self._own_map(record.about)):
-                    pass
+    def _map_of(self, id: str) -> str:
+        return self._own_map(self.record(id).about)
 
     def _shipped(self) -> Iterator[Record]:
         for path in sorted(self._models.glob("*/card.json")):
@@ -300,11 +290,6 @@ def _check_options(about: Description) -> None:
         read_options(cls, {name: value for name, value in about.options.items() if name in known})
     except PolicyError as error:
         raise error.at("card") from None
-
-
-def _missing(key: str) -> NotFound:
-    expected = "an id or name from /v1/policies"
-    return NotFound(f"there is no policy {key!r}", path="policy_id", got=key, expected=expected)
 
 
 def sent_id(made_here: str, card: Mapping[str, Any], weights: bytes) -> str:

@@ -58,12 +58,7 @@ class Observe:
             method = scope["method"] if route != "other" else "other"  # what a caller makes up is no label
             metrics.answered(method, route, status, time.perf_counter() - start)
             if status >= 400:
-                _tell_refusal(scope, method, route, status)
-
-
-def _tell_refusal(scope: Scope, method: str, route: str, status: int) -> None:
-    """What failed (500 and above) has a line already that says more; it is only counted here."""
-    type = scope["state"].get("problem", "error")
-    metrics.refused(type)
-    if status < 500:
-        logs.tell("refused", type=type, status=status, method=method, route=route)
+                type = scope["state"].get("problem", "error")
+                metrics.refused(type)
+                if status < 500:  # what failed has a line already that says more
+                    logs.tell("refused", type=type, status=status, method=method, route=route)

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 
 from specshield.service.access.owners import Caller, Owner
+from specshield.service.bounds.body import received
 from specshield.service.heavy.uploads import FILES
-from specshield.service.routes.uploads import TOO_MUCH, received
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.maps import MapList, MapResponse
-from specshield.service.state import Cursor, Limit, ServerState, problems
+from specshield.service.state import TOO_MUCH, Cursor, Limit, ServerState, problems
 from specshield.world.formats import FORMATS
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])

@@ -11,8 +11,7 @@ from fastapi import APIRouter, Request, Response
 from specshield.service.access.owners import Owner
 from specshield.service.routes.policies import PolicyId
 from specshield.service.routes.sessions import GONE, SessionKey
-from specshield.service.routes.uploads import TOO_MUCH
-from specshield.service.state import ServerState, problems
+from specshield.service.state import TOO_MUCH, ServerState, problems
 
 router = APIRouter(prefix="/v1")
 SVG = "image/svg+xml"

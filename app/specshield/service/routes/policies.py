@@ -14,12 +14,12 @@ from specshield.policy.methods import METHODS
 from specshield.service import examples
 from specshield.service.access.keys import Key
 from specshield.service.access.owners import Caller, Owner
+from specshield.service.bounds.body import received
 from specshield.service.heavy.uploads import PARTS, is_multipart
 from specshield.service.library.policies import Record
-from specshield.service.routes.uploads import TOO_MUCH, received
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.policies import PolicyList, PolicyRequest, PolicyResponse
-from specshield.service.state import Cursor, Limit, Server, ServerState, json_content, problems
+from specshield.service.state import TOO_MUCH, Cursor, Limit, Server, ServerState, json_content, problems
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
@@ -122,23 +122,14 @@ def _show(server: Server, record: Record, owner: str) -> dict[str, Any]:
 
 
 def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
-    training, about = _training(server, record), record.about
     return {
+        **vars(_training(server, record)),
+        **vars(record.about),
         "id": record.id,
         "name": name,
-        "status": training.status,
-        "progress": training.progress,
-        "eta_s": training.eta_s,
-        "error": training.error,
         "metrics": (record.card or {}).get("metrics", {}),
         "warnings": _warnings(record),
-        "map_id": about.map_id,
-        "robot": about.robot,
-        "spec": about.spec,
         "horizon": record.horizon,
-        "method": about.method,
-        "seed": about.seed,
-        "options": about.options,
         "created_at": record.created_at,
     }
 
@@ -153,7 +144,7 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
 
     def show() -> dict[str, Any]:
         found, following = server.policies.page(owner, cursor, limit)
-        names = server.policies.names(owner)
+        names = server.claims.names("policies", owner)
         return {"items": [_listed(server, record, names) for record in found], "next": following}
 
     return await asyncio.to_thread(show)

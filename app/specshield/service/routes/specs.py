@@ -10,9 +10,8 @@ from fastapi import APIRouter, Request
 from specshield.service import examples
 from specshield.service.access.owners import Owner
 from specshield.service.heavy.uploads import explain
-from specshield.service.routes.uploads import TOO_MUCH
 from specshield.service.schemas.specs import SpecRequest, SpecResponse
-from specshield.service.state import ServerState, json_content, problems
+from specshield.service.state import TOO_MUCH, ServerState, json_content, problems
 
 router = APIRouter(prefix="/v1/specs", tags=["specifications"])
 MODELS = (SpecRequest,)  # documented by hand

@@ -37,9 +37,9 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
 
     format: `FORMAT`, of records of this layout. before: SHA-256, as `link` has it.
 
-    Asked: pose, x_t as it was sent, three float64, None where it is the stored one to the bit. logits: as
-    `_pack_logits` has them. signals: which were sent, bit i for column i of the row's signals; their
-    values are there. all_witnesses: whether one was asked for each action.
+    Asked: pose, x_t as it was sent, three float64, None where it is the stored one to the bit. logits: the
+    finite ones, as `_sparse` has them. signals: which were sent, bit i for column i of the row's signals;
+    their values are there. all_witnesses: whether one was asked for each action.
 
     occupied, free: the points that were sent, two float64 each. explain: whether explanations were asked for.
     tables: which the policies went by, as the digest of the map they were made for; None: their own.
@@ -93,7 +93,7 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
 
     def logits_sent(self) -> Floats | None:
         """[A], -inf where the logit was null; None where none were sent."""
-        return None if self.logits is None else _unpack_logits(self.logits, len(self.rows))
+        return None if self.logits is None else _full(self.logits, len(self.rows), -math.inf, True)
 
     def pose_sent(self, row: Floats) -> Floats:
         """x_t [3] as the caller sent it; row: the stored one of this step."""
@@ -121,11 +121,6 @@ def encode(record: StepRecord) -> bytes:
 
 def decode(content: bytes) -> StepRecord:
     return _decoder.decode(content)
-
-
-def row_of(content: bytes) -> Floats:
-    """A stored row: pose and signals."""
-    return np.frombuffer(content, "<f8")
 
 
 def digest(content: bytes) -> bytes:
@@ -156,10 +151,10 @@ def make(
     rows, table, pool = _pack_table(actions, row)
     return StepRecord(
         format=FORMAT, before=before, t=decision.t, pose=None if sent == row[:3].tobytes() else sent,
-        logits=None if logits is None else _pack_logits(logits), main_task_done=main_task_done,
+        logits=None if logits is None else _sparse(logits, -math.inf, True), main_task_done=main_task_done,
         signals=sum(1 << i for i, name in enumerate(names) if name in signals), all_witnesses=all_witnesses,
-        mode=decision.mode, distribution=_sparse(decision.distribution), rows=rows, table=table, pool=pool,
-        action=decision.action, completion_action=decision.completion_action,
+        mode=decision.mode, distribution=_sparse(decision.distribution, 0.0, False), rows=rows, table=table,
+        pool=pool, action=decision.action, completion_action=decision.completion_action,
         spec_status=decision.spec_status, feasible_mass=decision.feasible_mass, kl=decision.kl,
         reason=decision.reason, finished=decision.finished, residual=decision.residual,
         in_collision=decision.in_collision,
@@ -193,8 +188,9 @@ def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
 def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
     """What the caller was answered. row: the stored one of this step; names: of the actions."""
     table = _unpack_table(record, row)
+    distribution = _full(record.distribution, len(record.rows), 0.0, False)
     return _answer(
-        record, action_name=names[record.action], distribution=_full(record.distribution, len(record.rows)),
+        record, action_name=names[record.action], distribution=distribution,
         j_values=[None if value != value else value for value in table[:, 0].tolist()],
         robustness=[None if value != value else value for value in table[:, 1].tolist()],
         next_poses=table[:, 2:], explanations=record.explanations if record.explain else None,
@@ -287,11 +283,13 @@ def _unpack_table(record: StepRecord, row: Floats) -> Floats:
     return table
 
 
-def _sparse(values: Floats) -> bytes:
-    """float64 with the zeros left out: a bit for each value, then those whose bit is set."""
+def _sparse(values: Floats, absent: float, shortens: bool) -> bytes:
+    """float64 without the values that are `absent`: a bit for each value, then those whose bit is set. With
+    `shortens` as float32, where that loses nothing.
+    """
     bits, kept = np.zeros((len(values) + 7) // 8, np.uint8), np.empty(len(values))
-    count, _ = _keep(values, 0.0, bits, kept)
-    return bits.tobytes() + kept[:count].tobytes()
+    count, short = _keep(values, absent, bits, kept)
+    return bits.tobytes() + kept[:count].astype("<f4" if short and shortens else "<f8").tobytes()
 
 
 @kernel
@@ -309,25 +307,11 @@ def _keep(values: Floats, absent: float, bits: Bytes, kept: Floats) -> tuple[int
     return count, short
 
 
-def _full(content: bytes, size: int) -> Floats:
+def _full(content: bytes, size: int, absent: float, shortens: bool) -> Floats:
+    """`_sparse` undone."""
     head = (size + 7) // 8
     there = np.unpackbits(np.frombuffer(content, np.uint8, head), count=size).view(np.bool_)
-    values = np.zeros(size)
-    values[there] = np.frombuffer(content, "<f8", offset=head)
-    return values
-
-
-def _pack_logits(logits: Floats) -> bytes:
-    """A bit for each that is finite, then those: as float32 where that loses nothing, else as float64."""
-    bits, kept = np.zeros((len(logits) + 7) // 8, np.uint8), np.empty(len(logits))
-    count, short = _keep(logits, -math.inf, bits, kept)
-    return bits.tobytes() + kept[:count].astype("<f4" if short else "<f8").tobytes()
-
-
-def _unpack_logits(content: bytes, size: int) -> Floats:
-    head = (size + 7) // 8
-    finite = np.unpackbits(np.frombuffer(content, np.uint8, head), count=size).view(np.bool_)
-    values = np.full(size, -np.inf)
-    short = len(content) - head == 4 * int(finite.sum())
-    values[finite] = np.frombuffer(content, "<f4" if short else "<f8", offset=head)
+    values = np.full(size, absent)
+    short = shortens and len(content) - head == 4 * int(there.sum())
+    values[there] = np.frombuffer(content, "<f4" if short else "<f8", offset=head)
     return values

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -25,6 +25,7 @@ from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
 from specshield.shield.decision import Config
 
+F = TypeVar("F")
 RACES = 10  # writes lost to others before a caller is told so
 # Bytes that a session takes beside its state and its rows: its objects, and its parsed rules for each byte of
 # their JSON. tracemalloc found 3,000, and 5 to 10, with rules of 1 to 200 kB.
@@ -221,6 +222,13 @@ def over(session: Session, t: int) -> SessionFinished:
         f"session {session.id!r} is over: no further step is decided", path="t", got=t,
         expected="a step already decided, to read it again",
     )  # fmt: skip
+
+
+def there(found: F | None, key: str) -> F:
+    """What the store has of a session. Raises NotFound where it has nothing."""
+    if found is None:
+        raise missing(key)
+    return found
 
 
 def missing(key: str) -> NotFound:

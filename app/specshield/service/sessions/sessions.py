@@ -17,7 +17,7 @@ import numpy as np
 
 from specshield import handover
 from specshield.arrays import Floats
-from specshield.errors import FragmentError, InputError, LimitReached, NotFound, SpecshieldError
+from specshield.errors import InputError, LimitReached, NotFound, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
 from specshield.service.access.keys import OPEN, Key
@@ -40,14 +40,15 @@ from specshield.service.sessions.session import (
     needed,
     over,
     pack,
+    there,
 )
-from specshield.service.sessions.shields import Shields, refused
+from specshield.service.sessions.shields import Shields, prepared
 from specshield.service.sessions.state import State, pack_carry
 from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
-from specshield.service.storage.store import Change, Dump, Record
+from specshield.service.storage.store import Change
 from specshield.shield import episode
 from specshield.shield.decision import Config, check_preferring
 from specshield.shield.preference import Preference
@@ -83,12 +84,8 @@ class Sessions:
         settings = self._checked(request)
         preference = None
         if request.shaping != PROJECTION:
-            try:
-                asked = request.shaping, request.policies, request.initial_pose, key.name
-                preparing = await self._run(self._shields.prepared, *asked)
-                preference = await asyncio.shield(asyncio.wrap_future(preparing))
-            except FragmentError as error:
-                raise refused(request.shaping, error) from None
+            asked = request.shaping, request.policies, request.initial_pose, key.name
+            preference = await prepared(self._run, self._shields, *asked)
         ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
         try:
             config, begun, status, rows = await self._begun(request, settings, preference, key.name)
@@ -136,7 +133,7 @@ class Sessions:
         return config
 
     async def read(self, id: str) -> dict[str, Any]:
-        session = Session.of(await self._load(id))
+        session = Session.of(there(await self._store.load(id), id))
         return describe(session.rules, session.state)
 
     async def page(
@@ -159,7 +156,7 @@ class Sessions:
         Closing again changes nothing.
         """
         for _ in range(RACES):
-            session = Session.of(await self._load(id))
+            session = Session.of(there(await self._store.load(id), id))
             state = session.state
             if request.t is not None and request.poses is not None:
                 last = session.config["max_steps"] + 1  # where the last step led
@@ -200,14 +197,14 @@ class Sessions:
 
     async def trajectory(self, id: str) -> tuple[Iterator[bytes], bytes]:
         """One JSON object a step, as `lines` has it; and the rules, as one JSON list."""
-        found = await self._dump(id)
+        found = there(await self._store.dump(id), id)
         session = Session.of(found)
         shown = describe(session.rules, session.state)["rules"]
         return lines(session, found.steps), files.to_json(shown)
 
     async def record(self, id: str) -> tuple[bytes, str]:
         """The session's record as a file, and its seal."""
-        found = await self._dump(id)
+        found = there(await self._store.dump(id), id)
         rows = Session.of(found).rows
         return await self._run(chain.pack, found.config, pack(rows), found.steps)
 
@@ -215,17 +212,11 @@ class Sessions:
         """The session's config, its rows, and the record of the last one, empty where that has none, or was
         decided by another rule than the one in force.
         """
-        found = await self._dump(id)
+        found = there(await self._store.dump(id), id)
         session = Session.of(found)
         t = len(session.rows) - 1
         decided = rules.begins(session.config) <= t < len(found.steps)
         return dict(session.config), session.rows, found.steps[t] if decided else b""
-
-    async def _dump(self, id: str) -> Dump:
-        found = await self._store.dump(id)
-        if found is None:
-            raise missing(id)
-        return found
 
     async def using(self, owner: str, policy_id: str) -> str | None:
         """An owner's session that may still ask this policy, if there is one, archived ones too."""
@@ -238,12 +229,6 @@ class Sessions:
                     return str(had[-1]["id"])
             if after is None:
                 return None
-
-    async def _load(self, id: str) -> Record:
-        found = await self._store.load(id)
-        if found is None:
-            raise missing(id)
-        return found
 
     async def _check_room(self, owner: str | None, limit: int | None) -> None:
         """Raises LimitReached where this owner, or with None all of them, keep `limit` sessions."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -73,7 +74,7 @@ class Shields:
             return shield
         return replace(shield, preference=self._preference_at_hand(shield, session))
 
-    def prepared(
+    def preparing(
         self, name: str, keys: Sequence[str], pose: Sequence[float], owner: str
     ) -> Future[Preference]:
         """The preference that a session with these policies asks for, or will be."""
@@ -131,9 +132,19 @@ class Shields:
         return found.result() if found is not None and found.done() and found.exception() is None else None
 
 
-def refused(shaping: str, error: FragmentError) -> FragmentError:
-    """What a caller is told whose preference cannot be prepared for the formula."""
-    return FragmentError(
-        f"{shaping!r} cannot be had for this formula: {error.message}", path="shaping", got=shaping,
-        expected="'projection', or a formula that 'reachability' takes",
-    )  # fmt: skip
+async def prepared(
+    run: Callable[..., Awaitable[Any]], shields: Shields, shaping: str, keys: Sequence[str],
+    pose: Sequence[float], owner: str,
+) -> Preference:  # fmt: skip
+    """The preference that a session with these policies asks for, once it can be used. run: calls a function
+    in a thread. Raises FragmentError where it cannot be prepared for the formula.
+    """
+    try:
+        preparing = await run(shields.preparing, shaping, keys, pose, owner)
+        preference: Preference = await asyncio.shield(asyncio.wrap_future(preparing))
+        return preference
+    except FragmentError as error:
+        raise FragmentError(
+            f"{shaping!r} cannot be had for this formula: {error.message}", path="shaping", got=shaping,
+            expected="'projection', or a formula that 'reachability' takes",
+        ) from None  # fmt: skip

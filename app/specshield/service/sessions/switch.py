@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,14 +11,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import (
-    FragmentError,
-    HistoryGap,
-    InputError,
-    LimitReached,
-    SpecshieldError,
-    StepConflict,
-)
+from specshield.errors import HistoryGap, InputError, LimitReached, SpecshieldError, StepConflict
 from specshield.lookahead.preferences import PROJECTION
 from specshield.reasons import refusal
 from specshield.service.heavy.heavy import Heavy
@@ -35,11 +27,11 @@ from specshield.service.sessions.session import (
     columns,
     contended,
     describe,
-    missing,
     over,
     pack,
+    there,
 )
-from specshield.service.sessions.shields import Shields, refused
+from specshield.service.sessions.shields import Shields, prepared
 from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Change, Store
@@ -69,9 +61,7 @@ class Switches:
         StepConflict, SessionFinished, LimitReached.
         """
         for _ in range(RACES):
-            found = await self._store.load(id, request.t - 1 if request.t else None)
-            if found is None:
-                raise missing(id)
+            found = there(await self._store.load(id, request.t - 1 if request.t else None), id)
             session = Session.of(found)
             ids = await self._run(lambda: [self._policies.find(key, owner).id for key in request.policies])
             if _is_last(session, request, ids):
@@ -104,12 +94,7 @@ class Switches:
             )
             return made
         if shaping != PROJECTION:
-            asked = shaping, ids, wanted.row[:3].tolist(), owner
-            try:
-                preparing = await self._run(self._shields.prepared, *asked)
-                await asyncio.shield(asyncio.wrap_future(preparing))
-            except FragmentError as error:
-                raise refused(shaping, error) from None
+            await prepared(self._run, self._shields, shaping, ids, wanted.row[:3].tolist(), owner)
         here: Session = await self._run(switched, self._policies, self._shields, wanted, self._most)
         return here
 

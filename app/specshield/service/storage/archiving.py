@@ -17,10 +17,8 @@ from typing import ParamSpec, TypeVar
 
 import anyio
 
-from specshield.errors import SessionExists
-from specshield.service.access.owners import shown
 from specshield.service.storage.archive import Archive
-from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, keys
+from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Record, Store, exists, keys
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -58,7 +56,7 @@ return redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3]) > 0 and 1 or 0"""
 
 
 class ArchivingStore(Store):
-    """A `Store` whose sessions may lie in the archive. Its `page` and `count` are of those in the store."""
+    """A `Store` whose sessions may lie in the archive. Its `count` is of those in the store."""
 
     def __init__(self, url: str, timeout: float, ttl: int, archive: Archive, replicas: int = 0) -> None:
         super().__init__(url, timeout, ttl, replicas)
@@ -69,8 +67,7 @@ class ArchivingStore(Store):
 
     async def create(self, id: str, config: bytes, change: Change) -> bytes:
         if await self.in_thread(self.archive.find, id) is not None:
-            told = f"there is a session {shown(id)!r} already"
-            raise SessionExists(told, path="id", got=shown(id), expected="an id not in use")
+            raise exists(id)
         return await super().create(id, config, change)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:

@@ -91,13 +91,10 @@ class Folder:
             made = [folder for folder in target.parents if not folder.exists()]
             try:
                 target.parent.mkdir(parents=True, exist_ok=True)
-                with open(draft, "wb") as file:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
+                write_through(draft, content)
                 os.replace(draft, target)
                 for folder in (target.parent, *(folder.parent for folder in made)):
-                    _sync(folder)
+                    sync(folder)
                 return
             except FileNotFoundError:
                 if not left:
@@ -180,7 +177,15 @@ class Remote:
         return f"{self._root}/{path}".rstrip("/")
 
 
-def _sync(folder: Path) -> None:
+def write_through(path: Path, content: bytes) -> None:
+    """When this returns, the content is on the disk; its name is there after `sync` of the folder."""
+    with open(path, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def sync(folder: Path) -> None:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -27,9 +27,6 @@ AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads
 INDEX = "specshield:sessions"
 NO_VERSION = b"-"  # that no session ever has
 APPEND = Script(Path(__file__).with_name("append.lua").read_text())
-DROP = """\
-if redis.call('HGET', KEYS[1], 'version') ~= ARGV[1] then return 0 end
-return redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])"""
 
 
 @dataclass(frozen=True)
@@ -86,7 +83,7 @@ class Store:
 
     def __init__(self, url: str, timeout: float, ttl: int, replicas: int = 0) -> None:
         self.redis: Any = connect(url, socket_timeout=timeout)
-        self._drop, self._append = self.redis.register_script(DROP), self.redis.register_script(APPEND.text)
+        self._append = self.redis.register_script(APPEND.text)
         # A cluster has no one connection: redis-py finds the server that has a session's keys.
         self._wire = None if is_cluster(url) else Wire(self.redis.connection_pool, timeout, replicas)
         self._timeout, self._ttl, self._replicas = timeout, ttl, replicas
@@ -123,8 +120,7 @@ class Store:
         if isinstance(begun, Record) and begun.config == config:  # a try whose answer was lost
             begun = begun.version
         if not isinstance(begun, bytes):
-            told = f"there is a session {shown(id)!r} already"
-            raise SessionExists(told, path="id", got=shown(id), expected="an id not in use")
+            raise exists(id)
         await self.list_name(id)
         return begun
 
@@ -139,11 +135,8 @@ class Store:
     async def take_off(self, ids: Sequence[bytes]) -> None:
         """Takes names off the list that have no session. One that was made meanwhile is listed again."""
         await self.redis.zrem(INDEX, *ids)
-        async with self.redis.pipeline(transaction=False) as pipe:
-            for id in ids:
-                pipe.exists(keys(id.decode())[0])
-            there = await pipe.execute()
-        if back := {id: 0 for id, found in zip(ids, there, strict=True) if found}:
+        gone = await self._gone(ids)
+        if back := {id: 0 for id in ids if id not in gone}:
             await self.redis.zadd(INDEX, back)
 
     async def append(self, id: str, version: bytes, change: Change) -> bytes | Record | None:
@@ -199,39 +192,12 @@ class Store:
             (config, state, version), found, left = await pipe.execute()
         return None if config is None or found is None else Dump(config, state, version, found, left)
 
-    async def drop(self, id: str, version: bytes) -> bool:
-        """Erase all of it if `version` is still the latest. False where it is not."""
-        async with self._reaching():
-            if not await self._drop(keys=keys(id), args=[version]):
-                return False
-            await self.redis.zrem(INDEX, id)
-        return True
-
     async def delete(self, id: str) -> bool:
         """Erase all of it. False where there was nothing."""
         async with self._reaching():
             found = await self.redis.unlink(*keys(id))
             await self.redis.zrem(INDEX, id)
         return bool(found)
-
-    async def page(
-        self, owner: str, after: str | None, limit: int
-    ) -> tuple[list[tuple[bytes, bytes]], str | None]:
-        """Up to `limit` of an owner's (config, state) in order of id, and the id to go on after, None at the
-        end. There are fewer where the configs are long: reading them must not hold up steps.
-        """
-        listed: list[tuple[bytes, bytes]] = []
-        (first, end), room = between(owner), PAGE_BYTES
-        while len(listed) < limit and room > 0:
-            async with self._reaching():
-                low, count = f"[{first}" if after is None else f"({first}{after}", limit - len(listed)
-                ids = await self.redis.zrangebylex(INDEX, low, f"({end}", 0, min(count, AT_ONCE))
-                if not ids:
-                    return listed, None
-                ids, room = await self._that_fit(ids, room)
-                listed += await self._configs(ids)
-                after = shown(ids[-1].decode())
-        return listed, after
 
     async def count(self, owner: str | None) -> int:
         """How many sessions an owner has, or with None all of them; some may have expired."""
@@ -247,7 +213,8 @@ class Store:
                 ids = await self.redis.zrangebylex(INDEX, low, high, 0, AT_ONCE)
                 if not ids:
                     return
-                await self._configs(ids)
+                if gone := await self._gone(ids):
+                    await self.take_off(gone)
                 low = f"({ids[-1].decode()}"
 
     async def versions(self, ids: Sequence[str]) -> list[bytes | None]:
@@ -289,15 +256,13 @@ class Store:
                     return ids[:taken], room
         return ids, room
 
-    async def _configs(self, ids: Sequence[bytes]) -> list[tuple[bytes, bytes]]:
+    async def _gone(self, ids: Sequence[bytes]) -> list[bytes]:
+        """Those that have no session."""
         async with self.redis.pipeline(transaction=False) as pipe:
             for id in ids:
-                pipe.hmget(keys(id.decode())[0], "config", "state")
-            found = await pipe.execute()
-        expired = [id for id, (config, _) in zip(ids, found, strict=True) if config is None]
-        if expired:
-            await self.take_off(expired)
-        return [(config, state) for config, state in found if config is not None]
+                pipe.exists(keys(id.decode())[0])
+            there = await pipe.execute()
+        return [id for id, found in zip(ids, there, strict=True) if not found]
 
 
 def _range(owner: str | None) -> tuple[str, str]:
@@ -315,6 +280,11 @@ def _record(
     config: bytes | None, state: bytes, version: bytes, rows: bytes | None, step: bytes | None
 ) -> Record | None:
     return None if config is None or rows is None else Record(config, state, version, rows, step or None)
+
+
+def exists(id: str) -> SessionExists:
+    told = f"there is a session {shown(id)!r} already"
+    return SessionExists(told, path="id", got=shown(id), expected="an id not in use")
 
 
 def _away(error: Exception) -> StoreError:

@@ -68,12 +68,6 @@ class TrainingWorker:
                 self._process.wait(5.0)
 
 
-def wants_worker(settings: Settings) -> bool:
-    if settings.worker is not None:
-        return settings.worker
-    return settings.redis_url is None
-
-
 async def tend(embedded: EmbeddedStore | None, worker: TrainingWorker | None, startup: Startup) -> None:
     """Starts again what has died: the store, and once the server is ready the worker. Until cancelled."""
     while True:

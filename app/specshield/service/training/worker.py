@@ -136,18 +136,15 @@ class _Worker(Worker):
         raise SystemExit(0)
 
     def _killed(self, job: Job, pid: int, status: int, usage: Any) -> None:
+        if job.origin not in self._training:
+            return
         killed = status and os.WIFSIGNALED(status)
         how = f"by signal {os.WTERMSIG(status)}" if killed else f"with status {status}"
         if killed and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
-        self._fail(
-            job,
-            f"the training process ended {how}; ask for it again, and it goes on from its last checkpoint",
+        reason = (
+            f"the training process ended {how}; ask for it again, and it goes on from its last checkpoint"
         )
-
-    def _fail(self, job: Job, reason: str) -> None:
-        if job.origin not in self._training:
-            return
         id, attempt = job.args
         if self._jobs.report(id, attempt, status="failed", error=reason, eta_s=""):
             _ended(self._jobs, job, "failed", reason)

@@ -93,15 +93,12 @@ class Cells:
 
     def collect(self) -> Iterator[Metric]:
         """What all processes have counted."""
-        whole = [content for content in self._contents() if len(content) == SIZE * 8]
-        cells = np.sum([np.frombuffer(content) for content in whole], axis=0)
+        held = [self.held.tobytes()]
+        if self._folder is not None:
+            held = [file.read_bytes() for file in self._folder.glob("*.cells")]
+        cells = np.sum([np.frombuffer(content) for content in held if len(content) == SIZE * 8], axis=0)
         for family in self._families:
             yield family.metric(cells)
-
-    def _contents(self) -> list[bytes]:
-        if self._folder is None:
-            return [self.held.tobytes()]
-        return [file.read_bytes() for file in self._folder.glob("*.cells")]
 
     def _map(self) -> mmap.mmap:
         if self._folder is None:

@@ -22,7 +22,7 @@ from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer
 from specshield.service.sessions import rules
 from specshield.service.sessions.record import StepRecord
-from specshield.service.sessions.session import Session, missing
+from specshield.service.sessions.session import Session, there
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import News, Store
 from specshield.service.watch.feed import (
@@ -144,10 +144,7 @@ class Watchers:
             while places and not self._stopping():
                 told = []
                 for feed, t in [(feed, t) for feed, t in places.items() if t < feed.end or feed.over]:
-                    if t < feed.start:
-                        found, t = await self._older(feed, t)
-                    else:
-                        found, t = feed.since(t), max(t, feed.end)
+                    found, t = await self._since(feed, t)
                     told += [each.whole for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
@@ -176,9 +173,7 @@ class Watchers:
                     del self._feeds[feed.id]
 
     async def _begin(self, id: str) -> Feed:
-        found = await self._store.load(id)
-        if found is None:
-            raise missing(id)
+        found = there(await self._store.load(id), id)
         session = Session.of(found)
         state = session.state
         return Feed(
@@ -191,10 +186,7 @@ class Watchers:
             yield FIRST
             while not self._stopping():
                 changed = feed.changed
-                if t < feed.start:
-                    found, t = await self._older(feed, t)
-                else:
-                    found, t = feed.since(t), max(t, feed.end)
+                found, t = await self._since(feed, t)
                 if found:
                     yield b"".join(each.event for each in found)
                 if t < feed.end:
@@ -261,8 +253,10 @@ class Watchers:
             feed.add(state, found, state.next_t, state.next_t)
         feed.version = None
 
-    async def _older(self, feed: Feed, t: int) -> tuple[list[Told], int]:
-        """Decisions from step t on, and the step that follows them."""
+    async def _since(self, feed: Feed, t: int) -> tuple[list[Told], int]:
+        """Decisions from step t on, and the step that follows them; what is not kept is read."""
+        if t >= feed.start:
+            return feed.since(t), max(t, feed.end)
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
         if new is None:
             dump = await self._store.dump(feed.id)

@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from specshield.service.access.owners import shown
 from specshield.service.schemas.answers import StepAnswer, to_json
@@ -112,7 +113,7 @@ def events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
     switched = [rule for rule in feed.told[1:] if rule["from"] >= t]
     for i, step in enumerate(new.steps):
         if step:
-            row = record.row_of(new.rows[i * feed.width : (i + 1) * feed.width])
+            row = np.frombuffer(new.rows[i * feed.width : (i + 1) * feed.width], "<f8")
             rule = rules.at(feed.rules, t + i)
             kept = record.decode(step)
             answer = record.answer(kept, row, feed.rules[rule]["actions"])

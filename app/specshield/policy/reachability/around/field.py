@@ -15,9 +15,9 @@ from scipy.ndimage import minimum_filter
 from specshield.arrays import Bools, Floats, Int8s
 from specshield.compiled import kernel, leaf
 from specshield.policy.geodesic import geodesic_distance
+from specshield.policy.progress import ALWAYS, EVENTUALLY, PENDING, Rules
 from specshield.policy.reachability.guide import make_scratch, predicate_at
 from specshield.robot.body import Body, centre
-from specshield.rule.progress import ALWAYS, EVENTUALLY, PENDING, Rules
 
 COARSE = 2  # cells of the map to a side of a field's, at least: 10 cm where the map has 5. By hand.
 MOST = 20_000  # cells of a field, which take some 2 ms; on larger maps they are larger

@@ -18,6 +18,8 @@ from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.heap import Heap, pop, push
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
+from specshield.policy.progress.recall import forgive, recall
 from specshield.policy.reachability.around.field import due, spare_on
 from specshield.policy.reachability.guide import (
     Guide,
@@ -30,11 +32,9 @@ from specshield.policy.reachability.guide import (
 )
 from specshield.policy.reachability.tables import SAFE, UNKNOWN, goals_settled, is_broken, slack_at
 from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, climb, rejoin
-from specshield.policy.recall import forgive, recall
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import around, displacement, longest_motions, motion_count, step, step_from
-from specshield.rule.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
 
 # Chosen by hand; python -m evaluation worlds says what comes of them.
 POSES = 16_384  # that one search may come to, in some 10 ms; a power of two, for the hash table

@@ -10,7 +10,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
-from specshield.rule.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay
+from specshield.policy.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay
 from specshield.rule.residual import again, joined, left_over
 from specshield.stl import Formula
 

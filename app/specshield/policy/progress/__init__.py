@@ -6,7 +6,6 @@ progress is all of the history that still matters to a formula of the paper's fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +13,8 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.errors import FragmentError
+from specshield.policy.progress.obligations import obligations
 from specshield.rule.values import REGIONS, fill_place, fill_signals, initial_signals, places, regions_of
-from specshield.stl import obligations
 from specshield.stl.program import STACK_SIZE, Programs, compile_predicates, evaluate_packed
 from specshield.task import Task
 from specshield.world.regions import PackedRegions
@@ -52,14 +51,6 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
     kind, a, b, c1, c2, last = np.array(rows, np.int64).reshape(-1, 6).T.copy()
     programs = compile_predicates([part.predicate for part in parts], places(task))
     return Rules(kind, a, b, c1, c2, last, programs, regions_of(task), initial_signals(task), margin)
-
-
-def signal_rows(task: Task, signals: Mapping[str, Floats], n: int) -> Floats:
-    """The signals' first n samples in the order of `Rules.signals`, shape (n, S). signals {name: [..n]}."""
-    rows = np.empty((n, len(task.signals)))
-    for i, name in enumerate(task.signals):
-        rows[:, i] = task.signal(name, signals, n)
-    return rows
 
 
 @leaf

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from specshield.errors import FragmentError
-from specshield.stl.formula import Always, And, Eventually, Formula, Implies, Node, Not, Or, Windowed
+from specshield.stl import Always, Eventually, Formula, conjuncts
+from specshield.stl.conjunction import is_predicate, signed
 
 
 @dataclass(frozen=True)
@@ -33,44 +34,6 @@ class Obligation:
     predicate: Formula
 
 
-def conjuncts(formula: Formula) -> tuple[Formula, ...]:
-    """The formulas that `formula` joins by `and` at its top, left to right.
-
-    `not` moves inwards through `and`, `or`, `->`, F and G, so `not F[a,b] p` becomes `G[a,b] not p`.
-    """
-    return _joined(formula, negated=False)
-
-
-def _joined(formula: Formula, negated: bool) -> tuple[Formula, ...]:
-    """The conjuncts of `formula`, or of its negation."""
-    match formula:
-        case Not(child):
-            return _joined(child, not negated)
-        case And(children) if not negated:
-            return tuple(part for child in children for part in _joined(child, False))
-        case Or(children) if negated:
-            return tuple(part for child in children for part in _joined(child, True))
-        case Implies(left, right) if negated:
-            return (*_joined(left, False), *_joined(right, True))
-        case Eventually(a, b, child) if negated:
-            return (Always(a, b, _signed(child, True)),)
-        case Always(a, b, child) if negated:
-            return (Eventually(a, b, _signed(child, True)),)
-    return (_signed(formula, negated),)
-
-
-def _signed(formula: Formula, negated: bool) -> Formula:
-    """`formula` or its negation, without a `not not`."""
-    if isinstance(formula, Not):
-        return _signed(formula.child, not negated)
-    return Not(formula) if negated else formula
-
-
-def is_predicate(node: Node) -> bool:
-    """Whether `node` has no temporal operator."""
-    return not isinstance(node, Windowed) and all(is_predicate(part) for part in node.parts)
-
-
 def obligations(formula: Formula) -> tuple[Obligation, ...]:
     """The obligations whose conjunction is `formula`, in the order of the text; rho is their minimum.
 
@@ -82,7 +45,7 @@ def obligations(formula: Formula) -> tuple[Obligation, ...]:
 
 def _normal(formula: Formula) -> tuple[Obligation, ...]:
     if is_predicate(formula):
-        return (Obligation("always", 0, 0, 0, 0, _signed(formula, False)),)
+        return (Obligation("always", 0, 0, 0, 0, signed(formula, False)),)
     parts = conjuncts(formula)
     if parts != (formula,):
         return tuple(found for part in parts for found in _normal(part))

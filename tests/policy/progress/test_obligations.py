@@ -5,7 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from specshield.errors import FragmentError
-from specshield.stl import Always, Eventually, Formula, Obligation, conjuncts, obligations, parse, robustness
+from specshield.policy.progress.obligations import Obligation, obligations
+from specshield.stl import Always, Eventually, Formula, parse, robustness
 from tests.stl.formulas import formulas, traces
 
 
@@ -66,37 +67,6 @@ def test_the_error_names_the_part_that_is_outside() -> None:
     with pytest.raises(FragmentError, match=r"'a U\[0,3\] b'") as caught:
         obligations(parse("F[0,1] a and G[0,1] (b and (a U[0,3] b))"))
     assert caught.value.got == "a U[0,3] b"
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (
-            "a and (F[0,1] b and (c or a)) and G[0,1] (a and b)",
-            ["a", "F[0,1] b", "c or a", "G[0,1] (a and b)"],
-        ),
-        ("not F[1,4] a", ["G[1,4] not a"]),
-        ("not G[1,4] not a", ["F[1,4] a"]),
-        ("not not F[1,4] a", ["F[1,4] a"]),
-        ("not F[1,4] G[0,2] a", ["G[1,4] not G[0,2] a"]),
-        ("not (F[0,1] a or not (b and c))", ["G[0,1] not a", "b", "c"]),
-        ("not (F[0,1] a -> G[0,2] b)", ["F[0,1] a", "F[0,2] not b"]),
-        ("not (a and b)", ["not (a and b)"]),
-        ("not (a U[0,3] b)", ["not (a U[0,3] b)"]),
-    ],
-)
-def test_conjuncts(text: str, expected: list[str]) -> None:
-    assert [str(part) for part in conjuncts(parse(text))] == expected
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.data())
-def test_the_conjuncts_together_have_the_formulas_robustness(data: st.DataObject) -> None:
-    formula = data.draw(formulas())
-    parts = conjuncts(formula)
-    samples = data.draw(traces(formula.horizon + 1))
-    assert max(part.horizon for part in parts) == formula.horizon
-    assert min(robustness(part, samples) for part in parts) == robustness(formula, samples)
 
 
 def _formula(o: Obligation) -> Formula:

@@ -1,0 +1,101 @@
+"""The tables as a safetensors file: written, read back, and checked against the task."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors.numpy import save as save_tensors
+
+from specshield.arrays import Bools, Int32s
+from specshield.errors import PolicyError
+from specshield.policy.extent import COARSEST
+from specshield.policy.progress import ALWAYS, make_rules
+from specshield.policy.reachability.latest import phases_of, time_tables
+from specshield.policy.reachability.stepwise import state_count, step_tables
+from specshield.policy.reachability.tables import Tables
+from specshield.policy.shape import MAX_HEADINGS, side_of
+from specshield.policy.tensors import named_arrays, read_tensors
+from specshield.task import Task
+
+
+def stored(tables: Tables, narrow: Bools, asked: float) -> bytes:
+    """The file. narrow [K] as a policy has it; asked: the pitch that its options ask for [m]."""
+    names = ("cell", "bits") if len(tables.bits) else ("cell", "code", "table")
+    tensors: dict[str, NDArray[Any]] = {name: getattr(tables, name) for name in names}
+    if narrow.any():
+        tensors["narrow"] = narrow.astype(np.uint8)
+    if tables.pitch > asked:
+        tensors["pitch"] = np.array([tables.pitch])
+    return save_tensors(tensors)
+
+
+def read_tables(weights: bytes | Path, task: Task, asked: float) -> tuple[Tables, Bools]:
+    """What `stored` wrote, `asked` for the same pitch. Raises PolicyError where it does not fit the task."""
+    rules = make_rules(task)
+    goals, tensors = np.flatnonzero(rules.kind != ALWAYS), read_tensors(weights)
+    narrow = _narrow_of(tensors.pop("narrow", None), len(rules.kind))
+    pitch = _pitch_of(tensors, task, asked)
+    if task.robot.wait_motion < 0:
+        cell, bits = named_arrays(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
+        headings = _checked_headings(bits.shape[2])
+        size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
+        _check_fit(cell, side_of(task.grid, pitch), bits.shape[1], bits.shape == size, f"bits {list(size)}")
+        return step_tables(rules, task.horizon, cell, bits, pitch), narrow
+    cell, code, table = named_arrays(
+        tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
+    )
+    phases, headings = phases_of(rules, task.horizon), _checked_headings(code.shape[2])
+    fits = table.shape == (len(phases), 1 << len(goals)) and table.min() >= -1 and table.max() < code.shape[0]
+    wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {1 << len(goals)}]"
+    _check_fit(cell, side_of(task.grid, pitch), code.shape[1], fits, wanted)
+    return time_tables(rules, goals, phases, cell, code, table, pitch), narrow
+
+
+def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, asked: float) -> float:
+    """The lattice's pitch [m]: one that had to grow is in the file, the others go by the number of cells."""
+    kept, cell = tensors.pop("pitch", None), tensors.get("cell")
+    if kept is not None:
+        found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
+        if not asked <= found <= COARSEST * asked:
+            raise PolicyError(
+                "the array 'pitch' is of another kind", path="weights.pitch", got=found,
+                expected=f"float64, one number from {asked:g} to {COARSEST * asked:g}",
+            )  # fmt: skip
+        return found
+    fine = asked / 3.0
+    return fine if cell is not None and cell.shape == side_of(task.grid, fine) else asked
+
+
+def _checked_headings(headings: int) -> int:
+    if not 4 <= headings <= MAX_HEADINGS:
+        raise PolicyError(
+            "the tables do not fit the task", path="weights", got=f"{headings} headings",
+            expected=f"4 to {MAX_HEADINGS} headings",
+        )  # fmt: skip
+    return headings
+
+
+def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
+    """The obligations that a file names as narrow. Files of rules without any do not have the tensor."""
+    if tensor is None:
+        return np.zeros(count, np.bool_)
+    if tensor.dtype != np.uint8 or tensor.shape != (count,):
+        raise PolicyError(
+            "the array 'narrow' is of another kind", path="weights.narrow",
+            got=f"{tensor.dtype} {list(tensor.shape)}", expected=f"uint8 [{count}]",
+        )  # fmt: skip
+    narrow: Bools = tensor == 1
+    return narrow
+
+
+def _check_fit(cell: Int32s, shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
+    if not fits or cell.shape != shape or cell.min(initial=-1) < -1 or cell.max(initial=-1) >= rows:
+        raise PolicyError(
+            "the tables do not fit the task", path="weights",
+            got=f"cell {list(cell.shape)} and tables of {rows} cells",
+            expected=f"cell {list(shape)}, {wanted}",
+        )  # fmt: skip

@@ -1,0 +1,69 @@
+"""How a server leaves: /readyz says so first, so that balancers send nothing new, and then it stops. What
+streams are open is told as soon as the server is.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import threading
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:  # the parent of several servers decides nothing
+    from specshield.service.startup import Startup
+
+GRACE = 10  # [s] that running requests and streams have once the server takes no more; chosen by hand
+
+
+class Stream(Protocol):
+    def stop(self) -> None:
+        """Says goodbye, after the message that is being answered."""
+
+
+class Streams:
+    """The streams of this process that are open."""
+
+    def __init__(self) -> None:
+        self.open = set[Stream]()
+
+    def close(self) -> None:
+        for stream in list(self.open):
+            stream.stop()
+
+    def close_at_stop(self) -> None:
+        """Closes them as soon as the server is told to stop. To be called in the server's event loop."""
+        loop = asyncio.get_running_loop()
+        for name in (signal.SIGTERM, signal.SIGINT) if _has_signals() else ():
+            stop = signal.getsignal(name)
+
+            def told(signum: int, frame: Any, stop: Any = stop) -> None:
+                loop.call_soon_threadsafe(self.close)
+                if callable(stop):
+                    stop(signum, frame)
+
+            signal.signal(name, told)  # uvicorn puts its caller's handlers back at the end
+
+
+def drain_at_sigterm(startup: Startup, seconds: float) -> None:
+    """From SIGTERM on /readyz answers 503 and everything else goes on; `seconds` later the server stops.
+
+    A second SIGTERM, or SIGINT, stops it at once. To be called in the server's event loop.
+    """
+    if not _has_signals():
+        return
+    loop, stop = asyncio.get_running_loop(), signal.getsignal(signal.SIGTERM)
+
+    def told(signum: int, frame: Any) -> None:
+        again, startup.stopping = startup.stopping, True
+        if callable(stop):
+            if again or seconds <= 0:
+                stop(signum, frame)
+            else:
+                loop.call_soon_threadsafe(loop.call_later, seconds, stop, signum, frame)
+
+    signal.signal(signal.SIGTERM, told)  # uvicorn puts its caller's handler back at the end
+
+
+def _has_signals() -> bool:
+    """False for a server inside another program, which has signals of its own."""
+    return threading.current_thread() is threading.main_thread()
