@@ -7,7 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 from specshield.sim import picture, report
@@ -27,7 +27,15 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
     status.say("starting the service ...")
     with own_server(say=status.say) as url:
         with robots(url) as several:
-            campaigns = [_campaign(several, name, runs, seed, status) for name in case_names()]
+            campaigns, pictures = list[Campaign](), list[Future[None]]()
+            for name in case_names():
+                campaigns.append(_campaign(several, name, runs, seed, status))
+                first = campaigns[-1].shielded[0], campaigns[-1].unshielded[0]
+                # In one of the processes, while the others go on with the next case.
+                drawn = several.submit(picture.draw, campaigns[-1].case, *first, out / f"{name}.png")
+                pictures.append(drawn)
+            for drawn in pictures:
+                drawn.result()
         status.clear()
         _tell(campaigns, runs, seed, out)
         print(f"{time.monotonic() - began:.0f} s")
@@ -54,9 +62,7 @@ def _tell(campaigns: Sequence[Campaign], runs: int, seed: int, out: Path) -> Non
         print(f'{case.name}  {case.task.formula}\n       model: "{case.instruction}"')
     print(f"\n{report.table(campaigns)}\n")
     for campaign in campaigns:
-        path = out / f"{campaign.case.name}.png"
-        picture.draw(campaign.case, campaign.shielded[0], campaign.unshielded[0], path)
-        print(f"picture: {path}")
+        print(f"picture: {out / f'{campaign.case.name}.png'}")
 
 
 def _campaign(several: Executor, case: str, runs: int, seed: int, status: StatusLine) -> Campaign:
