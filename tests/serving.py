@@ -34,7 +34,7 @@ class RunningServer:
 
 # [s] after which a test that hangs is given up. Nothing that works takes so long, on however busy a machine:
 # not even a policy, which its worker makes at a low priority.
-HUNG = 3600.0
+HUNG = 900.0
 
 # Below the ports that Linux gives to outgoing connections (32768 and up), in an order of this process's own.
 _PORTS = itertools.cycle(random.SystemRandom().sample(range(20_000, 32_000), 12_000))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from specshield.shield.episode import Config, InfeasibleStart, decide, make_shield, start
-from specshield.shield.proposal import Proposal
+from specshield.shield.proposal import Proposal, adapted, ask
 from tests.oracles.cells import END, FORWARD, LEFT, MOTIONS, RIGHT, WAIT, Cells, Exhaustive, Scripted, waits
 
 REACH = Cells("F[0,3] A", lambda s: s["A"][..., :4].any(-1), {"A": (1, 0)})
@@ -96,10 +96,20 @@ class Raising(Exhaustive):
     avoiding = foreseeing = earlier = on_body
 
 
-def test_a_proposer_that_raises_where_it_is_told_of_a_map_or_a_deadline_is_asked_as_it_is():
-    shield = make_shield([Raising(REACH)], Config(slack=1))
-    marked = {"carry": None, "occupied": [[0.5, 0.5]]}
-    assert decide(shield, [REACH.pose(0, 0, 0)], EVEN, **marked).feasible_mass > 0.0
+def test_a_proposer_that_raises_where_it_is_told_of_the_map_is_said_not_to_be_used():
+    shield = make_shield([Raising(REACH)])
+    decision = decide(shield, [REACH.pose(0, 0, 0)], EVEN, occupied=[[0.5, 0.5]])
+    assert decision.warnings == ("a policy was not used at this step: it raised RuntimeError",)
+    assert {m for m in range(MOTIONS) if decision.j_values[m] == 1.0} <= STANDING
+
+
+@pytest.mark.parametrize("how", ["on_body", "avoiding", "foreseeing", "earlier"])
+def test_a_proposer_that_cannot_be_told_of_something_raises_when_it_is_asked(how):
+    told, history = adapted(Raising(REACH), how, np.zeros(3)), np.array([REACH.pose(0, 0, 0)])
+    assert ask(told, history, {}, 0.0, MOTIONS, 3) == (
+        None, "a policy was not used at this step: it raised RuntimeError"
+    )  # fmt: skip
+    assert adapted(Exhaustive(REACH), how) == Exhaustive(REACH) or not hasattr(Exhaustive, how)
 
 
 def test_what_was_wrong_is_said():

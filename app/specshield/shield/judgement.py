@@ -120,12 +120,13 @@ def _in_time(
     shield: Shield, prefix: Prefix, tried: Futures, margin: float, steps: int, wanted: Bools
 ) -> Futures:
     """`tried`, and the futures that policies propose for deadlines so many steps earlier, of the motions
-    `wanted` [M]. They may meet them where a way that is just in time for the rule does not.
+    `wanted` [M]. They may meet them where a way that is just in time for the rule does not. The `wanted` ones
+    keep the rule already: what has no future that keeps it is not looked at again.
     """
     rows, warnings = list[Ints](), list[str]()
     for proposer in shield.proposers:
-        if hasattr(proposer, "earlier"):
-            hurried = adapted(proposer, "earlier", steps, wanted.copy())
+        hurried = adapted(proposer, "earlier", steps, wanted.copy())
+        if hurried is not proposer:
             proposal, wrong = ask(hurried, prefix.poses, prefix.signals, margin, len(wanted), prefix.steps, 0)
             rows.extend([] if proposal is None else [proposal.motions])
             warnings.extend([] if wrong is None else [wrong])

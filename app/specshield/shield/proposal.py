@@ -58,13 +58,26 @@ def joined(*proposals: Proposal) -> Proposal:
 
 
 def adapted(proposer: Proposer, how: str, *told: object) -> Proposer:
-    """What its method `how` returns, `on_body` for example; itself where it has none, or that raises."""
+    """What its method `how` returns, `on_body` for example; itself where it has none. Where that raises, a
+    proposer that raises the same when it is asked: so the answer says why the policy was not used.
+    """
     try:
         found: Proposer = getattr(proposer, how)(*told) if hasattr(proposer, how) else proposer
-    except Exception:
-        log.warning("a policy failed in `%s`", how, exc_info=True)
-        return proposer
+    except Exception as error:
+        return _Failed(proposer.task, error)
     return found
+
+
+@dataclass(frozen=True)
+class _Failed:
+    """In place of a proposer that could not be told of something."""
+
+    task: Task
+    error: Exception
+    id = "failed"
+
+    def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
+        raise self.error
 
 
 def ask(

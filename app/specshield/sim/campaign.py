@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import cache
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 
 import numpy as np
 
@@ -19,9 +20,9 @@ from specshield.sim.cases import Case, load_case
 from specshield.sim.episodes import Episode, with_shield, without_shield
 from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import Pose
-from specshield.sim.service import follow_parent
 
 PATIENCE = 60.0  # [s] for one decision: other work may share the machine
+MOST_ROBOTS = 8  # processes at once, of 190 MB each; chosen by hand
 DRAWS = 100  # starts tried for one episode before giving up
 
 
@@ -48,7 +49,8 @@ def robots(url: str) -> Executor:
     """A process for each core that drives robots, through clients of the service at `url`: the models of
     several robots would wait for each other in one.
     """
-    return ProcessPoolExecutor(os.cpu_count() or 1, get_context("spawn"), _begin_process, (url,))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ProcessPoolExecutor(min(cores, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
 
 
 def run(
@@ -71,7 +73,7 @@ def run(
             finished.result()
             on_progress(done)
     except BaseException:
-        robots.shutdown(wait=False, cancel_futures=True)
+        robots.shutdown(cancel_futures=True)  # those that drive come to their end
         raise
     pairs = [future.result() for future in futures]
     refused = sum(p[2] for p in pairs)
@@ -84,9 +86,16 @@ _case = cache(load_case)
 
 def _begin_process(url: str) -> None:
     global _client
-    follow_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _client = ShieldClient(url, timeout=PATIENCE)
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _pair(name: str, i: int, seed: int, named: bool) -> tuple[Episode, Episode, int]:

@@ -155,5 +155,7 @@ def test_ways_for_an_earlier_deadline_are_proposed_after_the_motions_that_are_as
 
     assert earlier("F[0,10] A", FORWARD, A=5)[:, :5].tolist() == [[FORWARD] * 5]
     assert earlier("F[0,10] A", LEFT, NORTH, A=5).shape == (0, 10)  # that is three turns and five cells
+    for both in ("F[0,10] A and F[10,11] B", "F[10,11] B and F[0,10] A"):  # a window of two steps stays
+        assert earlier(both, FORWARD, A=5, B=5)[:, :5].tolist() == [[FORWARD] * 5]
     assert earlier("G[0,10] A", FORWARD, A=0).shape == (0, 10)  # nothing has a deadline
     assert earlier("F[0,10] A", FORWARD, robot=RESTLESS, A=5).shape == (0, 10)

@@ -132,18 +132,20 @@ def hurried(guide: Guide, early: int, past: float, history: Floats, signals: Flo
     past, history (t + 1, 3), signals (t + 1, S): as `recall` has them.
     """
     rules = guide.rules._replace(b=guide.rules.b.copy(), c1=guide.rules.c1.copy())
-    least = _hasten(guide.rules, early, past, history, signals, rules.b, rules.c1) if guide.wait >= 0 else 0
-    return guide._replace(rules=rules, tables=guide.tables._replace(early=least)), least > 0
+    if guide.wait < 0:
+        return guide, False
+    least, sooner = _hasten(guide.rules, early, past, history, signals, rules.b, rules.c1)
+    return guide._replace(rules=rules, tables=guide.tables._replace(early=least)), sooner
 
 
 @kernel
 def _hasten(
     rules: Rules, early: int, past: float, history: Floats, signals: Floats, b: Ints, c1: Ints
-) -> int:
-    """Brings the ends b, c1 (K,) of `hurried` forward; by how much at least [steps], 0 where none is."""
+) -> tuple[int, bool]:
+    """Brings the ends b, c1 (K,) of `hurried` forward; by how much at least [steps], and whether one is."""
     status, run = np.empty(rules.kind.shape[0], np.int8), np.empty(rules.kind.shape[0], np.int64)
     recall(rules, past, history, signals, status, run)
-    least = 0
+    least, met, moved = 0, False, False
     for k in range(rules.kind.shape[0]):
         dwells = rules.kind[k] == EVENTUALLY_ALWAYS
         end = rules.c1[k] if dwells else rules.b[k]
@@ -155,8 +157,9 @@ def _hasten(
             c1[k] = sooner
         else:
             b[k] = sooner
-        least = min(least, end - sooner) if least > 0 else end - sooner
-    return least
+        least = min(least, end - sooner) if met else end - sooner
+        met, moved = True, moved or sooner < end
+    return least, moved
 
 
 @kernel

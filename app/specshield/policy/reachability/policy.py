@@ -162,7 +162,7 @@ class ReachabilityPolicy(Carded):
                 )
             if preferred >= 0:
                 proposals.append(Proposal(motions[chosen], int(preferred)))
-            if not (self.guess or self.early) and (len(self.barred) or not self.told):
+            if not self.guess and self.wanted is None and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
                 if guide.wait >= 0 and not is_known(guide, past, history, rows, free):
                     around = go_around(guide, past, history, rows, self._fields, poses, ways, POSES)

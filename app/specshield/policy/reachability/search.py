@@ -154,7 +154,7 @@ def _first_steps(
 
 @leaf
 def _some_in_time(wanted: Bools, twin: Ints, slacks: Floats, lowest: float) -> bool:
-    """Whether a motion that is wanted (M,) has a slack of at least `lowest`. Twins are wanted together."""
+    """Wants twins together. Whether a motion that is wanted (M,) has a slack of `lowest` [steps] or more."""
     some = False
     for m in range(wanted.shape[0]):
         wanted[twin[m]] |= wanted[m]
