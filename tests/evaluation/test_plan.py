@@ -4,13 +4,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from evaluation import campaigns, plan
 from evaluation.experiment import Experiment, split
 from evaluation.houses import houses_in, load_house_case
-
-HOUSES = Path(__file__).parents[3] / "shared" / "data" / "houses"
+from tests.houses import HOUSES, needs_houses
 
 
 def test_every_method_of_the_plan_is_one_and_no_experiment_is_run_twice():
@@ -42,7 +39,7 @@ def test_a_campaign_that_fails_is_told_and_the_others_are_run(tmp_path, monkeypa
     assert plan.carry_out(tmp_path / "out", page, [], ["cases"], 0.001, 1) == 1
 
 
-@pytest.mark.skipif(not HOUSES.is_dir(), reason="the ProcTHOR houses are not beside the project")
+@needs_houses
 def test_every_procthor_house_beside_the_project_is_a_case():
     found = houses_in(HOUSES)
     assert [Path(path).stem for path in found] == [f"house_{i}" for i in (0, 1, 10, 14, 2, 5)]

@@ -1,17 +1,16 @@
 """What pages of other origins reach in a real browser: nothing. Needs Chromium on the machine."""
 
 import json
-import shutil
 import subprocess
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from tests.browsing import CHROMIUM, needs_chromium
 from tests.serving import HUNG
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+pytestmark = needs_chromium
 ATTACKS = """<!doctype html><body><iframe name="sink"></iframe><img src="/wait"><script>
 const target = "%(target)s", told = {};
 const grid = JSON.stringify(%(grid)s);

@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -16,10 +15,10 @@ from specshield.service import description
 from specshield.service.app import create_app
 from specshield.service.examples import POLICY
 from specshield.service.settings import Settings
+from tests.browsing import CHROMIUM, needs_chromium
 from tests.serving import HUNG
 
 COMMITTED = Path(__file__).parents[2] / "openapi.json"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +189,7 @@ def body_of(operation, told):
     return told["components"]["schemas"][content["schema"]["$ref"].rsplit("/", 1)[1]]["examples"][0]
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed")
+@needs_chromium
 def test_the_page_is_there_without_the_internet(server, tmp_path):
     """A browser that can resolve no name but the server's draws the page."""
     picture = tmp_path / "docs.png"

@@ -11,9 +11,10 @@ import httpx
 import pytest
 
 from tests.browsing import browsing, needs_chromium
+from tests.houses import HOUSES, needs_houses
 from tests.service.world import ahead, grid_json
 from tests.serving import serving
-from tests.world.test_procthor import HOUSES, SIZES, house
+from tests.world.test_procthor import SIZES, house
 
 pytestmark = needs_chromium
 SHOTS = os.environ.get("SPECSHIELD_SCREENSHOTS")  # a folder for pictures of every screen
@@ -161,7 +162,7 @@ def test_a_map_far_from_its_frames_origin_is_drawn_on_as_any(own):
     assert complaints == []
 
 
-@pytest.mark.skipif(not HOUSES.exists(), reason="the folder of real houses is not here")
+@needs_houses
 def test_a_real_house(own):
     """A ProcTHOR house with its rooms and a place that is drawn: it is seen why the robot may not go straight
     on at first; pushed, and with an obstacle, it keeps the rule to its end.

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from specshield.errors import SampleError
-from specshield.stl import SATISFIED_ABOVE, Formula, Verdict, parse, robustness, robustness_bounds, verdict
+from specshield.stl import SATISFIED_ABOVE, parse, robustness, robustness_bounds, verdict
 from tests.stl.formulas import finite, formulas, terms, traces
 
 INF = math.inf
@@ -63,7 +63,7 @@ def test_sound_monotone_and_tight_in_the_end(data: st.DataObject) -> None:
         lo, hi = robustness_bounds(formula, prefix)
         assert previous[0] <= lo <= rho <= hi <= previous[1]
         previous = (lo, hi)
-        now = verdict(float(lo), float(hi))
+        now = verdict(formula, prefix)
         assert decided in ("pending", now)
         decided = now
     assert previous == (rho, rho)
@@ -79,23 +79,25 @@ def test_batches() -> None:
     assert lo.shape == hi.shape == (2,)
 
 
-def said_of(formula: Formula, prefix: dict[str, list[float]]) -> Verdict:
-    low, high = robustness_bounds(formula, prefix)
-    return verdict(float(low), float(high))
-
-
 def test_zero_is_not_satisfied() -> None:
-    assert said_of(parse("x"), {"x": [0.0]}) == "violated"
-    assert said_of(parse("x"), {"x": [5e-324]}) == "satisfied"
-    assert said_of(parse("not x"), {"x": [0.0]}) == "violated"
+    assert verdict(parse("x"), {"x": [0.0]}) == "violated"
+    assert verdict(parse("x"), {"x": [5e-324]}) == "satisfied"
+    assert verdict(parse("not x"), {"x": [0.0]}) == "violated"
 
 
 def test_an_always_to_the_horizon_stays_pending_until_its_last_step() -> None:
     formula = parse("G[0,150] not Forbidden")
     kept = [-1.0] * 151
-    assert said_of(formula, {"Forbidden": kept[:150]}) == "pending"
-    assert said_of(formula, {"Forbidden": kept}) == "satisfied"
-    assert said_of(formula, {"Forbidden": [*kept[:3], 0.0]}) == "violated"
+    assert verdict(formula, {"Forbidden": kept[:150]}) == "pending"
+    assert verdict(formula, {"Forbidden": kept}) == "satisfied"
+    assert verdict(formula, {"Forbidden": [*kept[:3], 0.0]}) == "violated"
+
+
+def test_a_margin_asks_for_more() -> None:
+    formula = parse("F[0,2] x")
+    assert verdict(formula, {"x": [0.2]}, margin=0.3) == "pending"
+    assert verdict(formula, {"x": [0.2]}) == "satisfied"
+    assert verdict(formula, {"x": [0.2, 0.1, 0.3]}, margin=0.3) == "violated"
 
 
 def test_what_a_prefix_cannot_be() -> None:
@@ -103,3 +105,5 @@ def test_what_a_prefix_cannot_be() -> None:
         robustness_bounds(parse("F[0,9] x"), {"x": [1.0, math.nan]})
     with pytest.raises(SampleError, match="'1 / x' is not finite at step 1"):
         robustness_bounds(parse("F[0,9] 1 / x > 2"), {"x": [1.0, 0.0]})
+    with pytest.raises(SampleError, match="one trajectory"):
+        verdict(parse("x"), {"x": [[1.0]]})

@@ -228,7 +228,7 @@ def test_wrong_messages_are_refused_by_path(info, data, path):
     assert caught.value.expected
 
 
-@pytest.mark.skipif(not MAPS.is_dir(), reason="the maps of navigation2 are not beside the project")
+@pytest.mark.skipif(not MAPS.is_dir(), reason="there is no folder ../shared/data/maps")
 @pytest.mark.parametrize(
     ("name", "shape", "origin", "darkest_free", "point", "inside"),
     [

@@ -1,7 +1,6 @@
 import copy
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +9,8 @@ from scipy import ndimage
 from specshield.errors import MapError
 from specshield.world.procthor import load_house
 from specshield.world.regions import Union, signed_distance
+from tests.houses import HOUSES, needs_houses
 
-HOUSES = Path(__file__).parents[3] / "shared/data/houses"
 SIZES = {
     "Bed": {"type": "Bed", "size": [1.0, 0.5, 2.0]},
     "Lamp": {"type": "Lamp", "size": [0.2, 0.4, 0.2]},
@@ -226,7 +225,7 @@ def sizes():
     return json.loads((HOUSES / "asset-sizes.json").read_text())
 
 
-@pytest.mark.skipif(not HOUSES.is_dir(), reason="the ProcTHOR houses are not beside the project")
+@needs_houses
 @pytest.mark.parametrize("number", [0, 1, 2, 5, 10, 14])
 def test_procthor_houses(number, sizes):
     plan = json.loads((HOUSES / f"house_{number}.json").read_text())

@@ -42,7 +42,7 @@ from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.doubt import recovered, tried_again
 from specshield.shield.surprise.slip import SAME_POSE, with_begun
 from specshield.shield.taught import doubtful, handed_on, on_map, teach, wary
-from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds, verdict
+from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds, verdict_between
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
 
@@ -100,7 +100,7 @@ def close(
     """The verdict on an episode's states [t + 1, 3], and the bounds on its robustness."""
     prefix = shield.task.samples(_history(history), signals)
     low, high = (float(v) for v in robustness_bounds(shield.task.formula, prefix))
-    return verdict(low, high), (low, high)
+    return verdict_between(low, high), (low, high)
 
 
 def decide(
@@ -134,7 +134,7 @@ def decide(
     foreseen = residual is not None and max(residual) <= SAME_POSE
     care = wary(shield.config, care, taught, shield is not before or (foreseen and tail is not None))
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
-    spec_status = verdict(prefix.low, prefix.high)
+    spec_status = verdict_between(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
     margin_decided = prefix.low > asked or prefix.high <= asked  # whatever follows, it is kept or it is not
 

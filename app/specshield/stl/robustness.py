@@ -78,9 +78,24 @@ def unseen_bounds(formula: Formula) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def verdict(low: float, high: float) -> Verdict:
-    """What bounds on rho say of the formula. Unless it is "pending", every continuation has this verdict."""
-    return "satisfied" if low > SATISFIED_ABOVE else "violated" if high <= SATISFIED_ABOVE else "pending"
+def verdict(formula: Formula, prefix: Mapping[str, ArrayLike], margin: float = SATISFIED_ABOVE) -> Verdict:
+    """Whether the prefix of one trajectory, samples [n], decides that rho > margin [m].
+
+    A verdict other than "pending" is the verdict on every continuation too.
+    """
+    low, high = robustness_bounds(formula, prefix)
+    if low.ndim:
+        raise SampleError(
+            "a verdict is about one trajectory, not a batch",
+            got=list(low.shape),
+            expected="samples of shape [n]",
+        )
+    return verdict_between(float(low), float(high), margin)
+
+
+def verdict_between(low: float, high: float, margin: float = SATISFIED_ABOVE) -> Verdict:
+    """What bounds on rho [m] say of a formula."""
+    return "satisfied" if low > margin else "violated" if high <= margin else "pending"
 
 
 @dataclass(frozen=True)

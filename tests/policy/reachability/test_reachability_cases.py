@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +16,9 @@ from specshield.shield.episode import Config, decide, make_shield, start
 from specshield.sim.cases import case_names, load_case
 from specshield.task import make_task
 from specshield.world.procthor import load_house
+from tests.houses import HOUSES, needs_houses
 from tests.oracles.judge import margin
 
-HOUSES = Path(__file__).parents[4] / "shared" / "data" / "houses"
 END = STRETCH.action_names.index("end")
 
 
@@ -83,7 +82,7 @@ def test_thirty_wandering_episodes_keep_the_rule_and_never_fall_back(name):
     assert min(judged) > 0.0
 
 
-@pytest.mark.skipif(not HOUSES.exists(), reason="the houses lie beside the repository and are not there")
+@needs_houses
 def test_a_real_house_with_a_dwell_and_rooms_to_visit():
     sizes = json.loads((HOUSES / "asset-sizes.json").read_text())
     grid, rooms = load_house(json.loads((HOUSES / "house_0.json").read_text()), sizes, 0.05)

@@ -126,14 +126,14 @@ def fill(n: int, wait: int, x: float, y: float, theta: float, motions: Ints, pos
 
 def hurried(guide: Guide, early: int, past: float, history: Floats, signals: Floats) -> tuple[Guide, bool]:
     """The guide for deadlines that come `early` steps earlier, though no window keeps less than half its
-    length: those of every F that is open at step t and can still be met so early; and whether one is. None is
-    for a robot that cannot wait.
+    length: those of every F that is open at step t and can still be met so early. And whether any deadline
+    does come earlier; for a robot that cannot wait, none does.
 
     past, history (t + 1, 3), signals (t + 1, S): as `recall` has them.
     """
-    rules = guide.rules._replace(b=guide.rules.b.copy(), c1=guide.rules.c1.copy())
     if guide.wait < 0:
         return guide, False
+    rules = guide.rules._replace(b=guide.rules.b.copy(), c1=guide.rules.c1.copy())
     least, sooner = _hasten(guide.rules, early, past, history, signals, rules.b, rules.c1)
     return guide._replace(rules=rules, tables=guide.tables._replace(early=least)), sooner
 

@@ -140,7 +140,7 @@ class ReachabilityPolicy(Carded):
         proposals = []
         for past in pasts(rules, history, rows):
             guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
-            if self.early:
+            if self.wanted is not None:
                 guide, sooner = hurried(guide, self.early, past, history, rows)
                 if not sooner:
                     continue

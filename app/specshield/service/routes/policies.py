@@ -122,14 +122,23 @@ def _show(server: Server, record: Record, owner: str) -> dict[str, Any]:
 
 
 def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
+    training, about = _training(server, record), record.about
     return {
-        **vars(_training(server, record)),
-        **vars(record.about),
         "id": record.id,
         "name": name,
+        "status": training.status,
+        "progress": training.progress,
+        "eta_s": training.eta_s,
+        "error": training.error,
         "metrics": (record.card or {}).get("metrics", {}),
         "warnings": _warnings(record),
+        "map_id": about.map_id,
+        "robot": about.robot,
+        "spec": about.spec,
         "horizon": record.horizon,
+        "method": about.method,
+        "seed": about.seed,
+        "options": about.options,
         "created_at": record.created_at,
     }
 
