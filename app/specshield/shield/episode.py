@@ -42,7 +42,8 @@ from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.doubt import recovered, tried_again
 from specshield.shield.surprise.slip import SAME_POSE, with_begun
 from specshield.shield.taught import doubtful, handed_on, on_map, teach, wary
-from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds, verdict_between
+from specshield.stl import SATISFIED_ABOVE, Verdict, robustness_bounds
+from specshield.stl.robustness import verdict_between
 
 __all__ = ["Carry", "Config", "Decision", "Shield", "check_place", "close", "decide", "make_shield", "start"]
 

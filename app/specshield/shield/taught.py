@@ -122,8 +122,7 @@ def teach(
     if config.learn_map and carry is not None and carry.t == t - 1:
         told = known is NONE and occupied is None and free is None and not stuck and followed.drawn >= 0
         if told and _goes_as_told(shield.body, poses[-2], carry.next_poses[followed.drawn], poses[-1]):
-            nothing_new = Taught(followed=moved_on(followed))
-            return nothing_new, ()
+            return Taught(followed=moved_on(followed)), ()
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
         drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
         halts = halts_at(stuck, poses[-1], drawn, near)

@@ -75,9 +75,8 @@ def run(
     except BaseException:
         robots.shutdown(cancel_futures=True)  # those that drive come to their end
         raise
-    pairs = [future.result() for future in futures]
-    refused = sum(p[2] for p in pairs)
-    return Campaign(load_case(case), seed, [p[0] for p in pairs], [p[1] for p in pairs], refused)
+    shielded, unshielded, refused = zip(*(future.result() for future in futures), strict=True)
+    return Campaign(load_case(case), seed, list(shielded), list(unshielded), sum(refused))
 
 
 _client: ShieldClient | None = None  # of a process that drives robots

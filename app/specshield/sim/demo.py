@@ -12,7 +12,7 @@ from pathlib import Path
 
 from specshield.sim import picture, report
 from specshield.sim.campaign import Campaign, robots, run
-from specshield.sim.cases import case_names
+from specshield.sim.cases import case_names, load_case
 from specshield.sim.progress import StatusLine, duration
 from specshield.sim.service import own_server
 
@@ -32,8 +32,7 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
                 campaigns.append(_campaign(several, name, runs, seed, status))
                 first = campaigns[-1].shielded[0], campaigns[-1].unshielded[0]
                 # In one of the processes, while the others go on with the next case.
-                drawn = several.submit(picture.draw, campaigns[-1].case, *first, out / f"{name}.png")
-                pictures.append(drawn)
+                pictures.append(several.submit(picture.draw, load_case(name), *first, out / f"{name}.png"))
             for drawn in pictures:
                 drawn.result()
         status.clear()
