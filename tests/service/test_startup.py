@@ -11,6 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from specshield import compiled
 from specshield.client import ShieldClient
 from specshield.errors import Starting, TransportError
 from specshield.service.startup import mark_of_kernels
@@ -18,9 +19,14 @@ from tests.serving import serving, wait_for
 
 
 @pytest.fixture
-def held(tmp_path):
-    """A folder of kernels with none in it, and the lock that a server needs to compile them."""
+def held(tmp_path, monkeypatch):
+    """A folder of kernels with none in it, and the lock that a server needs to compile them.
+
+    They are for a processor of which the package holds none, whatever was started from it before.
+    """
     kernels = tmp_path / "kernels"
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    monkeypatch.setattr(compiled.config, "CPU_NAME", "generic")
     kernels.mkdir()
     lock = os.open(kernels / f"{mark_of_kernels().name}.lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_EX)
