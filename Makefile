@@ -5,6 +5,8 @@ PYTHON ?= $(shell for name in python3.11 python3 python3.12 python3.13 python3.1
 BIN := .venv/bin
 # A clone shares no compiled kernels with another, and keeps its own between runs.
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
+# Its tests start some 200 processes; without bytecode on the disk each compiles all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install demo run test wheels lint lines docs bench reliability results openapi clean
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 
 import pytest
@@ -10,6 +11,11 @@ from evaluation.shipped import shipped
 from specshield.shield.episode import Shield, make_shield
 from specshield.sim.cases import Case, case_names, load_case
 from tests.serving import RunningServer, serving
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: without this, each full collection looks at a million objects again."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
