@@ -149,11 +149,29 @@ def half_bodies(url: str) -> None:
     _at_once(16, send)
 
 
+def changing_maps(url: str) -> None:
+    """No attack: four robots that see a new obstacle at every step, ten steps a second, so that each decides
+    on a map of its own and tables are made anew all the time.
+    """
+    random = np.random.default_rng(0)
+
+    def see(pose: list[float]) -> dict[str, Any]:
+        angle, far = random.uniform(-np.pi, np.pi), random.uniform(1.0, 2.0)
+        thing = [pose[0] + far * np.cos(angle), pose[1] + far * np.sin(angle)]
+        return {"occupied": [[thing[0] + dx, thing[1] + dy] for dx in (0.0, 0.05) for dy in (0.0, 0.05)]}
+
+    def drive(client: httpx.Client) -> None:
+        body = {"policy_id": "case1", "initial_pose": START, "allow_infeasible": True, "map_memory": 10}
+        _step_until(client, body, time.monotonic() + LASTS, 0.1, see)
+
+    _at_once(4, lambda: _with_client(url, drive))
+
+
 ATTACKS: dict[str, Callable[[str], None]] = {
     made.__name__: made
     for made in (
         big_map, wrong_map, listing, expensive_house, planners, endless_lookahead, unknown_fields,
-        connections, headers, half_bodies,
+        connections, headers, half_bodies, changing_maps,
     )
 }  # fmt: skip
 
@@ -213,8 +231,17 @@ def _policy(client: httpx.Client, body: dict[str, Any]) -> str | None:
     return None
 
 
-def _step_until(client: httpx.Client, body: dict[str, Any], end: float, pause: float = 0.0) -> list[float]:
-    """Steps through sessions until `end`, every action as it is drawn; the milliseconds of each answer."""
+def _step_until(
+    client: httpx.Client,
+    body: dict[str, Any],
+    end: float,
+    pause: float = 0.0,
+    see: Callable[[list[float]], dict[str, Any]] = lambda pose: {},
+) -> list[float]:
+    """Steps through sessions until `end`, every action as it is drawn; the milliseconds of each answer.
+
+    see: what a step says beside pose and logits.
+    """
     took = list[float]()
     session: dict[str, Any] | None = None
     while time.monotonic() < end:
@@ -222,9 +249,8 @@ def _step_until(client: httpx.Client, body: dict[str, Any], end: float, pause: f
             session = client.post("/v1/sessions", json=body).raise_for_status().json()
             pose, t, logits = body["initial_pose"], 0, [0.0] * len(session["actions"])
         began = time.perf_counter()
-        answer = client.post(
-            f"/v1/sessions/{session['id']}/steps", json={"t": t, "poses": [pose], "logits": logits}
-        )
+        step = {"t": t, "poses": [pose], "logits": logits, **see(pose)}
+        answer = client.post(f"/v1/sessions/{session['id']}/steps", json=step)
         took.append(1000 * (time.perf_counter() - began))
         if answer.status_code != 200 or answer.json()["finished"] or t > 100:
             session = None

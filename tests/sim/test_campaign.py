@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import time
 
 import numpy as np
 import pytest
@@ -59,6 +60,14 @@ def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
         assert second.kl == first.kl
     assert again.shielded[0].start == again.unshielded[0].start
     assert campaign.shielded[1].start != campaign.shielded[0].start
+
+
+def test_robots_that_are_called_off_while_they_are_sent_out_do_not_set_out(server):
+    sent = []
+    with pytest.raises(KeyboardInterrupt), robots(server.url) as several:
+        sent += [several.submit(time.sleep, 0.1) for _ in range(500)]
+        raise KeyboardInterrupt
+    assert sum(each.cancelled() for each in sent) > 400
 
 
 def test_the_table_says_what_happened(campaign):

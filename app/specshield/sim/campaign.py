@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import get_context, parent_process
@@ -45,12 +46,17 @@ class Campaign:
         return [episode for episode in self.shielded if episode.spec_status != "satisfied"]
 
 
-def robots(url: str) -> Executor:
+@contextmanager
+def robots(url: str) -> Iterator[Executor]:
     """A process for each core that drives robots, through clients of the service at `url`: the models of
-    several robots would wait for each other in one.
+    several robots would wait for each other in one. What has not begun at the end of the block is left.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ProcessPoolExecutor(min(cores, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
+    pool = ProcessPoolExecutor(min(cores, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)  # those that drive come to their end
 
 
 def run(
@@ -68,13 +74,9 @@ def run(
     server that has no others.
     """
     futures = [robots.submit(_pair, case, i, seed, named) for i in range(runs)]
-    try:
-        for done, finished in enumerate(as_completed(futures), 1):
-            finished.result()
-            on_progress(done)
-    except BaseException:
-        robots.shutdown(cancel_futures=True)  # those that drive come to their end
-        raise
+    for done, finished in enumerate(as_completed(futures), 1):
+        finished.result()
+        on_progress(done)
     shielded, unshielded, refused = zip(*(future.result() for future in futures), strict=True)
     return Campaign(load_case(case), seed, list(shielded), list(unshielded), sum(refused))
 

@@ -56,12 +56,10 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
 
 def _tell(campaigns: Sequence[Campaign], runs: int, seed: int, out: Path) -> None:
     print(f"{runs} episodes a case, seed {seed}, over HTTP\n")
-    for campaign in campaigns:
-        case = campaign.case
+    for case in (campaign.case for campaign in campaigns):
         print(f'{case.name}  {case.task.formula}\n       model: "{case.instruction}"')
     print(f"\n{report.table(campaigns)}\n")
-    for campaign in campaigns:
-        print(f"picture: {out / f'{campaign.case.name}.png'}")
+    print("\n".join(f"picture: {out / campaign.case.name}.png" for campaign in campaigns))
 
 
 def _campaign(several: Executor, case: str, runs: int, seed: int, status: StatusLine) -> Campaign:
