@@ -64,9 +64,14 @@ def test_an_episode_is_decided_by_its_seed_alone(campaign, case, server):
 
 def test_robots_that_are_called_off_while_they_are_sent_out_do_not_set_out(server):
     sent = []
-    with pytest.raises(KeyboardInterrupt), robots(server.url) as several:
-        sent += [several.submit(time.sleep, 0.1) for _ in range(500)]
-        raise KeyboardInterrupt
+
+    def interrupted():
+        with robots(server.url) as several:
+            sent.extend(several.submit(time.sleep, 0.1) for _ in range(500))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     assert sum(each.cancelled() for each in sent) > 400
 
 
