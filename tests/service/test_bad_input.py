@@ -346,6 +346,8 @@ def test_policies_trained_elsewhere(client, unchanged, files, path):
         ({"id": "../x"}, "invalid-input", "id"),
         ({"id": "{x}"}, "invalid-input", "id"),
         ({"seed": 1.5}, "invalid-input", "seed"),
+        ({"uncertainty": "nne"}, "invalid-input", "uncertainty"),
+        ({"uncertainty": {"slip": 0.1}}, "invalid-input", "uncertainty.translation"),
     ],
 )
 def test_sessions(client, policy, unchanged, fields, type, path):

@@ -61,6 +61,13 @@ def test_a_session_that_looks_ahead(begin, step):
     assert answer["spec_status"] == "satisfied"
 
 
+@pytest.mark.parametrize("formula", ["x < 9", "F[0,0] x < 9"])
+def test_a_rule_that_is_over_at_once_leaves_nothing_to_look_ahead_to(client, begin, step, formula):
+    made = send_policy(client, spec={"formula": formula, "regions": {}})
+    session = begin(policy_id=made["id"], shaping="lookahead")
+    assert step(session, 0, [START], logits=LOGITS).json()["mode"] == "prior"
+
+
 def test_sessions_that_are_prepared_keep_no_step_waiting(client, policy, begin, step):
     """As many at once as there are threads for decisions, each for a task of its own: they take seconds."""
     session, count = begin(), (os.cpu_count() or 1) + 1

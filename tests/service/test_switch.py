@@ -117,7 +117,8 @@ def test_what_cannot_be_kept_changes_nothing(client, begin, step, switch):
     before, record = state(client, session), record_of(client, session)
     for spec, fields in ((TOO_SOON, {"clock": "restart"}), (TOO_SOON, {}), (BOTH, {"clock": "restart"})):
         for poses_sent in ({}, {"poses": [poses[3]]}):
-            problem(switch(session, 3, spec, **fields, **poses_sent), 422, "infeasible-switch")
+            told = problem(switch(session, 3, spec, **fields, **poses_sent), 422, "infeasible-switch")
+            assert ("restart" in told["expected"]) == ("clock" not in fields)
     problem(switch(session, 3, LATER, poses=[[99.0, 1.5, 0.0]], robot=CRAWLER), 422, "invalid-pose")
     assert problem(switch(session, 5, LATER), 409, "history-gap")["expected_t"] == 3
     problem(switch(session, 3, LATER, clock="later"), 422, "invalid-input")

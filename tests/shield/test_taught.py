@@ -214,6 +214,13 @@ def test_a_decision_is_the_same_where_the_carry_was_stored_and_the_process_is_an
     assert again.witness == first.witness
 
 
+def test_points_under_the_robot_are_ignored_and_said():
+    """Such as a scanner sees of the robot itself."""
+    decision = decide(shield_of(30), [START], None, True, occupied=[START[:2]])
+    assert decision.map_revision == 0
+    assert decision.warnings == ("`occupied` points under the robot were ignored: it stands there",)
+
+
 def test_points_outside_the_map_are_ignored_and_said():
     decision = decide(shield_of(30), [START], None, True, occupied=[(50.0, 1.0)])
     assert decision.map_revision == 0
@@ -381,6 +388,21 @@ def test_whoever_pauses_within_the_time_that_is_left_is_there_in_time(steps, unc
             if decision.spec_status != "pending":
                 break
         assert decision.spec_status == "satisfied", pause
+
+
+@pytest.mark.parametrize("uncertainty", [None, Uncertainty()])
+def test_who_was_held_for_too_long_is_driven_on_all_the_same(uncertainty):
+    """Nothing led anywhere for 14 steps, so the goal is reached too late; then everything works again."""
+    grid, goal = OccupancyGrid(np.zeros((20, 80), bool), 0.05), {"Goal": GOAL | {"center": [3.5, 0.5]}}
+    policy = synthesise(make_task(grid, STRETCH, "F[0,24] Goal", goal), Settings(pitch=0.1))
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=uncertainty))
+    poses, carry = [(0.4, 0.5, math.pi)], None  # with a wall before it
+    for t in range(24):
+        decision = decide(shield, poses, None, True, carry=carry)
+        carry, motion = decision.carry, int(STRETCH.motion_of[decision.action])
+        poses.append(poses[-1] if 2 <= t < 16 else step(shield.body, *poses[-1], motion))
+    assert decision.mode == "fallback"
+    assert poses[-1][0] - poses[16][0] > 1.0
 
 
 @pytest.mark.parametrize("learn_map", [False, True])

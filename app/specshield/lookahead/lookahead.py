@@ -81,7 +81,8 @@ class LookAhead:
         """As `Preference.step`. The memory is the belief.
 
         The log-weight of an action is -trust * D of the pose it leads to, D taken from its least value: at
-        most 0, and 0 for a terminal action, where nothing is known, and until the rule has cost FORCED.
+        most 0, and 0 for a terminal action, where nothing is known, until the rule has cost FORCED, and once
+        it is over.
         """
         if len(memory) != len(begun := self.begin()):  # it was written by another version
             memory = begun
@@ -97,7 +98,8 @@ class LookAhead:
         possible = float(prior[feasible & ~robot.terminal].sum()) / float(going_on.sum())
         forced = -float(going_on.sum()) * math.log(possible) if possible > 0.0 else FORCED
         belief = beliefs.update(belief, self.body, self.goals, pose, blocked, said, end, max(forced, 0.0))
-        if belief.forced < FORCED or belief.trust < NEGLIGIBLE:
+        over = len(history) > self.task.horizon  # no motion changes what the rule says
+        if over or belief.forced < FORCED or belief.trust < NEGLIGIBLE:
             return belief.to_bytes(), np.zeros(len(prior))
         costs = self._costs(belief, history, signals)
         return belief.to_bytes(), np.where(robot.terminal, 0.0, -belief.trust * costs[robot.motion_of])

@@ -152,6 +152,10 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
             path="Content-Type",
             expected="the header Content-Type: application/json",
         )
+    # Where a word or an object would do, an object is told what it lacks, not that it is no word.
+    found = [
+        e for e in found if e["type"] != "literal_error" or not isinstance(e.get("input"), dict)
+    ] or found
     listed = [
         {
             "path": ".".join(filter(None, (below, _path(item, body)[:200]))),
@@ -165,7 +169,9 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
     kind = next((FIELD_ERRORS[part] for part in parts if part in FIELD_ERRORS), InputError)
     wrong = {"missing": "is missing", "extra_forbidden": "is not a field of this request"}
     message = f"{first['path'] or 'the body'} {wrong.get(found[0]['type'], 'is not valid')}"
-    return kind(message, path=first["path"], got=first["got"], expected=first["expected"], errors=listed)
+    ways = dict.fromkeys(each["expected"] for each in listed if each["path"] == first["path"])
+    expected = " or ".join(ways)
+    return kind(message, path=first["path"], got=first["got"], expected=expected, errors=listed)
 
 
 def _expected(item: Mapping[str, Any]) -> str:
@@ -176,6 +182,8 @@ def _expected(item: Mapping[str, Any]) -> str:
         "extra_forbidden": "the fields that /docs lists",
         "missing": "a value: this field is required",
         "union_tag_not_found": "a value: this field is required",
+        "model_type": "an object",
+        "model_attributes_type": "an object",
     }
     return told.get(item["type"], said.removeprefix("Value error, ").removeprefix("Input should be "))
 

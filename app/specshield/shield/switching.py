@@ -28,7 +28,5 @@ def switch(
         rho = [value for value in found.robustness if value is not None]
         best = f"the best robustness found is {max(rho):.3f}" if rho else "; ".join(found.warnings)
         why = f"no way from here was found that keeps it: {best}"
-    raise InfeasibleSwitch(
-        f"the new rule was not taken: {why}", path="policy_id",
-        expected="a rule that can be kept from x_t; or clock 'restart'",
-    )  # fmt: skip
+    expected = "a rule that can be kept from x_t" + ("; or clock 'restart'" if len(history) > 1 else "")
+    raise InfeasibleSwitch(f"the new rule was not taken: {why}", path="policy_id", expected=expected)

@@ -154,15 +154,20 @@ def teach(
                 # A cell along the front was touched, which replaces a guess. A guess replaces nothing.
                 kept = known.cell if by == BEHIND else known.cell[known.by != BEHIND]
                 known = learn(grid, known, t, np.setdiff1d(cells, kept), True, by)
-    beyond = 0
+    beyond, said = 0, list[str]()
     for name, points in (("free", free), ("occupied", occupied)):  # what is both is taken for occupied
         if points is not None:
             cells, outside = cells_of(grid, check_points(points, name))
+            if name == "occupied":
+                seen, cells = cells, np.setdiff1d(cells, cells_under(shield.body, poses[-1], UNDER))
+                if len(cells) < len(seen):
+                    said.append("`occupied` points under the robot were ignored: it stands there")
             known = learn(grid, known, t, cells, name == "occupied")
             beyond += outside
-    said = (f"{beyond} points lie outside the map and were ignored",) if beyond else ()
+    if beyond:
+        said.append(f"{beyond} points lie outside the map and were ignored")
     own = known if known is before.map else revised(before.map, known)
-    return Taught(own, followed, motion >= 0 or on >= 0, stuck, near), said
+    return Taught(own, followed, motion >= 0 or on >= 0, stuck, near), tuple(said)
 
 
 @leaf

@@ -12,7 +12,7 @@ import numpy as np
 
 from specshield.robot.dynamics import step
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Futures, Prefix
+from specshield.shield.feasibility import Futures, Prefix, futures
 from specshield.shield.judgement import Judged
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.recovery import most_kept, recovers
@@ -79,7 +79,12 @@ def recovered(
     if judged.some or not recovers(shield.config):
         return judged
     tried = judged.tried
-    first, lost, said = most_kept(shield, judged.part, tried)
+    first, lost, said, helps = most_kept(shield, judged.part, tried)
+    if not helps:  # by what is believed, which may be why
+        free = on_map(told, revised(taught.map, forget(taught.map, taught.map.occupied)))
+        ways = futures(prefix, free.body, free.proposers, None, (0.0,))
+        first, lost, said, helps = most_kept(free, judged.part, ways)
+        first = first if helps else ways.preferred
     awaited = _awaited(told, shield, taught, prefix, tail, status, care)
     if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)

@@ -25,16 +25,17 @@ def recovers(config: Config) -> bool:
 
 def most_kept(
     shield: Shield, prefix: Prefix, tried: Futures
-) -> tuple[int, tuple[Formula, ...], tuple[str, ...]]:
+) -> tuple[int, tuple[Formula, ...], tuple[str, ...], bool]:
     """The first motion of the future that keeps most of `prefix.formula`, the parts that it gives up, the
-    safest first, and a sentence for each of them.
+    safest first, a sentence for each of them, and whether that is better than to stand for ever.
     """
-    whole = np.empty_like(tried.poses)
-    for motions, poses in zip(tried.motions, whole, strict=True):
+    whole = np.empty((len(tried.motions) + 1, *tried.poses.shape[1:]))
+    whole[-1] = prefix.poses[-1]
+    for motions, poses in zip(tried.motions, whole[:-1], strict=True):
         simulate(shield.body, prefix.poses[-1], motions, poses)
-    futures = replace(tried, poses=whole)
-    left, said, lost = np.ones(len(tried.motions), np.bool_), list[str](), list[Formula]()
-    nearest = np.zeros(len(tried.motions))
+    futures = replace(tried, poses=whole, motions=np.append(tried.motions, tried.motions[:1], 0))
+    left, said, lost = np.ones(len(whole), np.bool_), list[str](), list[Formula]()
+    nearest = np.zeros(len(whole))
     for part in sorted(conjuncts(prefix.formula), key=_order):
         rho, _ = rho_of(prefix.of(part), futures)
         keeps = left & (rho > SATISFIED_ABOVE)
@@ -44,8 +45,9 @@ def most_kept(
         nearest = nearest if said else rho
         lost.append(part)
         said.append(f"no way was found to keep {part}: the nearest misses it by {-rho[left].max():.3g}")
-    first = int(tried.motions[int(np.argmax(np.where(left, nearest, -np.inf))), 0])
-    return first, tuple(lost), tuple(said)
+    nearest = np.where(left, nearest, -np.inf)
+    best = int(np.argmax(nearest[:-1]))
+    return int(tried.motions[best, 0]), tuple(lost), tuple(said), bool(nearest[best] > nearest[-1])
 
 
 def given_up(prefix: Prefix) -> tuple[str, ...]:
