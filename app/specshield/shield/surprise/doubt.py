@@ -80,14 +80,15 @@ def recovered(
         return judged
     tried = judged.tried
     first, lost, said, helps = most_kept(shield, judged.part, tried)
-    if not helps:  # by what is believed, which may be why
-        free = on_map(told, revised(taught.map, forget(taught.map, taught.map.occupied)))
-        ways = futures(prefix, free.body, free.proposers, None, (0.0,))
-        first, lost, said, helps = most_kept(free, judged.part, ways)
-        first = first if helps else ways.preferred
     awaited = _awaited(told, shield, taught, prefix, tail, status, care)
     if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
+    elif not helps:  # what is believed of contacts may be why
+        known = taught.map
+        free = on_map(told, revised(known, forget(known, known.occupied & (known.by != SENT))))
+        ways = futures(prefix, free.body, free.proposers, None, (0.0,))
+        first, _, said, helps = most_kept(free, judged.part, ways)
+        first = first if helps else ways.preferred
     tried = replace(tried, warnings=(*tried.warnings, *said))
     return replace(judged, tried=tried, completion=int(shield.task.robot.representative[first]))
 
