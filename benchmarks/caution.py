@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.states import starts
+from benchmarks.episodes import driven
 from benchmarks.timing import quietest, summary
 from evaluation.experiment import SESSIONS, Experiment
 from evaluation.methods import Shielded
@@ -28,8 +28,6 @@ from specshield.shield.decision import Config
 from specshield.shield.episode import Shield, decide, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.sim.cases import Case, load_case
-from specshield.sim.learned.model import load_learned
-from specshield.sim.robot import SimulatedRobot
 
 REPEATS = 3
 SETTINGS = {"none": Config(), "default": SESSIONS["default"]}
@@ -67,22 +65,9 @@ def main() -> None:
 
 def seconds(case: Case, shield: Shield, episodes: int, seed: int) -> Iterator[float]:
     """What each decision takes while the rule is pending."""
-    model, terminal = load_learned(case.instruction), case.task.robot.terminal
-    for episode, begun in enumerate(starts(shield, episodes, seed)):
-        robot = SimulatedRobot(case, tuple(begun.history[0].tolist()))
-        model.reset(np.random.default_rng([seed, episode]))
-        poses, over, carry = [robot.pose], False, None
-        while len(poses) <= case.task.horizon:
-            logits = None if over else model.logits(robot)
-            asked = (shield, np.array(poses), logits, over, None, carry)
-            decision = decide(*asked)
-            if decision.spec_status != "pending":
-                break
-            yield quietest(lambda asked=asked: decide(*asked), REPEATS)
-            over = over or bool(terminal[decision.action])
-            robot.execute(decision.completion_action if over else decision.action)
-            poses.append(robot.pose)
-            carry = decision.carry
+    for poses, logits, over, carry, _ in driven(case, shield, episodes, seed):
+        asked = (shield, poses, logits, over, None, carry)
+        yield quietest(lambda asked=asked: decide(*asked), REPEATS)
 
 
 if __name__ == "__main__":

@@ -51,8 +51,10 @@ class Asked:
         return {"pose": self.pose, "logits": self.logits, "over": self.over, "first": self.first}
 
 
-def episodes(case: Case, shield: Shield, count: int, seed: int) -> Iterator[Asked]:
-    """Every state of `count` episodes at which the rule is pending."""
+def driven(case: Case, shield: Shield, count: int, seed: int) -> Iterator[tuple[Any, ...]]:
+    """Every state of `count` episodes at which the rule is pending: the poses so far [t + 1, 3], logits [A],
+    whether the main task is over, the carry, and what was decided of them.
+    """
     model, terminal = load_learned(case.instruction), case.task.robot.terminal
     for episode, begun in enumerate(starts(shield, count, seed)):
         robot = SimulatedRobot(case, tuple(begun.history[0].tolist()))
@@ -63,12 +65,18 @@ def episodes(case: Case, shield: Shield, count: int, seed: int) -> Iterator[Aske
             decision = decide(shield, poses, logits, over, carry=carry)
             if decision.spec_status != "pending":
                 break
-            told = None if logits is None else logits.tolist()
-            yield Asked(list(robot.pose), told, over, len(poses) == 1, is_near(decision, terminal))
+            yield np.array(poses), logits, over, carry, decision
             over = over or bool(terminal[decision.action])
             robot.execute(decision.completion_action if over else decision.action)
             poses.append(robot.pose)
             carry = decision.carry
+
+
+def episodes(case: Case, shield: Shield, count: int, seed: int) -> Iterator[Asked]:
+    for poses, logits, over, _, decision in driven(case, shield, count, seed):
+        told = None if logits is None else logits.tolist()
+        near = is_near(decision, case.task.robot.terminal)
+        yield Asked(poses[-1].tolist(), told, over, len(poses) == 1, near)
 
 
 def is_near(decision: Decision, terminal: np.ndarray[Any, np.dtype[np.bool_]]) -> bool:

@@ -16,9 +16,9 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 APP = REPOSITORY / "app"
 PACKAGE = APP / "specshield"
 TRUSTED = ("stl", "world", "robot", "task.py", "rule", "shield")  # what the guarantee rests on
-MOST_TRUSTED = 7_623  # lines of the trusted core
+MOST_TRUSTED = 7_599  # lines of the trusted core
 AIM = 17_000  # lines of app/ that the project wants to come down to
-MOST = 37_851
+MOST = 37_827
 LONGEST = 350  # lines of one module
 FULLEST = 14  # files in one folder, at one level
 

@@ -22,9 +22,7 @@ from specshield.quick import quick
 
 MOST_TRANSLATION = 10.0  # [m] a motion that is less certain than this is none. Chosen by hand.
 CHANCE = 0.01  # that margin and slack do not suffice in an episode: half of it for each. Chosen by hand.
-MENDED = (
-    0.1  # [rad] a heading that is off by this costs a motion to mend; a Stretch's smallest turn is 6 degrees
-)
+MENDED = 0.1  # [rad] a heading off by this costs a motion to mend; a Stretch's smallest turn is 6 degrees
 HARDER = 2.0  # times the noise itself: what it costs in motions (docs/uncertainty.md)
 
 

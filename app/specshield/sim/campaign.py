@@ -49,7 +49,7 @@ class Campaign:
 @contextmanager
 def robots(url: str) -> Iterator[Executor]:
     """A process for each core that drives robots, through clients of the service at `url`: the models of
-    several robots would wait for each other in one. What has not begun at the end of the block is left.
+    several robots would wait for each other in one. What has not begun by the end of the block is called off.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     pool = ProcessPoolExecutor(min(cores, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))

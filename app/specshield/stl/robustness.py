@@ -86,7 +86,7 @@ def verdict(formula: Formula, prefix: Mapping[str, ArrayLike], margin: float = S
     low, high = robustness_bounds(formula, prefix)
     if low.ndim:
         raise SampleError(
-            "a verdict is about one trajectory", got=list(low.shape), expected="one, of shape [n]"
+            "a verdict is about one trajectory", got=list(low.shape), expected="samples of shape [n]"
         )
     return verdict_between(float(low), float(high), margin)
 

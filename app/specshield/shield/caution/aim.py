@@ -63,19 +63,9 @@ def aim(
     def at(most: int) -> tuple[Best, bool]:
         rows, robustness = np.empty(motions, np.int64), np.empty(motions)
         highest = _best_open(
-            parts,
-            still,
-            prefix.t,
-            asked,
-            most,
-            leaves,
-            whole,
-            tried.motions,
-            follows,
-            margin,
-            rows,
-            robustness,
-        )
+            parts, still, prefix.t, asked, most, leaves, whole, tried.motions, follows, margin,
+            rows, robustness,
+        )  # fmt: skip
         return Best(robustness, rows), highest > margin
 
     motions = len(task.robot.motions)

@@ -30,9 +30,7 @@ NOISE_WEIGHT, SLIP_WEIGHT = 20.0, 60.0  # [motions] what is assumed of it
 SLIPS_AT_ALL = 0.5  # the assumed probability that motions slip, before the first
 EXACT = 1e-6  # [m] and [rad]: what ends this near to where f has it shows no noise
 SURE = 3  # [motions] that have shown none, after which there is none but for what is seen
-STRAY = (
-    0.25  # of a motion's length: what misses by more than this, and than noise does, was stopped on its way
-)
+STRAY = 0.25  # of a motion's length: what misses by more, and by more than noise, was stopped
 MOST_ODDS = 1e6  # so that what changes late is still noticed
 TINY = 1e-9  # [motions]
 BESIDE = 0.2  # [m] from the footprint, which may be told wrong: what is so near may be met. By hand.

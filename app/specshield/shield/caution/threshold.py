@@ -56,20 +56,9 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         parts, leaves = _from_now_on(parts, leaves, prefix, tried)
     sigma = math.hypot(noise.move, care.stride * noise.turn)
     _chances(
-        parts,
-        begins,
-        still,
-        prefix.t,
-        noise,
-        care.stride,
-        sigma,
-        care.margin,
-        leaves,
-        tried.rho,
-        tried.motions,
-        task.robot.wait_motion,
-        values,
-    )
+        parts, begins, still, prefix.t, noise, care.stride, sigma, care.margin,
+        leaves, tried.rho, tried.motions, task.robot.wait_motion, values,
+    )  # fmt: skip
     motion_of = task.robot.motion_of
     if judged.some:
         values[doubts & ~judged.feasible_motion] = 0.0

@@ -72,7 +72,8 @@ def recovered(
     status: Verdict, care: Care,
 ) -> Judged:  # fmt: skip
     """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words. If what is
-    in the way may go again, it is waited for, as long as that gives up no more.
+    in the way may go again, it is waited for, as long as that gives up no more. Where no future is better
+    than to stand for ever, contacts and what led nowhere are set aside: they may be why.
 
     told: the shield on the policy's map; shield: on the session's own.
     """
