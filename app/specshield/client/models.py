@@ -105,7 +105,7 @@ class Beginning(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Residual:
-    """How far x_t lies from where the last action should have led: [m], [rad]."""
+    """How far x_t lies from the nearest pose that the last decision foresaw: [m], [rad]."""
 
     translation: float
     rotation: float

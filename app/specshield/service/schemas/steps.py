@@ -118,7 +118,7 @@ class StepResponse(Answer):
     in_collision: bool = Field(description="x_t touches an obstacle: the world is what it is.")
     next_poses: list[Pose] = Field(description="f(x_t, a) for each action.")
     residual: Residual | None = Field(
-        description="How far x_t is from where the executed action should have led."
+        description="How far x_t is from the nearest pose that the last decision foresaw."
     )
     warnings: list[str] = Field(
         description="What did not go as it should, such as a policy whose proposal could not be used."

@@ -22,8 +22,8 @@ from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
 Near = tuple[float, float]  # [m], [rad] poses this near may be one, but for noise
-# Of a robot of which nothing is known: five times the noise of a Stretch's controller (0.01 m, 0.5 degrees;
-# DESIGN.md, section 4). Chosen by hand.
+# Of a robot of which nothing is known: five times the noise of a Stretch's controller (0.01 m, 0.5 degrees,
+# as SPOC's stochastic controller has it). Chosen by hand.
 NEAR: Near = (0.05, math.radians(2.5))
 
 ARC = math.radians(25.0)  # [rad] to both sides of straight ahead: where a contact is most likely. By hand.
