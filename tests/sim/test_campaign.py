@@ -1,8 +1,12 @@
 """Campaigns through the SDK against a real server, and what is made of them."""
 
 import dataclasses
+import multiprocessing
+import os
 import re
+import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 import pytest
@@ -13,6 +17,7 @@ from specshield.sim import canvas, picture, report
 from specshield.sim.campaign import robots, run
 from specshield.stl import parse
 from tests.oracles.judge import margin
+from tests.serving import HUNG, wait_for
 
 RUNS = 20  # with seed 0: the episodes of `make demo`
 SEED = 0
@@ -22,6 +27,25 @@ SEED = 0
 def campaign(server, case):
     with robots(server.url) as several:
         yield run(several, case.name, RUNS, seed=SEED)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_an_interrupt_while_a_robots_process_begins_leaves_none_behind(server, monkeypatch):
+    """The exit of Python waits for every process: one that nobody tells to end keeps it waiting for ever."""
+
+    def begun(pool, begin=ProcessPoolExecutor._adjust_process_count):
+        begin(pool)
+        (id,) = pool._processes
+        wait_for(lambda: len(os.listdir(f"/proc/{id}/task")) > 1)  # it waits for work: numpy has its threads
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ProcessPoolExecutor, "_adjust_process_count", begun)
+    before = multiprocessing.active_children()
+    with pytest.raises(KeyboardInterrupt), robots(server.url) as several:
+        run(several, "case1", 1, SEED)
+    for left in {*multiprocessing.active_children()}.difference(before):
+        left.join(HUNG)
+    assert set(multiprocessing.active_children()) <= set(before)
 
 
 def test_with_the_shield_the_rule_is_kept_and_without_it_broken(campaign, case):

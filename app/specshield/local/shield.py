@@ -118,11 +118,13 @@ class LocalShield:
         method: str = DEFAULT,
         options: Mapping[str, Any] | None = None,
         seed: int = 0,
+        check: bool = True,
     ) -> LocalShield:
         """A policy made on the spot, by reachability in about a second.
 
         world: a grid, the path of a map's `.yaml`, or a map as the API takes it in JSON, with its `format`.
-        rooms: named areas beside those that the map brings. The rest is as in the SDK's `policies.create`.
+        rooms: named areas beside those that the map brings. check: whether to try some random starts, and to
+        warn of what they show. The rest is as in the SDK's `policies.create`.
         """
         grid, own = _read_world(world)
         made_robot = robot if isinstance(robot, Robot) else robot_from_json(robot)
@@ -133,7 +135,7 @@ class LocalShield:
         made = how.make(task, settings, Run(seed))
         weights = made.weights()
         policy = load_policy(weights, made.card, task)
-        card = {**made.card, "warnings": list(notices(policy))}
+        card = {**made.card, "warnings": list(notices(policy)) if check else []}
         for notice in card["warnings"]:
             log.warning("%s", notice)
         return _prepared(policy, card, weights)
@@ -222,11 +224,9 @@ def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
     images = [image for kind in (".pgm", ".png") if (image := path.with_suffix(kind)).is_file()]
     if not path.is_file() or not images:
         raise MapError(
-            "no map can be read there",
-            path="world",
-            got=str(path),
+            "no map can be read there", path="world", got=str(path),
             expected="a .yaml with its image beside it",
-        )
+        )  # fmt: skip
     named = path.with_suffix(".regions.json")
     areas = json.loads(named.read_text()) if named.is_file() else {}
     rooms = parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})

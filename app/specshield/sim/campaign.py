@@ -10,7 +10,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from multiprocessing import get_context, parent_process
+from multiprocessing import active_children, get_context, parent_process
 
 import numpy as np
 
@@ -52,21 +52,21 @@ def robots(url: str) -> Iterator[Executor]:
     several robots would wait for each other in one. What has not begun by the end of the block is called off.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    others = active_children()
     pool = ProcessPoolExecutor(min(cores, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
     try:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)  # those that drive come to their end
+        # An interrupt that comes while a process is started leaves one of which the pool does not know.
+        for left in {*active_children()}.difference(others):
+            left.terminate()
 
 
 def run(
-    robots: Executor,
-    case: str,
-    runs: int,
-    seed: int,
-    on_progress: Callable[[int], None] = lambda _: None,
-    named: bool = False,
-) -> Campaign:
+    robots: Executor, case: str, runs: int, seed: int,
+    on_progress: Callable[[int], None] = lambda _: None, named: bool = False,
+) -> Campaign:  # fmt: skip
     """`runs` pairs of episodes of a case, the i-th decided by `seed` and i alone. on_progress: how many are
     done.
 
