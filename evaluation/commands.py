@@ -23,7 +23,7 @@ def evaluate(
         ),
     ] = "",
     noise: Annotated[
-        str, typer.Option(help="none, gaussian, rough, slip, obstacle, shift, collider; or some.")
+        str, typer.Option(help="none, gaussian, rough, slip, short, obstacle, shift, collider; or some.")
     ] = "none",
     model: Annotated[str, typer.Option(help="The model that is to be kept to the rule.")] = "learned",
     house: Annotated[

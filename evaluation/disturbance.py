@@ -5,6 +5,7 @@
                 controller; standing still does not
     rough       the same, twice as much
     slip        one motion in twenty does nothing
+    short       every motion goes nine tenths of its way, and turns as it should
     obstacle    something 0.3 m wide, on no map, stands on the way that was certified at the start
     shift       walls and furniture stand 0.05 m from where the map has them, along x or y
     collider    the robot's footprint lies 0.109 m behind its origin, as a Stretch's does, and the shield was
@@ -31,11 +32,12 @@ from specshield.sim.robot import Pose
 from specshield.task import Task
 from specshield.world.occupancy import OccupancyGrid
 
-DISTURBANCES = ("none", "gaussian", "rough", "slip", "obstacle", "shift", "collider")
+DISTURBANCES = ("none", "gaussian", "rough", "slip", "short", "obstacle", "shift", "collider")
 MOVED = ("obstacle", "shift")  # those in which the world itself is another
 SIGMA_MOVE, SIGMA_TURN = 0.01, math.radians(0.5)  # [m], [rad]
 ROUGHNESS = {"gaussian": 1.0, "rough": 2.0}  # times the two
 SLIP = 0.05
+SHORT = 0.1  # of a motion's way
 OBSTACLE, SHIFT = 0.3, 0.05  # [m]
 AWAY = 0.8  # [m] an obstacle keeps this far from the start and from the target
 PASSABLE = 0.25  # [m] clearance of the space that an obstacle must not cut apart
@@ -76,6 +78,9 @@ def executed(name: str, body: Body, before: Pose, after: Pose, random: np.random
         return after
     if name == "slip" and chance < SLIP:
         return before
+    if name == "short":
+        x, y = (b + (1.0 - SHORT) * (a - b) for a, b in zip(after[:2], before[:2], strict=True))
+        return x, y, after[2]
     if name in ROUGHNESS:
         move, turn = ROUGHNESS[name] * SIGMA_MOVE, ROUGHNESS[name] * SIGMA_TURN
         x, y, theta = after[0] + move * noise[0], after[1] + move * noise[1], wrap(after[2] + turn * noise[2])

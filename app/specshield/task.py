@@ -175,11 +175,9 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
             )
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not -LARGEST <= value <= LARGEST:
             raise SampleError(
-                "a signal's initial value has to be a number in range",
-                path=f"signals.{name}",
-                got=value,
-                expected=SIGNAL,
-            )
+                "a signal's initial value has to be a number in range", path=f"signals.{name}",
+                got=value, expected=SIGNAL,
+            )  # fmt: skip
     return {name: float(value) for name, value in signals.items()}
 
 

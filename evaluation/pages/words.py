@@ -65,6 +65,7 @@ NOISES = {
     "none": "the world is as the shield was told",
     "gaussian": "every motion ends off by sigma 0.01 m along x and along y, and by sigma 0.5 degrees",
     "slip": "5 % of the motions do nothing",
+    "short": "every motion goes nine tenths of its way",
     "rough": "every motion ends off by twice as much as under gaussian",
     "obstacle": "a box 0.3 m wide that is on no map stands on the way that was certified at the start",
     "shift": "walls and furniture stand 0.05 m from where the map has them, along x or y",

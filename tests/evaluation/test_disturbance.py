@@ -42,6 +42,13 @@ def test_one_motion_in_twenty_slips(case):
     assert (poses[~stayed] == after).all()
 
 
+def test_short_strides_go_nine_tenths_of_their_way(case):
+    before = (4.5, 5.0, 0.3)
+    after, poses = ends("short", case, before, 2)
+    for pose in poses:
+        np.testing.assert_allclose(pose - before, [0.9, 0.9, 1.0] * (after - before), atol=1e-12)
+
+
 @pytest.mark.parametrize("name", disturbance.DISTURBANCES)
 def test_standing_still_is_never_disturbed(case, name):
     pose, random = (4.5, 5.0, 0.3), np.random.default_rng(0)

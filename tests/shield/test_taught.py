@@ -413,3 +413,24 @@ def test_ways_for_the_slack_are_asked_for_on_the_way_by_robots_that_may_be_inexa
         False,
     ]
     assert not wary(exact, Care(0.0, 3), Taught(), True).on_way
+
+
+def test_a_caller_who_draws_by_itself_and_waits_has_run_into_nothing():
+    """Its robot is exact, and nothing stands there. By chance it seems to do what was drawn for a while."""
+    wanted = {"m": 0.0, "p": 3.0, "ls": -2.0, "rs": -2.0}  # p: stand
+    logits = np.array([wanted.get(name, -np.inf) for name in STRETCH.action_names])
+    for seed in range(60):
+        shield = shield_of(80, learn_map=True, uncertainty=Uncertainty(), seed=seed)
+        own, poses, carry = np.random.default_rng(seed), [START], None
+        for _ in range(12):
+            found = decide(shield, poses, logits, carry=carry)
+            assert found.map_revision == 0
+            carry, action = found.carry, int(own.choice(len(logits), p=found.distribution))
+            poses.append(step(shield.body, *poses[-1], int(STRETCH.motion_of[action])))
+
+
+@pytest.mark.parametrize("far", [1e4, 1e19, -1.7e308])
+def test_a_pose_that_no_robot_can_have_is_answered(far):
+    shield = shield_of(learn_map=True, uncertainty=Uncertainty())
+    carry = decide(shield, [START], None, True).carry
+    assert decide(shield, [START, (far, 1.0, 0.0)], None, True, carry=carry).in_collision

@@ -35,6 +35,14 @@ def test_motions_as_foreseen_let_go():
     assert slack[0] >= 7 > slack[1] > slack[2]
 
 
+def test_turns_on_the_spot_say_nothing_of_a_stride():
+    """Else the first of a robot's strides that are 5 % short is a contact, of which nothing is learned."""
+    noise = noise_of(STRETCH, walked(Seen(), [MOVES[1]] * 10))
+    assert noise.move >= 0.005
+    noise = noise_of(STRETCH, walked(Seen(), [MOVES[1]] * 10 + [0.95 * MOVES[0]] * 10))
+    assert 0.002 < noise.move < 0.01
+
+
 @pytest.mark.parametrize("times", [0.5, 1.0, 3.0])
 def test_noise_is_found_out(times):
     random = np.random.default_rng(0)
@@ -101,23 +109,30 @@ def cells(formula):
 
 
 def test_margin_and_slack_begin_cautious_and_let_go_and_what_was_given_is_the_least():
-    world = cells("F[0,12] A and F[14,30] A")
-    policy = Scripted(
-        world,
-        lambda t, motion: {WAIT: [FORWARD], LEFT: [RIGHT, FORWARD], RIGHT: [LEFT, FORWARD]}.get(motion, []),
-    )
+    world = cells("F[8,20] A and F[22,38] A")
+    way = [
+        FORWARD,
+        LEFT,
+        LEFT,
+        FORWARD,
+        RIGHT,
+        RIGHT,
+        FORWARD,
+        WAIT,
+    ]  # three moves, of which A is the last's end
+    policy = Scripted(world, lambda t, motion: way[t + 1 :] if motion == way[t] else [])
     for config in (
         Config(uncertainty=Uncertainty()),
         Config(uncertainty=Uncertainty(), margin=0.01, slack=1),
     ):
         shield, history, carry, said = make_shield([policy], config), [world.pose(0, 0, 0)], None, []
-        for motion in [LEFT, RIGHT, LEFT, RIGHT]:
+        for motion in way:
             found = decide(shield, history, np.zeros(5), carry=carry)
             said.append((found.margin, found.slack))
             carry = found.carry
             history.append(world.pose(*world.after(world.state(history[-1]), motion)))
         assert said[0][0] > 0.03
-        assert said[-1][0] == config.margin
+        assert said[-1][0] == pytest.approx(config.margin, abs=1e-9)
         assert said[0][1] >= said[-1][1] >= config.slack
 
 

@@ -128,11 +128,9 @@ def robot_from_json(spec: Any) -> Robot:
     items = spec["actions"]
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ACTIONS:
         raise RobotError(
-            "a robot has a list of actions",
-            path="actions",
-            got=type(items).__name__,
+            "a robot has a list of actions", path="actions", got=type(items).__name__,
             expected=f"1 to {MAX_ACTIONS} actions",
-        )
+        )  # fmt: skip
     actions = tuple(_action(item, f"actions[{i}]") for i, item in enumerate(items))
     names = [action.name for action in actions]
     for i, name in enumerate(names):
@@ -187,11 +185,9 @@ def _action(item: Any, path: str) -> Action:
 def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
     if not isinstance(item, dict):
         raise RobotError(
-            "not an object",
-            path=path or None,
-            got=type(item).__name__,
+            "not an object", path=path or None, got=type(item).__name__,
             expected=f"an object with {sorted(required)}",
-        )
+        )  # fmt: skip
     missing, unknown = required - item.keys(), item.keys() - required - optional
     if missing or unknown:
         said = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(map(str, unknown))}"

@@ -174,7 +174,7 @@ def decide(
     margin, slack = (care.margin, care.least) if judged is None else (judged.margin, judged.slack)
     remembered = None
     if seen is not None:
-        follows = shield.config.learn_map and taught.followed.follows
+        follows = shield.config.learn_map and taught.followed.surely
         done = answer.distribution
         if follows:
             done = np.zeros(len(robot.actions))
@@ -211,8 +211,10 @@ def decide(
         carry=Carry(
             t, nexts, certified, memory, residuals=remembered,
             threshold_left=left if shield.config.threshold_over == "episode" else None,
-            learned=handed_on(shield, taught, int(robot.motion_of[moved])), action=action,
-            stuck=taught.stuck,
+            learned=handed_on(
+                shield, taught, int(robot.motion_of[moved]), moved, answer.distribution, nexts, poses[-1]
+            ),
+            action=action, stuck=taught.stuck,
         ),
     )  # fmt: skip
 

@@ -21,7 +21,7 @@ from specshield.compiled import kernel, leaf
 from specshield.quick import quick
 from specshield.robot.barred import NOTHING_BARRED, is_barred
 from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
-from specshield.shield.caution.experience import was_stopped, went_on, within_noise
+from specshield.shield.caution.experience import SELDOM, chance_of, was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Config, Shield, Stuck
 from specshield.shield.feasibility import Prefix
 from specshield.shield.proposal import adapted
@@ -60,7 +60,7 @@ SAME_PLACE = 1e-6  # [m]; what rounding explains
 KEPT = 64  # bodies of learned maps in a process: 0.4 MB each in a flat of 10 x 10 m at 5 cm
 
 
-HEAD = struct.Struct("<h?hB")  # what `Followed` holds
+HEAD = struct.Struct("<h?hB3f")  # what `Followed` holds
 MOST_MET = 255  # contacts at one pose that HEAD can hold
 NEVER_DRAWN = Followed()
 
@@ -86,11 +86,10 @@ class Taught:
         """[n, 6]: what no future goes by where another keeps the rule."""
         return barred_by(self.stuck, self.near) if self.stuck else NOTHING_BARRED
 
-    def to_bytes(self, drawn: int | None = None) -> bytes:
-        """drawn: the motion that was drawn since; None: none was."""
-        known, met = self.followed, min(self.followed.met, MOST_MET)
-        head = HEAD.pack(known.drawn if drawn is None else drawn, known.follows, known.halted, met)
-        return head + self.map.to_bytes()
+    def to_bytes(self) -> bytes:
+        known = self.followed
+        told = known.follows, known.halted, min(known.met, MOST_MET), known.alone, known.going, known.standing
+        return HEAD.pack(known.drawn, *told) + self.map.to_bytes()
 
     @staticmethod
     def from_bytes(value: bytes | None) -> Taught:
@@ -122,7 +121,7 @@ def teach(
     if config.learn_map and carry is not None and carry.t == t - 1:
         told = known is NONE and occupied is None and free is None and not stuck and followed.drawn >= 0
         if told and _goes_as_told(shield.body, poses[-2], carry.next_poses[followed.drawn], poses[-1]):
-            return Taught(followed=moved_on(followed)), ()
+            return Taught(followed=moved_on(followed, as_drawn=True)), ()
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
         drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
         halts = halts_at(stuck, poses[-1], drawn, near)
@@ -276,13 +275,21 @@ def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Float
     return shield if proposers is shield.proposers else replace(shield, body=body, proposers=proposers)
 
 
-def handed_on(shield: Shield, taught: Taught, drawn: int) -> bytes | None:
+def handed_on(
+    shield: Shield, taught: Taught, drawn: int, moved: int, distribution: Floats, nexts: Floats, pose: Floats
+) -> bytes | None:
     """What the next decision has to know; None where nothing was learned, and nothing is to be. drawn: the
-    motion that was drawn, -1 for none.
+    motion that was drawn, -1 for none; the rest is as in `remember`.
     """
     if not shield.config.learn_map and not taught.map.revision:
         return None
-    return taught.to_bytes(drawn)
+    followed = replace(taught.followed, drawn=drawn)
+    if followed.follows and followed.alone >= SELDOM:
+        going = chance_of(shield, distribution, moved, nexts, nexts[drawn] if drawn >= 0 else pose)
+        followed = replace(
+            followed, going=going, standing=chance_of(shield, distribution, moved, nexts, pose)
+        )
+    return replace(taught, followed=followed).to_bytes()
 
 
 _bodies: OrderedDict[tuple[str, bytes], Body] = OrderedDict()

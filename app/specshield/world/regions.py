@@ -249,11 +249,9 @@ def region_from_json(spec: Any, path: str) -> Region:
     kind = checks.member(spec, "type", path)
     if not isinstance(kind, str) or kind not in KINDS:
         raise MapError(
-            f"{path} is not a known kind of region",
-            path=f"{path}.type",
-            got=kind,
+            f"{path} is not a known kind of region", path=f"{path}.type", got=kind,
             expected="one of " + ", ".join(KINDS),
-        )
+        )  # fmt: skip
     names = [field.name for field in fields(KINDS[kind])]
     if extra := sorted(set(map(str, spec)) - {"type", *names}):
         raise MapError(
@@ -275,11 +273,9 @@ def _union_from_json(members: Any, path: str) -> Union:
         where = f"{path}.members[{i}]"
         if isinstance(spec, Mapping) and spec.get("type") == "union":
             raise MapError(
-                "a union cannot be a member of a union",
-                path=where,
-                got="union",
+                "a union cannot be a member of a union", path=where, got="union",
                 expected="circle, rectangle or polygon",
-            )
+            )  # fmt: skip
         part = region_from_json(spec, where)
         assert not isinstance(part, Union)
         parts.append(part)

@@ -46,9 +46,9 @@ class Seen(NamedTuple):
 
     moved: how many there were, and lost: how many of them were not executed; both may be fractions. odds: of
     what was seen if motions never slip, to if they do. noisy: how many were measured against f; moves, turns:
-    the sums of their squared residuals [m^2], [rad^2]; exact: how many of them had none. standing: the
-    probability, by the last answer, that the robot is not told to move. slipping: how likely
-    it was to stand, by slips alone, as often in a row as it has now; 1 after a motion that moved it.
+    the sums of their squared residuals [m^2], [rad^2]; exact: how many had none, of those that do not turn on
+    the spot, which says nothing of a stride. standing: the probability, by the last answer, that the robot is
+    not told to move. slipping: how likely it was to stand, by slips alone, as often in a row as it has now.
     """
 
     moved: float = 0.0
@@ -130,15 +130,18 @@ def remember(
     """What is handed on. distribution [A]: of what the robot does, as far as that is known; moved: what is
     executed for a terminal action; nexts [M, 3]: where f leads from the pose (3,).
     """
-    standing = _standing(
-        shield.task.robot.motion_of, distribution, int(shield.task.robot.motion_of[moved]), nexts, pose
-    )
-    return FORMAT.pack(*seen._replace(standing=standing))
+    return FORMAT.pack(*seen._replace(standing=chance_of(shield, distribution, moved, nexts, pose)))
+
+
+def chance_of(shield: Shield, distribution: Floats, moved: int, nexts: Floats, there: Floats) -> float:
+    """The probability that what is done leads to a pose (3,); the rest is as in `remember`."""
+    motion_of = shield.task.robot.motion_of
+    return _leading(motion_of, distribution, int(motion_of[moved]), nexts, there)
 
 
 @kernel
-def _standing(motion_of: Ints, distribution: Floats, ending: int, nexts: Floats, pose: Floats) -> float:
-    """The probability that the robot is not told to move. ending: what a terminal action is followed by."""
+def _leading(motion_of: Ints, distribution: Floats, ending: int, nexts: Floats, pose: Floats) -> float:
+    """The probability of actions that lead to a pose (3,). ending: what a terminal action is followed by."""
     total = 0.0
     for a in range(motion_of.shape[0]):
         m = motion_of[a] if motion_of[a] >= 0 else ending
@@ -201,10 +204,8 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
     far = FAR * (noise.move + noise.turn)
     if still < miss or miss > max(STRAY * way, far):
         # It was to move and did not, or it was to stand: how likely is either?
-        rate, standing = (
-            noise.lost / (noise.lost + noise.kept),
-            seen.standing if still <= EXACT + far else 0.0,
-        )
+        rate = noise.lost / (noise.lost + noise.kept)
+        standing = seen.standing if still <= EXACT + far else 0.0
         asked = (1.0 - standing) * rate
         slipped = noise.slips * asked / (noise.slips * asked + standing) if standing > 0.0 else 1.0
         odds = seen.odds * standing / (standing + asked)
@@ -213,18 +214,17 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
             seen.noisy, seen.moves, seen.turns, seen.exact, seen.standing,
             seen.slipping * _slip(noise) if still < miss else 1.0,
         )  # fmt: skip
+    gone = math.hypot(foreseen[motion, 0] - before[0], foreseen[motion, 1] - before[1])
     dx, dy = pose[0] - foreseen[motion, 0], pose[1] - foreseen[motion, 1]
     return Seen(
-        seen.moved + 1.0,
-        seen.lost,
+        seen.moved + 1.0, seen.lost,
         min(seen.odds * (1.0 + noise.lost / noise.kept), MOST_ODDS),
         seen.noisy + 1.0,
         seen.moves + dx * dx + dy * dy,
         seen.turns + wrap(pose[2] - foreseen[motion, 2]) ** 2,
-        seen.exact + (1.0 if miss <= EXACT else 0.0),
-        seen.standing,
-        1.0,
-    )
+        seen.exact + (1.0 if miss <= EXACT and gone > EXACT else 0.0),
+        seen.standing, 1.0,
+    )  # fmt: skip
 
 
 @leaf

@@ -3,7 +3,7 @@
 The shield knows poses, not what was executed. A pose on the way of a motion, and short of where f leads, is a
 contact of that motion, unless the end of another motion explains it. Where the robot did not move at all, it
 may have slipped, or its caller may have chosen to wait: so that counts only for a caller that executes what
-was drawn, and only the second time in a row.
+was drawn, as one that draws for itself would seldom have seemed to, and only the second time in a row.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from specshield.portable import arctan2
 from specshield.quick import quick
 from specshield.robot.body import centre
 from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
+from specshield.shield.caution.experience import SELDOM
 from specshield.world.learned import BEHIND, CONTACT, LEFT, RIGHT
 
 Near = tuple[float, float]  # [m], [rad] poses this near may be one, but for noise
@@ -37,13 +38,22 @@ UNDER = 0.03  # [m] a footprint that covers a cell by more than this shows it fr
 class Followed:
     """What is known of how the caller follows: the motion drawn last (-1: none), whether all steps so far can
     be what was drawn, and the drawn motion that did nothing in the step before (-1: none). met: how many
-    contacts there were at this very pose.
+    contacts there were at this very pose. alone: how likely a caller that draws by itself does all
+    this. going, standing: how likely it goes where the drawn motion leads, and stays where it is.
     """
 
     drawn: int = -1
     follows: bool = True
     halted: int = -1
     met: int = 0
+    alone: float = 1.0
+    going: float = 1.0
+    standing: float = 0.0
+
+    @property
+    def surely(self) -> bool:
+        """Whether the caller executes what is drawn."""
+        return self.follows and self.alone < SELDOM
 
 
 def contact_of(
@@ -57,10 +67,11 @@ def contact_of(
     """
     drawn = followed.drawn
     if drawn >= 0 and is_near(foreseen[drawn : drawn + 1], after, near):
-        return -1, moved_on(followed)
+        return -1, moved_on(followed, as_drawn=True)
     if is_near(before[None], after, near):  # it stands where it stood
-        if drawn < 0 or not followed.follows:
-            return -1, followed
+        followed = replace(followed, alone=followed.alone * followed.standing)
+        if drawn < 0 or not followed.surely:
+            return -1, replace(followed, halted=-1)
         if followed.halted == drawn or followed.met or again:  # what stopped it a moment ago does so again
             return drawn, replace(followed, halted=-1, met=followed.met + 1)
         return -1, replace(followed, halted=drawn)
@@ -73,8 +84,10 @@ def contact_of(
     return motion, replace(followed, halted=-1, met=1)
 
 
-def moved_on(followed: Followed) -> Followed:
-    """After a motion that met nothing."""
+def moved_on(followed: Followed, as_drawn: bool = False) -> Followed:
+    """After a motion that met nothing. as_drawn: whether it was the one that was drawn."""
+    if as_drawn and followed.alone >= SELDOM and followed.going < 1.0:
+        followed = replace(followed, alone=followed.alone * followed.going)
     return replace(followed, halted=-1, met=0) if followed.halted >= 0 or followed.met else followed
 
 
@@ -147,8 +160,10 @@ def _around(body: Body, pose: Floats, beyond: float) -> tuple[Ints, Floats, Floa
     h, (u, v) = body.resolution, centre(body, *pose)
     reach = body.radius + beyond + h
     height, width = body.occupied.shape
-    rows = np.arange(max(math.floor((v - reach) / h), 0), min(math.floor((v + reach) / h) + 1, height))
-    columns = np.arange(max(math.floor((u - reach) / h), 0), min(math.floor((u + reach) / h) + 1, width))
+    rows, columns = (
+        np.arange(*np.clip(((at - reach) / h, (at + reach) / h + 1.0), 0, side).astype(int))
+        for at, side in ((v, height), (u, width))
+    )
     row, column = (each.ravel() for each in np.meshgrid(rows, columns, indexing="ij"))
     cells = row * width + column
     yaw = math.atan2(body.sin_yaw, body.cos_yaw)
