@@ -1,11 +1,17 @@
 """What is said of the conjuncts of a rule that cannot be kept is true: held against every future on cells."""
 
+import math
+
 import numpy as np
 
 from specshield.handover import begun
+from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.refusal import begin, refusal
 from specshield.reasons.relaxation import relaxations
+from specshield.robot import robot_from_json
 from specshield.shield.episode import decide, make_shield
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import Scripted, waits
 from tests.reasons.rules_on_cells import dwells, until, visits
 
@@ -110,3 +116,16 @@ def test_a_rule_that_is_over_and_was_not_kept_could_still_be_kept_later():
     assert told.proved
     assert "F[0,1] A is broken already" in told.message or "breaks" in told.message
     assert told.conjuncts[0].late_by == 4  # at step 5
+
+
+def test_whoever_lands_exactly_on_an_edge_is_one_step_short():
+    """On the edge rho is 0, which does not satisfy: the search has to go on to the next step."""
+    free = np.zeros((60, 60), bool)
+    robot = robot_from_json({"footprint": {"radius": 0.2}, "actions": [
+        {"name": "forward", "translate": 0.25}, {"name": "left", "rotate": math.pi / 6}, {"name": "wait"},
+        {"name": "end", "terminal": True}]})  # fmt: skip
+    places = {"East": {"type": "rectangle", "min": [4.5, 0.0], "max": [6.0, 6.0]}}
+    task = make_task(OccupancyGrid(free, 0.1), robot, "F[0,12] East", places)
+    found = relaxations(make_shield([synthesise(task)]), np.array([[1.5, 1.5, 0.0]]), {})
+    assert found.way is None
+    assert (found.conjuncts[0].late_by, found.conjuncts[0].feasible_alone) == (1, False)

@@ -44,19 +44,19 @@ class Known:
 
     def past(self, predicate: Formula) -> Bools:
         """Whether a predicate held at each of the steps 0 to t."""
-        return self._holds(predicate, self.task.samples(self.history, self.signals))
+        return self._holds(predicate, self.task.samples(self.history, self.signals), -ROUNDING)
 
-    def at(self, predicate: Formula, poses: Floats) -> Bools:
-        """Whether a predicate holds at poses [n, 3] to come."""
+    def at(self, predicate: Formula, poses: Floats, above: float = -ROUNDING) -> Bools:
+        """Whether a predicate holds at poses [n, 3] to come: its robustness is above that."""
         held = {name: np.array([value]) for name, value in self.held.items()}
-        return self._holds(predicate, self.task.samples(poses, held))
+        return self._holds(predicate, self.task.samples(poses, held), above)
 
-    def _holds(self, predicate: Formula, samples: Mapping[str, Floats]) -> Bools:
+    def _holds(self, predicate: Formula, samples: Mapping[str, Floats], above: float) -> Bools:
         """True, too, where the predicate's arithmetic is not finite on some of them."""
         each = {name: samples[name][:, None] for name in predicate.names}  # every step is a trajectory of one
         count = len(next(iter(each.values()))) if each else 1
         try:
-            return np.asarray(robustness(predicate, each) > -ROUNDING) if each else np.ones(1, np.bool_)
+            return np.asarray(robustness(predicate, each) > above) if each else np.ones(1, np.bool_)
         except SampleError:
             return np.ones(count, np.bool_)
 

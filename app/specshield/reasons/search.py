@@ -19,6 +19,7 @@ from specshield.reasons.ground import Ground
 from specshield.reasons.known import Known, spread
 from specshield.reasons.needs import Need
 from specshield.robot.dynamics import Body, calmest_motion, motion_count
+from specshield.stl import SATISFIED_ABOVE
 
 # Chosen by hand: a search takes a second at most.
 MOST_NODES = 60_000
@@ -99,7 +100,7 @@ def search(
         poses, met, run, parent, motion = poses[keep], met[keep].copy(), run[keep], parent[keep], motion[keep]
         waiting = np.zeros(len(poses), np.bool_)
         for k, goal in enumerate(goals):
-            holds = known.at(goal.need.predicate, poses) & (met >> k & 1 == 0)
+            holds = known.at(goal.need.predicate, poses, SATISFIED_ABOVE) & (met >> k & 1 == 0)
             run[:, k] = np.where(holds & (step >= goal.need.first), run[:, k] + 1, 0)
             met[run[:, k] > goal.need.stay] |= 1 << k
             waiting |= holds & (step < goal.need.first)
@@ -130,7 +131,7 @@ def _kept(known: Known, guards: Sequence[Need], poses: Floats, step: int) -> Boo
     keep = np.ones(len(poses), np.bool_)
     for guard in guards:
         if guard.first <= step <= guard.end:
-            keep &= known.at(guard.predicate, poses)
+            keep &= known.at(guard.predicate, poses, SATISFIED_ABOVE)
     return keep
 
 
@@ -139,7 +140,7 @@ def _so_far(known: Known, goals: Sequence[Wanted], poses: Floats, met: Ints) -> 
     keep = np.ones(len(poses), np.bool_)
     for k, goal in enumerate(goals):
         if goal.need.before is not None:
-            keep &= (met >> k & 1 == 1) | known.at(goal.need.before, poses)
+            keep &= (met >> k & 1 == 1) | known.at(goal.need.before, poses, SATISFIED_ABOVE)
     return keep
 
 
