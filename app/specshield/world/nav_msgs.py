@@ -34,9 +34,8 @@ def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
     except (ValueError, OverflowError):
         values = np.array(None)
     if values.dtype.kind != "i" or values.ndim != 1:
-        raise MapError(
-            "data has to hold integers alone", path="data", expected="integers from -1 (unknown) to 100"
-        )
+        i = next((i for i, value in enumerate(data) if type(value) is not int or abs(value) > 100), 0)
+        raise checks.wrong("occupancy", f"data[{i}]", data[i], "an integer from -1 (unknown) to 100")
     wrong = np.flatnonzero((values < UNKNOWN) | (values > 100))
     if wrong.size:
         i = int(wrong[0])
