@@ -14,7 +14,14 @@ import numpy as np
 import pytest
 
 from specshield.client import ShieldClient
-from specshield.errors import HistoryConflict, InfeasibleStart, InfeasibleSwitch, NotFound, SessionFinished
+from specshield.errors import (
+    HistoryConflict,
+    HistoryGap,
+    InfeasibleStart,
+    InfeasibleSwitch,
+    NotFound,
+    SessionFinished,
+)
 from specshield.local import LocalShield
 from specshield.world.occupancy import OccupancyGrid
 from tests.service.world import grid_json, policy_files, send_policy
@@ -120,16 +127,9 @@ def test_a_server_switches_the_same(server: RunningServer) -> None:
 
 def test_a_model_that_ends_is_asked_again_under_another_rule(server: RunningServer, tmp_path: Path) -> None:
     """The rule is kept and `end` drawn: no server has been told so, and another rule is taken."""
-    there, here, begins = list[str](), list[LocalShield](), (1.0, 1.5, 0.0)
-    with httpx.Client(base_url=server.url, verify=False, timeout=60.0) as client:
-        assert client.post("/v1/maps", json=grid_json()).status_code == 201
-        for formula in ("F[0,5] x > 0.5", "F[0,20] x > 1.5"):
-            spec: dict[str, Any] = {"formula": formula, "regions": {}}
-            there.append(send_policy(client, spec=spec)["id"])
-            parts = policy_files(spec)
-            (tmp_path / "policy.safetensors").write_bytes(parts["weights"])
-            (tmp_path / "card.json").write_bytes(parts["card"])
-            here.append(LocalShield.load(tmp_path, grid_json()))
+    begins = (1.0, 1.5, 0.0)
+    rules = ({"formula": "F[0,5] x > 0.5", "regions": {}}, {"formula": "F[0,20] x > 1.5", "regions": {}})
+    there, here = _both(server, tmp_path, *rules)
     with ShieldClient(server.url, timeout=60.0) as sdk:
         remote = sdk.sessions.create(policy_id=there[0], initial_pose=begins)
         local = here[0].session(initial_pose=begins)
@@ -147,6 +147,105 @@ def test_a_model_that_ends_is_asked_again_under_another_rule(server: RunningServ
         for session, last in ((remote, there[0]), (local, here[0])):
             with pytest.raises(SessionFinished):
                 session.switch(last)
+
+
+def _both(server: RunningServer, folder: Path, *specs: dict[str, Any]) -> tuple[list[str], list[LocalShield]]:
+    """Policies of zeros for these rules: their ids on the server, and the same in process."""
+    there, here = list[str](), list[LocalShield]()
+    with httpx.Client(base_url=server.url, verify=False, timeout=60.0) as client:
+        assert client.post("/v1/maps", json=grid_json()).status_code in (200, 201)
+        for spec in specs:
+            there.append(send_policy(client, spec=spec)["id"])
+            parts = policy_files(spec)
+            (folder / "policy.safetensors").write_bytes(parts["weights"])
+            (folder / "card.json").write_bytes(parts["card"])
+            here.append(LocalShield.load(folder, grid_json()))
+    return there, here
+
+
+PLAIN: dict[str, Any] = {"formula": "F[0,30] x > 1.9", "regions": {}}
+READS: dict[str, Any] = {
+    "formula": "F[0,30] x > 2 and G[0,30] battery > 1", "regions": {}, "signals": {"battery": 9.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("clock", ["keep", "restart"])
+@pytest.mark.parametrize("steps", [0, 3])
+@pytest.mark.parametrize("rules", [(READS, PLAIN), (PLAIN, READS), (READS, {**READS, "formula": "x > 0.1"})])
+def test_a_server_switches_the_same_without_a_pose_where_rules_read_signals(
+    server: RunningServer, tmp_path: Path, rules: tuple[dict[str, Any], ...], steps: int, clock: Any
+) -> None:
+    """x_t is where the last decision's action leads; at first, where the session began."""
+    there, here = _both(server, tmp_path, *rules)
+    pose = (1.0, 1.5, 0.0)
+    with ShieldClient(server.url, timeout=60.0) as sdk:
+        remote = sdk.sessions.create(policy_id=there[0], initial_pose=pose)
+        local = here[0].session(initial_pose=pose)
+        for t in range(steps + 4):
+            if t == steps:
+                told, mine = remote.switch(there[1], clock=clock), local.switch(here[1], clock=clock)
+                same = ("spec_status", "next_t", "any_signal", "feasible", "horizon")
+                assert [getattr(told, name) for name in same] == [getattr(mine, name) for name in same]
+                same = ("from", "origin", "clock", "formula", "horizon", "spec_status")
+                assert [[rule[name] for name in same] for rule in told.rules] == [
+                    [rule[name] for name in same] for rule in mine.rules
+                ]
+            signals = {"battery": 9.0 - 0.1 * t} if "battery" in local.task.signals else None
+            decision = local.step(pose, [0.5, 0.0, 0.0, 0.2, None], signals=signals)
+            asked = remote.step(pose, [0.5, 0.0, 0.0, 0.2, None], signals=signals)
+            assert decision == replace(asked, timings={})
+            pose = decision.next_poses[decision.execute]
+
+
+def test_after_a_step_without_a_decision_a_switch_needs_the_pose(
+    server: RunningServer, tmp_path: Path
+) -> None:
+    there, here = _both(server, tmp_path, PLAIN, READS)
+    pose = (1.0, 1.5, 0.0)
+    with ShieldClient(server.url, timeout=60.0) as sdk:
+        remote = sdk.sessions.create(policy_id=there[0], initial_pose=pose)
+        local = here[0].session(initial_pose=pose)
+        for session, other in ((remote, there[1]), (local, here[1])):
+            session.record(pose)
+            with pytest.raises(HistoryGap):
+                session.switch(other)
+            assert session.switch(other, pose=pose).next_t == 1
+
+
+@pytest.mark.parametrize("clock", ["keep", "restart"])
+def test_a_switch_that_fails_leaves_everything_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Any
+) -> None:
+    """Whether it is refused, or something of it breaks at the very end."""
+    grid = LocalShield.shipped("case1").task.grid
+    first, then = (
+        LocalShield.make(grid, formula, signals={"battery": 9.0}, robot=ROBOT, check=False)
+        for formula in ("F[0,90] x > 1 and G[0,90] battery > 1", "F[0,99] x > 1 and G[0,99] battery > 2")
+    )
+    wall = LocalShield.make(grid, "F[0,3] x > 9 and F[0,3] x < 1", robot=ROBOT, check=False)
+    tried, plain = (first.session(initial_pose=START) for _ in range(2))
+
+    def broken(*_: Any) -> bool:
+        raise RuntimeError
+
+    pose = START
+    for _ in range(6):
+        decision, expected = (each.step(pose, [1.0, 0.0, 0.0, -3.0]) for each in (tried, plain))
+        assert decision == expected
+        pose = decision.next_poses[decision.execute]
+        before = {
+            name: value.copy() if isinstance(value, list | dict) else value
+            for name, value in vars(tried).items()
+        }
+        with pytest.raises(InfeasibleSwitch):
+            tried.switch(wall, clock=clock)
+        with monkeypatch.context() as patched:
+            patched.setattr("specshield.local.session.any_signal", broken)
+            with pytest.raises(RuntimeError):
+                tried.switch(then, clock=clock)
+        assert vars(tried) == before
+        assert (tried.task, len(tried.info.rules)) == (first.task, 1)
+    assert tried.trajectory() == plain.trajectory()
 
 
 def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -> None:

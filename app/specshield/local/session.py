@@ -23,7 +23,7 @@ from specshield.client.models import (
     execute_of,
 )
 from specshield.client.wire import Logits, Numbers, Points, logit_values, point_values, pose_values
-from specshield.errors import HistoryConflict, SessionFinished, StepConflict
+from specshield.errors import HistoryConflict, HistoryGap, SessionFinished, StepConflict
 from specshield.local.rule import Rule
 from specshield.reasons import refusal
 from specshield.reasons.explanation import explanations
@@ -165,19 +165,18 @@ class LocalSession:
         carry = handover.carried_over(self._carry, same_map, same_robot, later)
         way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
         carry = handover.carried_over(self._carry, same_map, same_robot, later, way)
-        known = self._poses if pose is None else [*self._poses, x_t]
-        ended = old.told(old.verdict(known, held)[0])
+        known = self._poses if pose is None and self.t > 0 else [*self._poses, x_t]
+        ended, (status, _) = old.told(old.verdict(known, held)[0]), rule.verdict(known, held)
+        info = replace(
+            self.info, **policy.about(), next_t=self.t, feasible=True, spec_status=status,
+            rules=(*self.info.rules[:-1], ended, rule.told(status)),
+            any_signal=any_signal(rule.shield, seen, signals),
+        )  # fmt: skip
         self._rules.append(rule)
         self._carry, self._first = carry, first
         self._signals = {name: values[: self.t] for name, values in held.items()}
-        self.spec_status, _ = rule.verdict(known, held)
-        self.finished = False
-        self.info = replace(
-            self.info, **policy.about(), next_t=self.t, feasible=True, spec_status=self.spec_status,
-            rules=(*self.info.rules[:-1], ended, rule.told(self.spec_status)),
-            any_signal=any_signal(rule.shield, seen, signals),
-        )  # fmt: skip
-        return self.info
+        self.info, self.spec_status, self.finished = info, status, False
+        return info
 
     def events(self, after: int | None = None) -> Iterator[Decision]:
         """The decisions after step `after`, by default those that follow; -1: from the first. It ends with
@@ -212,11 +211,9 @@ class LocalSession:
     def _check(self, over: bool) -> None:
         if self._over:
             raise SessionFinished(
-                "the session is over: no further step is decided",
-                path="t",
-                got=self.t,
+                "the session is over: no further step is decided", path="t", got=self.t,
                 expected="a new session",
-            )
+            )  # fmt: skip
         if self.main_task_done and not over:
             raise StepConflict(
                 "an earlier step said that the main task is done, which cannot be taken back",
@@ -224,10 +221,12 @@ class LocalSession:
             )  # fmt: skip
 
     def _foreseen(self) -> Pose:
-        """Where the last decision's action leads."""
+        """Where the last decision's action leads. Raises HistoryGap after a step without a decision."""
+        if self.t == 0:
+            return self._initial
         last = self._decisions.get(self.t - 1)
         if last is None:
-            return self._poses[-1] if self._poses else self._initial
+            raise HistoryGap(f"nothing says where the robot is at step {self.t}", path="pose", expected="x_t")
         return self._poses[-1] if last.execute is None else last.next_poses[last.execute]
 
     def _at(self, pose: Numbers) -> Pose:
