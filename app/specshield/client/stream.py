@@ -37,10 +37,9 @@ def check_installed() -> None:
         import websockets  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"stream=True needs the package {error.name}, which is not installed",
-            path="stream",
+            f"stream=True needs the package {error.name}, which is not installed", path="stream",
             expected="pip install 'specshield[stream]', or stream=False",
-        ) from error
+        ) from error  # fmt: skip
 
 
 def packed(request: Request) -> bytes | None:

@@ -115,11 +115,9 @@ def path(*segments: str) -> str:
     for segment in segments:
         if not isinstance(segment, str) or segment in ("", ".", ".."):
             raise InputError(
-                "this cannot be an id or a name",
-                path="id",
-                got=segment,
+                "this cannot be an id or a name", path="id", got=segment,
                 expected="an id or a name that the server gave",
-            )
+            )  # fmt: skip
     return "/v1/" + "/".join(quote(segment, safe="", errors="replace") for segment in segments)
 
 
@@ -130,10 +128,9 @@ def encode(body: Mapping[str, Any]) -> bytes:
     except (TypeError, ValueError, RecursionError) as error:
         name = next((name for name, value in body.items() if not _is_json(value)), "body")
         raise InputError(
-            f"{name}: cannot be sent as JSON: {error}",
-            path=name,
+            f"{name}: cannot be sent as JSON: {error}", path=name,
             expected="finite numbers, texts, lists and objects of them",
-        ) from error
+        ) from error  # fmt: skip
 
 
 def _json(value: Any) -> bytes:
@@ -161,11 +158,9 @@ def content(source: Content, where: str) -> bytes:
             return Path(source).read_bytes()
         except OSError as error:
             raise InputError(
-                f"{where} cannot be read: {error.strerror}",
-                path=where,
-                got=str(source),
+                f"{where} cannot be read: {error.strerror}", path=where, got=str(source),
                 expected="a file that can be read",
-            ) from error
+            ) from error  # fmt: skip
     return source.encode() if isinstance(source, str) else source
 
 
@@ -196,11 +191,9 @@ def logit_values(logits: Logits) -> list[float | None]:
     for i, value in enumerate(values):
         if math.isnan(value) or value == math.inf:
             raise LogitsError(
-                f"logit {i} is {value}",
-                path=f"logits[{i}]",
-                got=str(value),
+                f"logit {i} is {value}", path=f"logits[{i}]", got=str(value),
                 expected="a finite number, -inf or None",
-            )
+            )  # fmt: skip
     return [None if value == -math.inf else value for value in values]
 
 

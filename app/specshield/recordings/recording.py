@@ -75,10 +75,9 @@ def of_record(
 
     if len(chain.configs) > 1:
         raise InputError(
-            "the session had several rules, and one is written to a file",
-            got=len(chain.configs),
+            "the session had several rules, and one is written to a file", got=len(chain.configs),
             expected="a session without a switch",
-        )
+        )  # fmt: skip
     config, names = chain.configs[0], chain.names[0]
     begun = datetime.fromisoformat(config.created_at).timestamp() if config.created_at else 0.0
     items = []
