@@ -72,14 +72,10 @@ class Exchange:
         if request.body is not None:
             headers["Content-Type"] = "application/json"
         return {
-            "method": request.method,
-            "url": request.path,
-            "params": request.params,
-            "content": request.body,
-            "files": request.files,
-            "headers": headers,
+            "method": request.method, "url": request.path, "params": request.params, "content": request.body,
+            "files": request.files, "headers": headers,
             "timeout": httpx.Timeout(self.seconds, connect=min(timeout, self.seconds)),
-        }
+        }  # fmt: skip
 
     def begin(self, response: httpx.Response) -> None:
         """Raises httpx.DecodingError for a compressed body, which nobody asked for and may be a bomb."""

@@ -88,16 +88,9 @@ def of_record(
         pose = (held[0], held[1], held[2])
         items.append(TrajectoryItem(t, pose, dict(zip(names, held[3:], strict=True)), json.loads(told)))
     return Recording(
-        config.id,
-        config.spec.formula,
-        config.actions,
-        {**rooms, **parse_regions(config.spec.regions)},
-        items,
-        grid,
-        robot_from_json(config.robot),
-        begun,
-        step_seconds,
-    )
+        config.id, config.spec.formula, config.actions, {**rooms, **parse_regions(config.spec.regions)},
+        items, grid, robot_from_json(config.robot), begun, step_seconds,
+    )  # fmt: skip
 
 
 def map_of_service(client: ShieldClient, map_id: str) -> tuple[OccupancyGrid, Mapping[str, Region]]:
