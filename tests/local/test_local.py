@@ -19,6 +19,7 @@ from specshield.errors import (
     HistoryGap,
     InfeasibleStart,
     InfeasibleSwitch,
+    InputError,
     NotFound,
     SessionFinished,
 )
@@ -288,3 +289,113 @@ def test_no_web_part_is_imported() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     web = {"httpx", "fastapi", "starlette", "pydantic", "redis", "rq", "uvicorn", "torch"}
     assert not web & set(done.stdout.split())
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"uncertainty": "Learned"}, "uncertainty"),
+    ({"uncertainty": None}, "uncertainty"),
+    ({"uncertainty": 3}, "uncertainty"),
+    ({"uncertainty": {"foo": 1}}, "uncertainty.translation"),
+    ({"uncertainty": {"translation": 0.1, "rotation": 0.1, "foo": 1}}, "uncertainty.foo"),
+    ({"uncertainty": {"translation": "a", "rotation": 0.1}}, "uncertainty.translation"),
+    ({"uncertainty": {"translation": 0.1, "rotation": 0.1, "slip": 2}}, "uncertainty.slip"),
+    ({"threshold": "a"}, "threshold"),
+    ({"threshold": float("nan")}, "threshold"),
+    ({"threshold": 0.0}, "threshold"),
+    ({"threshold": None}, "threshold"),
+    ({"threshold_over": "foo"}, "threshold_over"),
+    ({"threshold_over": None}, "threshold_over"),
+    ({"learn_map": "no"}, "learn_map"),
+    ({"learn_map": 1}, "learn_map"),
+    ({"allow_infeasible": "x"}, "allow_infeasible"),
+    ({"slack": 1.5}, "slack"),
+    ({"slack": "3"}, "slack"),
+    ({"slack": True}, "slack"),
+    ({"slack": -1}, "slack"),
+    ({"margin": "x"}, "margin"),
+    ({"margin": float("inf")}, "margin"),
+    ({"max_steps": 700.5}, "max_steps"),
+    ({"max_steps": 0}, "max_steps"),
+    ({"map_memory": 2.5}, "map_memory"),
+    ({"map_memory": 0}, "map_memory"),
+    ({"seed": 1.5}, "seed"),
+    ({"seed": "x"}, "seed"),
+    ({"seed": -1}, "seed"),
+    ({"seed": 2**63}, "seed"),
+    ({"evaluation": "foo"}, "evaluation"),
+    ({"shaping": ["projection"]}, "shaping"),
+    ({"id": 5}, "id"),
+    ({"colour": "red"}, "colour"),
+    ({"initial_pose": None}, "initial_pose"),
+    ({"initial_pose": (4.5, 5.0)}, "initial_pose"),
+]
+
+
+@pytest.fixture(scope="module")
+def small() -> LocalShield:
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    return LocalShield.make(grid, "F[0,40] x > 4", robot=ROBOT, check=False)
+
+
+@pytest.mark.parametrize(("settings", "path"), WRONG, ids=str)
+def test_a_setting_that_a_server_refuses_is_refused(
+    server: RunningServer, small: LocalShield, settings: dict[str, Any], path: str
+) -> None:
+    """With the same path, at the latest when the session begins."""
+    with pytest.raises(InputError) as here:
+        small.session(**{"initial_pose": (3.0, 3.0, 0.0), **settings})
+    assert here.value.path == path
+    assert here.value.expected
+    body = {"policy_id": "case1", "initial_pose": START, **settings}
+    sent = json.dumps(body, default=str)
+    with httpx.Client(base_url=server.url, verify=False, timeout=60.0) as client:
+        answer = client.post("/v1/sessions", content=sent, headers={"content-type": "application/json"})
+    if "NaN" not in sent and "Infinity" not in sent:
+        assert answer.status_code == 422, answer.text
+        told = answer.json()
+        assert any(str(each["path"]).startswith(path) for each in told.get("errors", [told])), told
+
+
+def test_a_setting_may_come_from_numpy_and_what_is_known_of_the_robot_is_as_on_a_server(
+    server: RunningServer,
+) -> None:
+    """A slip that is not said is none."""
+    known = {"translation": 0.02, "rotation": 0.01}
+    options: dict[str, Any] = {
+        "initial_pose": np.array(START), "seed": np.int64(3), "slack": np.int32(2),
+        "margin": np.float32(0.25), "learn_map": np.bool_(False), "uncertainty": known,
+    }  # fmt: skip
+    local = LocalShield.shipped("case1").session(**options)
+    plain = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in options.items()}
+    with ShieldClient(server.url, timeout=300.0) as client:
+        remote = client.sessions.create(policy_id="case1", **plain)
+        logits = np.zeros(20)
+        assert local.step(START, logits) == replace(remote.step(START, logits), timings={})
+
+
+@pytest.mark.parametrize(
+    ("asked", "path"),
+    [
+        ({"signals": 5}, "signals"),
+        ({"signals": [1.0]}, "signals"),
+        ({"signals": {"x": "a"}}, "signals.x"),
+        ({"occupied": 5}, "occupied"),
+        ({"free": np.float64(5.0)}, "free"),
+        ({"occupied": [1, 2]}, "occupied[0]"),
+        ({"logits": [10**400, 0, 0, 0]}, "logits"),
+    ],
+)
+def test_what_a_step_cannot_read_is_said_and_changes_nothing(
+    small: LocalShield, asked: dict[str, Any], path: str
+) -> None:
+    session = small.session(initial_pose=(3.0, 3.0, 0.0))
+    with pytest.raises(InputError) as error:
+        session.step((3.0, 3.0, 0.0), **{"logits": np.zeros(4), **asked})
+    assert (error.value.path, session.t) == (path, 0)
+    assert session.step((3.0, 3.0, 0.0), np.zeros(4)).t == 0
+
+
+def test_a_switch_takes_no_name(small: LocalShield) -> None:
+    session = small.session(initial_pose=(3.0, 3.0, 0.0))
+    with pytest.raises(InputError, match="a LocalShield"):
+        session.switch("case1")  # type: ignore[arg-type]

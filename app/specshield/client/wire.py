@@ -174,8 +174,10 @@ def pose_values(pose: Numbers, where: str = "pose") -> Pose:
 
 def point_values(points: Points, where: str) -> list[list[float]]:
     """Points (x, y) in metres, map frame. InputError unless each is two finite numbers."""
-    found = []
-    for i, point in enumerate(points.tolist() if isinstance(points, Array) else points):
+    found, listed = [], points.tolist() if isinstance(points, Array) else points
+    if not isinstance(listed, Iterable):
+        raise InputError("these are no points", path=where, got=listed, expected="a list of points [x, y]")
+    for i, point in enumerate(listed):
         values = _floats(point, InputError, f"{where}[{i}]", "two finite numbers x, y")
         if len(values) != 2 or not all(map(math.isfinite, values)):
             raise InputError(
@@ -199,6 +201,8 @@ def logit_values(logits: Logits) -> list[float | None]:
 
 def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
     """SampleError unless every signal is a finite number."""
+    if not isinstance(signals, Mapping):
+        raise SampleError("these are no signals", path="signals", got=signals, expected="numbers by name")
     values = {}
     for name, value in signals.items():
         (values[name],) = _floats([value], SampleError, f"signals.{name}", "a finite number")
@@ -223,18 +227,14 @@ def _floats(values: Any, error: type[InputError], where: str, expected: str) -> 
     try:
         listed = values.tolist() if hasattr(values, "tolist") else values
         return [-math.inf if value is None else float(value) for value in listed]
-    except (TypeError, ValueError) as cause:
+    except (TypeError, ValueError, OverflowError) as cause:
         raise error(f"{where}: {cause}", path=where, expected=expected) from cause
 
 
 _BY_TYPE = {cls.type: cls for cls in tree()}
 _BY_STATUS: dict[int, type[SpecshieldError]] = {
-    401: Unauthorized,
-    403: Unauthorized,
-    404: NotFound,
-    409: Conflict,
-    413: BodyTooLarge,
-}
+    401: Unauthorized, 403: Unauthorized, 404: NotFound, 409: Conflict, 413: BodyTooLarge,
+}  # fmt: skip
 _GATEWAY: dict[int, type[TransportError]] = {502: TransportError, 503: TransportError, 504: TransportTimeout}
 
 
@@ -268,10 +268,8 @@ def error_of(reply: Reply) -> SpecshieldError:
     cls = _BY_TYPE.get(str(document.get("type")), default)
     error = cls(
         str(document.get("detail") or document.get("title") or f"status {reply.status}"),
-        path=document.get("path"),
-        got=document.get("got"),
-        expected=document.get("expected"),
-    )
+        path=document.get("path"), got=document.get("got"), expected=document.get("expected"),
+    )  # fmt: skip
     told = {"title", "detail", "path", "got", "expected"} | (
         {"type"} if cls.type == document.get("type") else set()
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from specshield import handover
+from specshield.client import wire
 from specshield.client.models import (
     Decision,
     Explanation,
@@ -22,8 +23,8 @@ from specshield.client.models import (
     Verdict,
     execute_of,
 )
-from specshield.client.wire import Logits, Numbers, Points, logit_values, point_values, pose_values
-from specshield.errors import HistoryConflict, HistoryGap, SessionFinished, StepConflict
+from specshield.client.wire import Logits, Numbers, Points
+from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished, StepConflict
 from specshield.local.rule import Rule
 from specshield.reasons import refusal
 from specshield.reasons.explanation import explanations
@@ -113,21 +114,18 @@ class LocalSession:
         """
         over = self.main_task_done if main_task_done is None else main_task_done
         self._check(over)
-        check_signals(self.task, signals or {})
+        sent = {} if signals is None else wire.signal_values(signals)
+        check_signals(self.task, sent)
         x_t = self._at(pose)
-        held = self._held(signals or {})
+        held = self._held(sent)
         made = episode.decide(
-            self._rule.shield,
-            self._rule.since([*self._poses, x_t]),
-            None if logits is None else [-math.inf if z is None else z for z in logit_values(logits)],
-            over,
-            self._rule.signals(held),
-            self._carry,
-            witnesses,
-            None if occupied is None else np.array(point_values(occupied, "occupied")).reshape(-1, 2),
-            None if free is None else np.array(point_values(free, "free")).reshape(-1, 2),
+            self._rule.shield, self._rule.since([*self._poses, x_t]),
+            None if logits is None else [-math.inf if z is None else z for z in wire.logit_values(logits)],
+            over, self._rule.signals(held), self._carry, witnesses,
+            None if occupied is None else np.array(wire.point_values(occupied, "occupied")).reshape(-1, 2),
+            None if free is None else np.array(wire.point_values(free, "free")).reshape(-1, 2),
             explanations if explain else None,
-        )
+        )  # fmt: skip
         answer = _answer(replace(made, t=self.t), self.info, over, witnesses, explain)
         self._poses.append(x_t)
         self._signals, self._carry, self._decisions[self.t] = held, made.carry, answer
@@ -154,6 +152,10 @@ class LocalSession:
         cannot be kept from there; nothing is changed then.
         """
         self._check(self.main_task_done)
+        if not isinstance(policy, type(self._rule.policy)):
+            raise InputError(
+                "this is no policy in process", path="policy", got=policy, expected="a LocalShield"
+            )
         x_t = self._foreseen() if pose is None else self._at(pose)
         old, rule = self._rule, self._rule.followed_by(policy, self._shaping, self.t, clock)
         first = {**policy.task.signals, **self._first}
@@ -231,7 +233,7 @@ class LocalSession:
 
     def _at(self, pose: Numbers) -> Pose:
         """x_t. Raises HistoryConflict where x_0 is not where the session began."""
-        x_t = pose_values(pose)
+        x_t = wire.pose_values(pose)
         if self.t > 0:
             return x_t
         gap = [a - b for a, b in zip(x_t, self._initial, strict=True)]
