@@ -108,7 +108,8 @@ class SessionState:
         the pose and move on. With `on_failure` "witness" or "stop" it raises only what the caller got wrong;
         where the service cannot answer, a `LocalDecision` says what to do. A `main_task_done` of True said
         there is remembered; signals sent there are lost. While the service is known to be away, it is asked
-        again at pauses of 0.25 to 4 s, once, and steps in between cost nothing.
+        again at pauses of 0.25 to 4 s, once, and steps in between cost nothing, those that say to stop too: a
+        robot that stands asks again at its own pace.
         """
         yield Within(None if deadline is None else wire.deadline_value(deadline))
         x_t = wire.pose_values(pose)
@@ -131,20 +132,20 @@ class SessionState:
         if self.on_failure == "witness":
             way = self._continuation.at(x_t)
         error: SpecshieldError | None = None
-        if isinstance(way, str) or self._circuit.due:
+        if self._circuit.due:
             try:
-                once = self._circuit.open and not isinstance(way, str)
-                decision = yield from self._ask(x_t, body, own, 1 if once else TRIES)
+                decision = yield from self._ask(x_t, body, own, 1 if self._circuit.open else TRIES)
             except SpecshieldError as failed:
                 if not is_away(failed):
                     raise
                 error = failed
                 self._circuit.failed()
+                self._unanswered = self.t
             else:
                 self._circuit.answered()
                 return decision
         if isinstance(way, str):
-            self._unanswered, self.main_task_done = self.t, self.main_task_done or body["main_task_done"]
+            self.main_task_done = self.main_task_done or body["main_task_done"]
             return LocalDecision(self.t, "stop", None, way, self.spec_status, error=error)
         return self._alone(x_t, way, body["main_task_done"], error)
 
