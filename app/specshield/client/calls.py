@@ -30,10 +30,11 @@ def wait_until_ready(timeout: float) -> Flow[None]:
         if isinstance(outcome, Reply) and outcome.status not in (502, 503, 504):
             return wire.check(outcome)
         error = outcome.error if isinstance(outcome, Failure) else wire.error_of(outcome)
-        if seconds + READY_EVERY > timeout:
-            raise TransportTimeout(f"not ready after {seconds:.0f} s: {error}") from error
-        yield Wait(READY_EVERY)
-        seconds += READY_EVERY
+        if seconds >= timeout:
+            raise TransportTimeout(f"not ready after {seconds:.1f} s: {error}") from error
+        pause = min(READY_EVERY, timeout - seconds)
+        yield Wait(pause)
+        seconds += pause
 
 
 def validate(
@@ -199,12 +200,13 @@ def wait_policy(
                 for warning in policy.warnings:
                     log.warning("policy %s: %s", id, warning)
                 return policy
-        if seconds + interval > timeout:
+        if seconds >= timeout:
             raise TransportTimeout(
-                f"policy {id} is {policy.status} ({policy.progress:.0%}) after {seconds:.0f} s", policy=policy
+                f"policy {id} is {policy.status} ({policy.progress:.0%}) after {seconds:.1f} s", policy=policy
             )
-        yield Wait(interval)
-        seconds += interval
+        pause = min(interval, timeout - seconds)
+        yield Wait(pause)
+        seconds += pause
 
 
 def create_session(
