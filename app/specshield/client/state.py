@@ -55,6 +55,7 @@ class SessionState:
         self.finished = info.finished
         self.main_task_done = info.main_task_done
         self.closed = False
+        self._heard = list(info.rules)  # with those that `events` was told of
         self._stored = info.next_t  # poses the server has, as far as is known
         self._poses: dict[int, Pose] = {} if initial_pose is None else {0: wire.pose_values(initial_pose)}
         self._continuation = Continuation(info.margin)
@@ -68,6 +69,11 @@ class SessionState:
     @property
     def id(self) -> str:
         return self.info.id
+
+    def _rule_at(self, t: int) -> str:
+        """The rule that decides step t, as far as this session and its `events` have heard."""
+        begun = [rule["formula"] for rule in self._heard if rule["from"] <= t]
+        return str(begun[-1] if begun else self.info.spec["formula"])
 
     @property
     def unsent(self) -> dict[int, Pose]:
@@ -244,7 +250,7 @@ class SessionState:
         return verdict
 
     def _events(self, after: int | None) -> Events:
-        rules = list(self.info.rules)
+        rules = self._heard = list(self.info.rules)
 
         def decided(answer: Mapping[str, Any]) -> Decision:
             # Once the rule is settled, a session that is finished is one whose main task is over.

@@ -78,15 +78,8 @@ def _regions(recording: Recording, now: fox.Timestamp) -> list[fox.SceneEntity]:
             pose=_pose(x, y, 0.0), billboard=True, font_size=12.0, scale_invariant=True, color=REGION,
             text=name,
         )  # fmt: skip
-        found.append(
-            fox.SceneEntity(
-                timestamp=now,
-                frame_id=FRAME,
-                id=f"region/{name}",
-                texts=[label],
-                lines=[_line(line, REGION) for line in lines],
-            )
-        )
+        drawn, id = [_line(line, REGION) for line in lines], f"region/{name}"
+        found.append(fox.SceneEntity(timestamp=now, frame_id=FRAME, id=id, texts=[label], lines=drawn))
     return found
 
 
