@@ -1,16 +1,27 @@
 """What a robot is told while the service is away, step by step, against answers written by hand."""
 
+import asyncio
 import itertools
 import json
 import math
 
+import httpx
 import pytest
-from client_script import answer, drive, lost, problem
+from client_script import SESSION, answer, drive, lost, problem
 from test_state import END, LOGITS, B, M, decided, session
 
 from specshield import errors
-from specshield.client import LocalDecision
+from specshield.client import (
+    AsyncSession,
+    AsyncShieldClient,
+    LocalDecision,
+    Session,
+    SessionInfo,
+    ShieldClient,
+)
 from specshield.client.away import LONGEST_PAUSE
+from specshield.client.models import build
+from specshield.client.wire import TRIES
 
 
 class Clock:
@@ -83,6 +94,7 @@ def test_a_robot_that_is_not_where_the_continuation_leads_is_told_to_stop(x, y):
     assert (decision.source, decision.execute, decision.t) == ("stop", None, 1)
     assert "where the certified continuation leads" in decision.reason
     assert state.t == 1, "a step on which the robot stands does not count"
+    state._circuit.clock.now += LONGEST_PAUSE
     again, bodies = step(state, x, decided(1, M), y=y)
     assert (again.source, bodies[0]["t"]) == ("service", 1)
 
@@ -98,7 +110,7 @@ def test_where_the_continuation_has_ended_and_where_there_never_was_one_the_robo
     state = robust()
     step(state, 0.0, decided(0, M, witness=[M]))
     assert step(state, 0.2, *AWAY)[0].source == "witness"
-    ended, _ = step(state, 0.4, *AWAY)
+    ended, _ = step(state, 0.4)
     assert (ended.source, "has ended" in ended.reason) == ("stop", True)
     none, _ = step(robust(), 0.0, *AWAY)
     assert (none.source, "no continuation" in none.reason) == ("stop", True)
@@ -112,6 +124,61 @@ def test_stop_stops_although_there_is_a_continuation():
     step(state, 0.0, decided(0, M, witness=[M, M]))
     decision, _ = step(state, 0.2, *AWAY)
     assert (decision.source, decision.execute) == ("stop", None)
+
+
+@pytest.mark.parametrize("on_failure", ["stop", "witness"])
+def test_a_step_that_says_to_stop_costs_nothing_while_it_is_away(on_failure):
+    """The robot stands off its continuation for 30 s and asks ten times a second."""
+    state = robust(on_failure)
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    clock, asked = state._circuit.clock, []
+    for number in range(300):
+        due = state._circuit.due
+        stopped, bodies = step(state, 9.0, *(() if not due else AWAY if number == 0 else AWAY[:1]))
+        assert (stopped.source, stopped.execute, stopped.t, state.t) == ("stop", None, 1, 1)
+        assert (len(bodies), stopped.error is None) == ((0, True) if not due else (1 if number else 5, False))
+        asked += [clock.now] * due
+        clock.now += 0.1
+    pauses = [b - a for a, b in itertools.pairwise(asked)]
+    assert pauses[0] == pytest.approx(0.3)  # the first step after 0.25 s
+    assert max(pauses) <= LONGEST_PAUSE + 0.11
+    clock.now += LONGEST_PAUSE
+    assert step(state, 9.0, decided(1, M))[0].source == "service"
+    assert len(step(state, 9.0, *AWAY)[1]) == 5, "away anew: what is known of before counts no longer"
+
+
+def test_the_main_task_may_end_at_a_step_that_is_not_asked_for():
+    state = robust("stop")
+    step(state, 0.0, *AWAY)
+    stopped, bodies = step(state, 0.0, main_task_done=True)
+    assert (stopped.source, bodies, state.main_task_done) == ("stop", [], True)
+
+
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_both_clients_stop_at_once_while_the_service_is_known_to_be_away(asynchronous):
+    asked = []
+
+    def refuse(request):
+        asked.append(request)
+        raise httpx.ConnectError("refused")
+
+    options = {"base_url": "http://robot.test", "transport": httpx.MockTransport(refuse)}
+    info = build(SessionInfo, SESSION)
+
+    async def awaited():
+        async with AsyncShieldClient(**options) as client:
+            held = AsyncSession(client._run, info, (0, 0, 0), "stop")
+            return [await held.step((0, 0, 0), LOGITS) for _ in range(3)]
+
+    def blocking():
+        with ShieldClient(**options) as client:
+            held = Session(client._run, info, (0, 0, 0), "stop")
+            return [held.step((0, 0, 0), LOGITS) for _ in range(3)]
+
+    first, *later = asyncio.run(awaited()) if asynchronous else blocking()
+    assert isinstance(first.error, errors.TransportError)
+    assert [(each.source, each.error) for each in later] == [("stop", None)] * 2
+    assert len(asked) == TRIES
 
 
 @pytest.mark.parametrize(
@@ -161,6 +228,8 @@ def test_a_decision_that_was_never_heard_is_passed_over_by_a_robot_that_stood():
     state = robust()
     stopped, _ = step(state, 0.0, *AWAY)
     assert stopped.source == "stop"
+    assert step(state, 0.0, logits=[1.0, 0.0, 0.0])[1] == []
+    state._circuit.clock.now += LONGEST_PAUSE
     conflict = problem(409, "step-conflict", expected_t=1)
     decision, bodies = step(state, 0.0, conflict, decided(1, M), logits=[1.0, 0.0, 0.0])
     assert (decision.source, decision.t, state.t) == ("service", 1, 2)
@@ -173,6 +242,7 @@ def test_the_main_task_that_ends_at_a_step_that_says_to_stop_has_ended(taken):
     state = robust("stop")
     stopped, _ = step(state, 0.0, *AWAY, main_task_done=True)
     assert (stopped.source, state.main_task_done) == ("stop", True)
+    state._circuit.clock.now += LONGEST_PAUSE
     outcomes = [problem(409, "step-conflict", expected_t=1), decided(1, M)] if taken else [decided(0, M)]
     _, bodies = step(state, 0.0, *outcomes)
     assert all(body["main_task_done"] for body in bodies)

@@ -190,10 +190,12 @@ def test_waiting_outlasts_a_server_that_is_away_for_a_while_but_not_one_that_nev
 
 
 def test_waiting_has_an_end():
-    error, _, waits = drive(calls.wait_policy("p", timeout=5, interval=2), *[answer(POLICY)] * 3)
+    """The time is used up, with a last question at its end, and told as it was."""
+    asked = [answer(POLICY)] * 4
+    error, _, waits = drive(calls.wait_policy("p", timeout=5, interval=2), *asked)
     assert type(error) is errors.TransportTimeout
-    assert "training (50%)" in error.message
-    assert sum(waits) == 4
+    assert error.message.endswith("is training (50%) after 5.0 s")
+    assert waits == pytest.approx([2, 2, 1 - 3 * 0.01])
 
 
 def test_uploads_are_multipart_and_get_the_time_to_be_prepared():
@@ -257,8 +259,9 @@ def test_waiting_until_ready_outlasts_a_server_that_is_away_and_one_that_starts(
 
 
 def test_waiting_until_ready_ends_and_says_how_far_the_server_was():
-    error, _, _ = drive(calls.wait_until_ready(0.5), lost(0.01), starting("1"))
+    error, _, waits = drive(calls.wait_until_ready(0.5), lost(0.01), starting("1"), starting("1"))
     assert type(error) is errors.TransportTimeout
-    assert error.message == "not ready after 0 s: starting"
+    assert error.message == "not ready after 0.5 s: starting"
+    assert waits == pytest.approx([calls.READY_EVERY, 0.5 - 0.02 - calls.READY_EVERY])
     error, _, _ = drive(calls.wait_until_ready(0.5), problem(404, "not-found"))
     assert type(error) is errors.NotFound

@@ -7,6 +7,7 @@ import json
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import httpx
 import pytest
 from client_script import SESSION
 from test_deadline import decided
@@ -14,6 +15,7 @@ from test_deadline import decided
 from specshield import errors
 from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient, events
 from specshield.client.models import build
+from specshield.commands.watch import watch as watched
 
 INFO = build(SessionInfo, SESSION)
 END = b'event: end\ndata: {"next_t": 9, "spec_status": "satisfied", "finished": true}\n\n'
@@ -117,3 +119,33 @@ def test_a_page_is_no_stream(watch):
 def test_a_session_that_is_gone_is_not_found(watch):
     with pytest.raises(errors.NotFound):
         watch(told(0), 404)
+
+
+def test_a_watched_session_is_headed_with_the_rule_of_the_decisions_that_follow(monkeypatch, capsys):
+    """It has had a second rule by the time it is read, and is given a third while it is watched."""
+    rules = [
+        {"from": t, "formula": formula, "actions": ["m", "end"], "terminal_actions": [1]}
+        for t, formula in ((0, "F[0,3] a"), (2, "F[0,3] b"), (4, "F[0,3] c"))
+    ]
+    switch = b"event: switch\ndata: %s\n\n" % json.dumps(rules[2]).encode()
+
+    def serve(request):
+        if not request.url.path.endswith("/events"):
+            now = {**SESSION, "spec": {"formula": "F[0,3] b"}, "next_t": 4, "rules": rules[:2]}
+            return httpx.Response(200, json=now)
+        steps = range(int(request.url.params["after"]) + 1, 6)
+        body = b"".join(told(t) for t in steps if t < 4) + switch + told(4, 5) + END
+        return httpx.Response(200, content=body, headers={"content-type": "text/event-stream"})
+
+    def client(url, api_key):
+        return ShieldClient(url, api_key, transport=httpx.MockTransport(serve))
+
+    monkeypatch.setattr("specshield.client.ShieldClient", client)
+    shown = []
+    for after in (None, 1):
+        watched("s", "http://robot.test", after, None)
+        head, _, *lines = capsys.readouterr().out.splitlines()
+        shown.append([head, *(line if "from" in line else int(line.split()[0]) for line in lines)])
+    later = ["from step 4: F[0,3] c", 4, 5]
+    assert shown[0] == ["session s: F[0,3] a", 0, 1, "from step 2: F[0,3] b", 2, 3, *later]
+    assert shown[1] == ["session s: F[0,3] b", 2, 3, *later]

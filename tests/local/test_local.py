@@ -14,7 +14,15 @@ import numpy as np
 import pytest
 
 from specshield.client import ShieldClient
-from specshield.errors import HistoryConflict, InfeasibleStart, InfeasibleSwitch, NotFound, SessionFinished
+from specshield.errors import (
+    HistoryConflict,
+    HistoryGap,
+    InfeasibleStart,
+    InfeasibleSwitch,
+    InputError,
+    NotFound,
+    SessionFinished,
+)
 from specshield.local import LocalShield
 from specshield.world.occupancy import OccupancyGrid
 from tests.service.world import grid_json, policy_files, send_policy
@@ -120,16 +128,9 @@ def test_a_server_switches_the_same(server: RunningServer) -> None:
 
 def test_a_model_that_ends_is_asked_again_under_another_rule(server: RunningServer, tmp_path: Path) -> None:
     """The rule is kept and `end` drawn: no server has been told so, and another rule is taken."""
-    there, here, begins = list[str](), list[LocalShield](), (1.0, 1.5, 0.0)
-    with httpx.Client(base_url=server.url, verify=False, timeout=60.0) as client:
-        assert client.post("/v1/maps", json=grid_json()).status_code == 201
-        for formula in ("F[0,5] x > 0.5", "F[0,20] x > 1.5"):
-            spec: dict[str, Any] = {"formula": formula, "regions": {}}
-            there.append(send_policy(client, spec=spec)["id"])
-            parts = policy_files(spec)
-            (tmp_path / "policy.safetensors").write_bytes(parts["weights"])
-            (tmp_path / "card.json").write_bytes(parts["card"])
-            here.append(LocalShield.load(tmp_path, grid_json()))
+    begins = (1.0, 1.5, 0.0)
+    rules = ({"formula": "F[0,5] x > 0.5", "regions": {}}, {"formula": "F[0,20] x > 1.5", "regions": {}})
+    there, here = _both(server, tmp_path, *rules)
     with ShieldClient(server.url, timeout=60.0) as sdk:
         remote = sdk.sessions.create(policy_id=there[0], initial_pose=begins)
         local = here[0].session(initial_pose=begins)
@@ -147,6 +148,105 @@ def test_a_model_that_ends_is_asked_again_under_another_rule(server: RunningServ
         for session, last in ((remote, there[0]), (local, here[0])):
             with pytest.raises(SessionFinished):
                 session.switch(last)
+
+
+def _both(server: RunningServer, folder: Path, *specs: dict[str, Any]) -> tuple[list[str], list[LocalShield]]:
+    """Policies of zeros for these rules: their ids on the server, and the same in process."""
+    there, here = list[str](), list[LocalShield]()
+    with httpx.Client(base_url=server.url, verify=False, timeout=60.0) as client:
+        assert client.post("/v1/maps", json=grid_json()).status_code in (200, 201)
+        for spec in specs:
+            there.append(send_policy(client, spec=spec)["id"])
+            parts = policy_files(spec)
+            (folder / "policy.safetensors").write_bytes(parts["weights"])
+            (folder / "card.json").write_bytes(parts["card"])
+            here.append(LocalShield.load(folder, grid_json()))
+    return there, here
+
+
+PLAIN: dict[str, Any] = {"formula": "F[0,30] x > 1.9", "regions": {}}
+READS: dict[str, Any] = {
+    "formula": "F[0,30] x > 2 and G[0,30] battery > 1", "regions": {}, "signals": {"battery": 9.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("clock", ["keep", "restart"])
+@pytest.mark.parametrize("steps", [0, 3])
+@pytest.mark.parametrize("rules", [(READS, PLAIN), (PLAIN, READS), (READS, {**READS, "formula": "x > 0.1"})])
+def test_a_server_switches_the_same_without_a_pose_where_rules_read_signals(
+    server: RunningServer, tmp_path: Path, rules: tuple[dict[str, Any], ...], steps: int, clock: Any
+) -> None:
+    """x_t is where the last decision's action leads; at first, where the session began."""
+    there, here = _both(server, tmp_path, *rules)
+    pose = (1.0, 1.5, 0.0)
+    with ShieldClient(server.url, timeout=60.0) as sdk:
+        remote = sdk.sessions.create(policy_id=there[0], initial_pose=pose)
+        local = here[0].session(initial_pose=pose)
+        for t in range(steps + 4):
+            if t == steps:
+                told, mine = remote.switch(there[1], clock=clock), local.switch(here[1], clock=clock)
+                same = ("spec_status", "next_t", "any_signal", "feasible", "horizon")
+                assert [getattr(told, name) for name in same] == [getattr(mine, name) for name in same]
+                same = ("from", "origin", "clock", "formula", "horizon", "spec_status")
+                assert [[rule[name] for name in same] for rule in told.rules] == [
+                    [rule[name] for name in same] for rule in mine.rules
+                ]
+            signals = {"battery": 9.0 - 0.1 * t} if "battery" in local.task.signals else None
+            decision = local.step(pose, [0.5, 0.0, 0.0, 0.2, None], signals=signals)
+            asked = remote.step(pose, [0.5, 0.0, 0.0, 0.2, None], signals=signals)
+            assert decision == replace(asked, timings={})
+            pose = decision.next_poses[decision.execute]
+
+
+def test_after_a_step_without_a_decision_a_switch_needs_the_pose(
+    server: RunningServer, tmp_path: Path
+) -> None:
+    there, here = _both(server, tmp_path, PLAIN, READS)
+    pose = (1.0, 1.5, 0.0)
+    with ShieldClient(server.url, timeout=60.0) as sdk:
+        remote = sdk.sessions.create(policy_id=there[0], initial_pose=pose)
+        local = here[0].session(initial_pose=pose)
+        for session, other in ((remote, there[1]), (local, here[1])):
+            session.record(pose)
+            with pytest.raises(HistoryGap):
+                session.switch(other)
+            assert session.switch(other, pose=pose).next_t == 1
+
+
+@pytest.mark.parametrize("clock", ["keep", "restart"])
+def test_a_switch_that_fails_leaves_everything_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Any
+) -> None:
+    """Whether it is refused, or something of it breaks at the very end."""
+    grid = LocalShield.shipped("case1").task.grid
+    first, then = (
+        LocalShield.make(grid, formula, signals={"battery": 9.0}, robot=ROBOT, check=False)
+        for formula in ("F[0,90] x > 1 and G[0,90] battery > 1", "F[0,99] x > 1 and G[0,99] battery > 2")
+    )
+    wall = LocalShield.make(grid, "F[0,3] x > 9 and F[0,3] x < 1", robot=ROBOT, check=False)
+    tried, plain = (first.session(initial_pose=START) for _ in range(2))
+
+    def broken(*_: Any) -> bool:
+        raise RuntimeError
+
+    pose = START
+    for _ in range(6):
+        decision, expected = (each.step(pose, [1.0, 0.0, 0.0, -3.0]) for each in (tried, plain))
+        assert decision == expected
+        pose = decision.next_poses[decision.execute]
+        before = {
+            name: value.copy() if isinstance(value, list | dict) else value
+            for name, value in vars(tried).items()
+        }
+        with pytest.raises(InfeasibleSwitch):
+            tried.switch(wall, clock=clock)
+        with monkeypatch.context() as patched:
+            patched.setattr("specshield.local.session.any_signal", broken)
+            with pytest.raises(RuntimeError):
+                tried.switch(then, clock=clock)
+        assert vars(tried) == before
+        assert (tried.task, len(tried.info.rules)) == (first.task, 1)
+    assert tried.trajectory() == plain.trajectory()
 
 
 def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -> None:
@@ -189,3 +289,113 @@ def test_no_web_part_is_imported() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     web = {"httpx", "fastapi", "starlette", "pydantic", "redis", "rq", "uvicorn", "torch"}
     assert not web & set(done.stdout.split())
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"uncertainty": "Learned"}, "uncertainty"),
+    ({"uncertainty": None}, "uncertainty"),
+    ({"uncertainty": 3}, "uncertainty"),
+    ({"uncertainty": {"foo": 1}}, "uncertainty.translation"),
+    ({"uncertainty": {"translation": 0.1, "rotation": 0.1, "foo": 1}}, "uncertainty.foo"),
+    ({"uncertainty": {"translation": "a", "rotation": 0.1}}, "uncertainty.translation"),
+    ({"uncertainty": {"translation": 0.1, "rotation": 0.1, "slip": 2}}, "uncertainty.slip"),
+    ({"threshold": "a"}, "threshold"),
+    ({"threshold": float("nan")}, "threshold"),
+    ({"threshold": 0.0}, "threshold"),
+    ({"threshold": None}, "threshold"),
+    ({"threshold_over": "foo"}, "threshold_over"),
+    ({"threshold_over": None}, "threshold_over"),
+    ({"learn_map": "no"}, "learn_map"),
+    ({"learn_map": 1}, "learn_map"),
+    ({"allow_infeasible": "x"}, "allow_infeasible"),
+    ({"slack": 1.5}, "slack"),
+    ({"slack": "3"}, "slack"),
+    ({"slack": True}, "slack"),
+    ({"slack": -1}, "slack"),
+    ({"margin": "x"}, "margin"),
+    ({"margin": float("inf")}, "margin"),
+    ({"max_steps": 700.5}, "max_steps"),
+    ({"max_steps": 0}, "max_steps"),
+    ({"map_memory": 2.5}, "map_memory"),
+    ({"map_memory": 0}, "map_memory"),
+    ({"seed": 1.5}, "seed"),
+    ({"seed": "x"}, "seed"),
+    ({"seed": -1}, "seed"),
+    ({"seed": 2**63}, "seed"),
+    ({"evaluation": "foo"}, "evaluation"),
+    ({"shaping": ["projection"]}, "shaping"),
+    ({"id": 5}, "id"),
+    ({"colour": "red"}, "colour"),
+    ({"initial_pose": None}, "initial_pose"),
+    ({"initial_pose": (4.5, 5.0)}, "initial_pose"),
+]
+
+
+@pytest.fixture(scope="module")
+def small() -> LocalShield:
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    return LocalShield.make(grid, "F[0,40] x > 4", robot=ROBOT, check=False)
+
+
+@pytest.mark.parametrize(("settings", "path"), WRONG, ids=str)
+def test_a_setting_that_a_server_refuses_is_refused(
+    server: RunningServer, small: LocalShield, settings: dict[str, Any], path: str
+) -> None:
+    """With the same path, at the latest when the session begins."""
+    with pytest.raises(InputError) as here:
+        small.session(**{"initial_pose": (3.0, 3.0, 0.0), **settings})
+    assert here.value.path == path
+    assert here.value.expected
+    body = {"policy_id": "case1", "initial_pose": START, **settings}
+    sent = json.dumps(body, default=str)
+    with httpx.Client(base_url=server.url, verify=False, timeout=60.0) as client:
+        answer = client.post("/v1/sessions", content=sent, headers={"content-type": "application/json"})
+    if "NaN" not in sent and "Infinity" not in sent:
+        assert answer.status_code == 422, answer.text
+        told = answer.json()
+        assert any(str(each["path"]).startswith(path) for each in told.get("errors", [told])), told
+
+
+def test_a_setting_may_come_from_numpy_and_what_is_known_of_the_robot_is_as_on_a_server(
+    server: RunningServer,
+) -> None:
+    """A slip that is not said is none."""
+    known = {"translation": 0.02, "rotation": 0.01}
+    options: dict[str, Any] = {
+        "initial_pose": np.array(START), "seed": np.int64(3), "slack": np.int32(2),
+        "margin": np.float32(0.25), "learn_map": np.bool_(False), "uncertainty": known,
+    }  # fmt: skip
+    local = LocalShield.shipped("case1").session(**options)
+    plain = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in options.items()}
+    with ShieldClient(server.url, timeout=300.0) as client:
+        remote = client.sessions.create(policy_id="case1", **plain)
+        logits = np.zeros(20)
+        assert local.step(START, logits) == replace(remote.step(START, logits), timings={})
+
+
+@pytest.mark.parametrize(
+    ("asked", "path"),
+    [
+        ({"signals": 5}, "signals"),
+        ({"signals": [1.0]}, "signals"),
+        ({"signals": {"x": "a"}}, "signals.x"),
+        ({"occupied": 5}, "occupied"),
+        ({"free": np.float64(5.0)}, "free"),
+        ({"occupied": [1, 2]}, "occupied[0]"),
+        ({"logits": [10**400, 0, 0, 0]}, "logits"),
+    ],
+)
+def test_what_a_step_cannot_read_is_said_and_changes_nothing(
+    small: LocalShield, asked: dict[str, Any], path: str
+) -> None:
+    session = small.session(initial_pose=(3.0, 3.0, 0.0))
+    with pytest.raises(InputError) as error:
+        session.step((3.0, 3.0, 0.0), **{"logits": np.zeros(4), **asked})
+    assert (error.value.path, session.t) == (path, 0)
+    assert session.step((3.0, 3.0, 0.0), np.zeros(4)).t == 0
+
+
+def test_a_switch_takes_no_name(small: LocalShield) -> None:
+    session = small.session(initial_pose=(3.0, 3.0, 0.0))
+    with pytest.raises(InputError, match="a LocalShield"):
+        session.switch("case1")  # type: ignore[arg-type]

@@ -30,10 +30,11 @@ def wait_until_ready(timeout: float) -> Flow[None]:
         if isinstance(outcome, Reply) and outcome.status not in (502, 503, 504):
             return wire.check(outcome)
         error = outcome.error if isinstance(outcome, Failure) else wire.error_of(outcome)
-        if seconds + READY_EVERY > timeout:
-            raise TransportTimeout(f"not ready after {seconds:.0f} s: {error}") from error
-        yield Wait(READY_EVERY)
-        seconds += READY_EVERY
+        if seconds >= timeout:
+            raise TransportTimeout(f"not ready after {seconds:.1f} s: {error}") from error
+        pause = min(READY_EVERY, timeout - seconds)
+        yield Wait(pause)
+        seconds += pause
 
 
 def validate(
@@ -133,14 +134,10 @@ def create_policy(
     server's /docs lists the methods that it has and the options of each.
     """
     body = {
-        "map_id": map_id,
-        "robot": robot,
-        "spec": {"formula": formula, "regions": regions or {}, "signals": signals or {}},
-        "method": method,
-        "seed": seed,
-        "options": options or {},
-        **_named(name),
-    }
+        "map_id": map_id, "robot": robot,
+        "spec": {"formula": formula, "regions": regions or {}, "signals": signals or {}}, "method": method,
+        "seed": seed, "options": options or {}, **_named(name),
+    }  # fmt: skip
     return build(Policy, (yield from call(wire.post("policies", body=body, slow=True))))
 
 
@@ -203,12 +200,13 @@ def wait_policy(
                 for warning in policy.warnings:
                     log.warning("policy %s: %s", id, warning)
                 return policy
-        if seconds + interval > timeout:
+        if seconds >= timeout:
             raise TransportTimeout(
-                f"policy {id} is {policy.status} ({policy.progress:.0%}) after {seconds:.0f} s", policy=policy
+                f"policy {id} is {policy.status} ({policy.progress:.0%}) after {seconds:.1f} s", policy=policy
             )
-        yield Wait(interval)
-        seconds += interval
+        pause = min(interval, timeout - seconds)
+        yield Wait(pause)
+        seconds += pause
 
 
 def create_session(
@@ -253,21 +251,12 @@ def create_session(
     asked = policies_asked(policy_id, policy_ids)
     key = str(uuid.uuid4()) if id is None else id
     body: dict[str, Any] = {
-        "id": key,
-        "initial_pose": wire.pose_values(initial_pose, "initial_pose"),
-        "seed": seed,
-        "threshold": threshold,
-        "margin": margin,
-        "slack": slack,
-        "evaluation": evaluation,
-        "shaping": shaping,
-        "allow_infeasible": allow_infeasible,
+        "id": key, "initial_pose": wire.pose_values(initial_pose, "initial_pose"), "seed": seed,
+        "threshold": threshold, "margin": margin, "slack": slack, "evaluation": evaluation,
+        "shaping": shaping, "allow_infeasible": allow_infeasible,
         "uncertainty": uncertainty if isinstance(uncertainty, str) else dict(uncertainty),
-        "learn_map": learn_map,
-        "map_memory": map_memory,
-        "threshold_over": threshold_over,
-        **asked,
-    }
+        "learn_map": learn_map, "map_memory": map_memory, "threshold_over": threshold_over, **asked,
+    }  # fmt: skip
     body.update({} if max_steps is None else {"max_steps": max_steps})
     delivery = yield from deliver(wire.post("sessions", body=body, slow=True))
     try:

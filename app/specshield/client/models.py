@@ -230,7 +230,7 @@ class LocalDecision:
 
     source "witness": `execute` is the next action of the certified continuation received last. The step
     counts: its pose is recorded, and told to the service later. source "stop": there is nothing certified to
-    do, so `execute` is None: the robot should stand. The step does not count: `t` stays, and the next `step`
+    do, so `execute` is None: the robot should stand. The step does not count: `t` stays, and a later `step`
     asks for it anew. `reason` says why there is nothing, `error` why the service did not answer (None: it was
     away a moment ago and was not asked this time).
     """

@@ -55,6 +55,7 @@ class SessionState:
         self.finished = info.finished
         self.main_task_done = info.main_task_done
         self.closed = False
+        self._heard = list(info.rules)  # with those that `events` was told of
         self._stored = info.next_t  # poses the server has, as far as is known
         self._poses: dict[int, Pose] = {} if initial_pose is None else {0: wire.pose_values(initial_pose)}
         self._continuation = Continuation(info.margin)
@@ -68,6 +69,11 @@ class SessionState:
     @property
     def id(self) -> str:
         return self.info.id
+
+    def _rule_at(self, t: int) -> str:
+        """The rule that decides step t, as far as this session and its `events` have heard."""
+        begun = [rule["formula"] for rule in self._heard if rule["from"] <= t]
+        return str(begun[-1] if begun else self.info.spec["formula"])
 
     @property
     def unsent(self) -> dict[int, Pose]:
@@ -108,7 +114,8 @@ class SessionState:
         the pose and move on. With `on_failure` "witness" or "stop" it raises only what the caller got wrong;
         where the service cannot answer, a `LocalDecision` says what to do. A `main_task_done` of True said
         there is remembered; signals sent there are lost. While the service is known to be away, it is asked
-        again at pauses of 0.25 to 4 s, once, and steps in between cost nothing.
+        again at pauses of 0.25 to 4 s, once, and steps in between cost nothing, those that say to stop too: a
+        robot that stands asks again at its own pace.
         """
         yield Within(None if deadline is None else wire.deadline_value(deadline))
         x_t = wire.pose_values(pose)
@@ -131,20 +138,20 @@ class SessionState:
         if self.on_failure == "witness":
             way = self._continuation.at(x_t)
         error: SpecshieldError | None = None
-        if isinstance(way, str) or self._circuit.due:
+        if self._circuit.due:
             try:
-                once = self._circuit.open and not isinstance(way, str)
-                decision = yield from self._ask(x_t, body, own, 1 if once else TRIES)
+                decision = yield from self._ask(x_t, body, own, 1 if self._circuit.open else TRIES)
             except SpecshieldError as failed:
                 if not is_away(failed):
                     raise
                 error = failed
                 self._circuit.failed()
+                self._unanswered = self.t
             else:
                 self._circuit.answered()
                 return decision
         if isinstance(way, str):
-            self._unanswered, self.main_task_done = self.t, self.main_task_done or body["main_task_done"]
+            self.main_task_done = self.main_task_done or body["main_task_done"]
             return LocalDecision(self.t, "stop", None, way, self.spec_status, error=error)
         return self._alone(x_t, way, body["main_task_done"], error)
 
@@ -243,7 +250,7 @@ class SessionState:
         return verdict
 
     def _events(self, after: int | None) -> Events:
-        rules = list(self.info.rules)
+        rules = self._heard = list(self.info.rules)
 
         def decided(answer: Mapping[str, Any]) -> Decision:
             # Once the rule is settled, a session that is finished is one whose main task is over.
@@ -283,14 +290,10 @@ class SessionState:
         poses, start, gaps, joined = dict(poses), min(self._stored, t), 0, -1
         while True:
             request = wire.post(
-                "sessions",
-                self.id,
-                action,
-                body={"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body},
-                slow=slow,
-                tries=tries,
-                t=t if action == "steps" else None,
-            )
+                "sessions", self.id, action,
+                body={"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body}, slow=slow,
+                tries=tries, t=t if action == "steps" else None,
+            )  # fmt: skip
             reply = (yield from deliver(request)).reply
             try:
                 wire.check(reply)

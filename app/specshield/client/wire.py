@@ -115,11 +115,9 @@ def path(*segments: str) -> str:
     for segment in segments:
         if not isinstance(segment, str) or segment in ("", ".", ".."):
             raise InputError(
-                "this cannot be an id or a name",
-                path="id",
-                got=segment,
+                "this cannot be an id or a name", path="id", got=segment,
                 expected="an id or a name that the server gave",
-            )
+            )  # fmt: skip
     return "/v1/" + "/".join(quote(segment, safe="", errors="replace") for segment in segments)
 
 
@@ -130,10 +128,9 @@ def encode(body: Mapping[str, Any]) -> bytes:
     except (TypeError, ValueError, RecursionError) as error:
         name = next((name for name, value in body.items() if not _is_json(value)), "body")
         raise InputError(
-            f"{name}: cannot be sent as JSON: {error}",
-            path=name,
+            f"{name}: cannot be sent as JSON: {error}", path=name,
             expected="finite numbers, texts, lists and objects of them",
-        ) from error
+        ) from error  # fmt: skip
 
 
 def _json(value: Any) -> bytes:
@@ -161,11 +158,9 @@ def content(source: Content, where: str) -> bytes:
             return Path(source).read_bytes()
         except OSError as error:
             raise InputError(
-                f"{where} cannot be read: {error.strerror}",
-                path=where,
-                got=str(source),
+                f"{where} cannot be read: {error.strerror}", path=where, got=str(source),
                 expected="a file that can be read",
-            ) from error
+            ) from error  # fmt: skip
     return source.encode() if isinstance(source, str) else source
 
 
@@ -179,8 +174,10 @@ def pose_values(pose: Numbers, where: str = "pose") -> Pose:
 
 def point_values(points: Points, where: str) -> list[list[float]]:
     """Points (x, y) in metres, map frame. InputError unless each is two finite numbers."""
-    found = []
-    for i, point in enumerate(points.tolist() if isinstance(points, Array) else points):
+    found, listed = [], points.tolist() if isinstance(points, Array) else points
+    if not isinstance(listed, Iterable):
+        raise InputError("these are no points", path=where, got=listed, expected="a list of points [x, y]")
+    for i, point in enumerate(listed):
         values = _floats(point, InputError, f"{where}[{i}]", "two finite numbers x, y")
         if len(values) != 2 or not all(map(math.isfinite, values)):
             raise InputError(
@@ -196,16 +193,16 @@ def logit_values(logits: Logits) -> list[float | None]:
     for i, value in enumerate(values):
         if math.isnan(value) or value == math.inf:
             raise LogitsError(
-                f"logit {i} is {value}",
-                path=f"logits[{i}]",
-                got=str(value),
+                f"logit {i} is {value}", path=f"logits[{i}]", got=str(value),
                 expected="a finite number, -inf or None",
-            )
+            )  # fmt: skip
     return [None if value == -math.inf else value for value in values]
 
 
 def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
     """SampleError unless every signal is a finite number."""
+    if not isinstance(signals, Mapping):
+        raise SampleError("these are no signals", path="signals", got=signals, expected="numbers by name")
     values = {}
     for name, value in signals.items():
         (values[name],) = _floats([value], SampleError, f"signals.{name}", "a finite number")
@@ -230,18 +227,14 @@ def _floats(values: Any, error: type[InputError], where: str, expected: str) -> 
     try:
         listed = values.tolist() if hasattr(values, "tolist") else values
         return [-math.inf if value is None else float(value) for value in listed]
-    except (TypeError, ValueError) as cause:
+    except (TypeError, ValueError, OverflowError) as cause:
         raise error(f"{where}: {cause}", path=where, expected=expected) from cause
 
 
 _BY_TYPE = {cls.type: cls for cls in tree()}
 _BY_STATUS: dict[int, type[SpecshieldError]] = {
-    401: Unauthorized,
-    403: Unauthorized,
-    404: NotFound,
-    409: Conflict,
-    413: BodyTooLarge,
-}
+    401: Unauthorized, 403: Unauthorized, 404: NotFound, 409: Conflict, 413: BodyTooLarge,
+}  # fmt: skip
 _GATEWAY: dict[int, type[TransportError]] = {502: TransportError, 503: TransportError, 504: TransportTimeout}
 
 
@@ -275,10 +268,8 @@ def error_of(reply: Reply) -> SpecshieldError:
     cls = _BY_TYPE.get(str(document.get("type")), default)
     error = cls(
         str(document.get("detail") or document.get("title") or f"status {reply.status}"),
-        path=document.get("path"),
-        got=document.get("got"),
-        expected=document.get("expected"),
-    )
+        path=document.get("path"), got=document.get("got"), expected=document.get("expected"),
+    )  # fmt: skip
     told = {"title", "detail", "path", "got", "expected"} | (
         {"type"} if cls.type == document.get("type") else set()
     )

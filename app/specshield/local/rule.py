@@ -46,15 +46,16 @@ class Rule:
         """The poses that it looks at."""
         return np.array(poses[self.origin :]).reshape(-1, 3)
 
-    def signals(self, held: Mapping[str, Sequence[float]]) -> dict[str, Floats]:
-        return {name: np.array(held[name][self.origin :]) for name in self.shield.task.signals}
+    def signals(self, held: Mapping[str, Sequence[float]], length: int | None = None) -> dict[str, Floats]:
+        """Those that it reads, where it looks, of the first `length` steps."""
+        return {name: np.array(held[name][self.origin : length]) for name in self.shield.task.signals}
 
     def verdict(
         self, poses: Sequence[Pose], held: Mapping[str, Sequence[float]]
     ) -> tuple[SpecStatus, tuple[float, float]]:
         if len(poses) <= self.origin:
             return "pending", (-math.inf, math.inf)
-        return episode.close(self.shield, self.since(poses), self.signals(held))
+        return episode.close(self.shield, self.since(poses), self.signals(held, len(poses)))
 
     def told(self, status: SpecStatus) -> dict[str, Any]:
         """As the contract shows it."""

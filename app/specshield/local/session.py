@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from specshield import handover
+from specshield.client import wire
 from specshield.client.models import (
     Decision,
     Explanation,
@@ -22,8 +23,8 @@ from specshield.client.models import (
     Verdict,
     execute_of,
 )
-from specshield.client.wire import Logits, Numbers, Points, logit_values, point_values, pose_values
-from specshield.errors import HistoryConflict, SessionFinished, StepConflict
+from specshield.client.wire import Logits, Numbers, Points
+from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished, StepConflict
 from specshield.local.rule import Rule
 from specshield.reasons import refusal
 from specshield.reasons.explanation import explanations
@@ -113,21 +114,18 @@ class LocalSession:
         """
         over = self.main_task_done if main_task_done is None else main_task_done
         self._check(over)
-        check_signals(self.task, signals or {})
+        sent = {} if signals is None else wire.signal_values(signals)
+        check_signals(self.task, sent)
         x_t = self._at(pose)
-        held = self._held(signals or {})
+        held = self._held(sent)
         made = episode.decide(
-            self._rule.shield,
-            self._rule.since([*self._poses, x_t]),
-            None if logits is None else [-math.inf if z is None else z for z in logit_values(logits)],
-            over,
-            self._rule.signals(held),
-            self._carry,
-            witnesses,
-            None if occupied is None else np.array(point_values(occupied, "occupied")).reshape(-1, 2),
-            None if free is None else np.array(point_values(free, "free")).reshape(-1, 2),
+            self._rule.shield, self._rule.since([*self._poses, x_t]),
+            None if logits is None else [-math.inf if z is None else z for z in wire.logit_values(logits)],
+            over, self._rule.signals(held), self._carry, witnesses,
+            None if occupied is None else np.array(wire.point_values(occupied, "occupied")).reshape(-1, 2),
+            None if free is None else np.array(wire.point_values(free, "free")).reshape(-1, 2),
             explanations if explain else None,
-        )
+        )  # fmt: skip
         answer = _answer(replace(made, t=self.t), self.info, over, witnesses, explain)
         self._poses.append(x_t)
         self._signals, self._carry, self._decisions[self.t] = held, made.carry, answer
@@ -154,6 +152,10 @@ class LocalSession:
         cannot be kept from there; nothing is changed then.
         """
         self._check(self.main_task_done)
+        if not isinstance(policy, type(self._rule.policy)):
+            raise InputError(
+                "this is no policy in process", path="policy", got=policy, expected="a LocalShield"
+            )
         x_t = self._foreseen() if pose is None else self._at(pose)
         old, rule = self._rule, self._rule.followed_by(policy, self._shaping, self.t, clock)
         first = {**policy.task.signals, **self._first}
@@ -165,19 +167,18 @@ class LocalSession:
         carry = handover.carried_over(self._carry, same_map, same_robot, later)
         way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
         carry = handover.carried_over(self._carry, same_map, same_robot, later, way)
-        known = self._poses if pose is None else [*self._poses, x_t]
-        ended = old.told(old.verdict(known, held)[0])
+        known = self._poses if pose is None and self.t > 0 else [*self._poses, x_t]
+        ended, (status, _) = old.told(old.verdict(known, held)[0]), rule.verdict(known, held)
+        info = replace(
+            self.info, **policy.about(), next_t=self.t, feasible=True, spec_status=status,
+            rules=(*self.info.rules[:-1], ended, rule.told(status)),
+            any_signal=any_signal(rule.shield, seen, signals),
+        )  # fmt: skip
         self._rules.append(rule)
         self._carry, self._first = carry, first
         self._signals = {name: values[: self.t] for name, values in held.items()}
-        self.spec_status, _ = rule.verdict(known, held)
-        self.finished = False
-        self.info = replace(
-            self.info, **policy.about(), next_t=self.t, feasible=True, spec_status=self.spec_status,
-            rules=(*self.info.rules[:-1], ended, rule.told(self.spec_status)),
-            any_signal=any_signal(rule.shield, seen, signals),
-        )  # fmt: skip
-        return self.info
+        self.info, self.spec_status, self.finished = info, status, False
+        return info
 
     def events(self, after: int | None = None) -> Iterator[Decision]:
         """The decisions after step `after`, by default those that follow; -1: from the first. It ends with
@@ -212,11 +213,9 @@ class LocalSession:
     def _check(self, over: bool) -> None:
         if self._over:
             raise SessionFinished(
-                "the session is over: no further step is decided",
-                path="t",
-                got=self.t,
+                "the session is over: no further step is decided", path="t", got=self.t,
                 expected="a new session",
-            )
+            )  # fmt: skip
         if self.main_task_done and not over:
             raise StepConflict(
                 "an earlier step said that the main task is done, which cannot be taken back",
@@ -224,15 +223,17 @@ class LocalSession:
             )  # fmt: skip
 
     def _foreseen(self) -> Pose:
-        """Where the last decision's action leads."""
+        """Where the last decision's action leads. Raises HistoryGap after a step without a decision."""
+        if self.t == 0:
+            return self._initial
         last = self._decisions.get(self.t - 1)
         if last is None:
-            return self._poses[-1] if self._poses else self._initial
+            raise HistoryGap(f"nothing says where the robot is at step {self.t}", path="pose", expected="x_t")
         return self._poses[-1] if last.execute is None else last.next_poses[last.execute]
 
     def _at(self, pose: Numbers) -> Pose:
         """x_t. Raises HistoryConflict where x_0 is not where the session began."""
-        x_t = pose_values(pose)
+        x_t = wire.pose_values(pose)
         if self.t > 0:
             return x_t
         gap = [a - b for a, b in zip(x_t, self._initial, strict=True)]

@@ -17,7 +17,8 @@ from specshield.client.wire import pose_values
 from specshield.errors import MapError, NotFound, PolicyError
 from specshield.local.rule import Rule
 from specshield.local.session import LocalSession
-from specshield.lookahead.preferences import PROJECTION, check_shaping, prepare
+from specshield.local.settings import read_settings
+from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.policy.methods import DEFAULT, METHODS, Run, load_policy
 from specshield.policy.notices import notices
 from specshield.policy.options import read_options
@@ -27,7 +28,6 @@ from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
 from specshield.shield.proposal import Proposer
 from specshield.shield.signals import any_signal
-from specshield.shield.uncertainty import Uncertainty
 from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task, parse_regions
 from specshield.world.formats import read_map
@@ -155,34 +155,23 @@ class LocalShield:
 
         Raises PoseError, InfeasibleStart (unless `allow_infeasible`), and InputError for a setting.
         """
-        settings: dict[str, Any] = {"uncertainty": "learned", "learn_map": True, **options}
-        pose = pose_values(settings.pop("initial_pose"))
+        given: dict[str, Any] = {**options}
+        pose = pose_values(given.pop("initial_pose", None), "initial_pose")
+        settings = read_settings(given)
         id, allowed = settings.pop("id", None) or "local", settings.pop("allow_infeasible", False)
         shaping = settings.pop("shaping", PROJECTION)
-        check_shaping(shaping)
-        told = settings.pop("uncertainty")
-        known = (
-            (Uncertainty() if told == "learned" else None) if isinstance(told, str) else Uncertainty(**told)
-        )
-        config = Config(**settings, uncertainty=known, any_signal=told != "none")
+        config = Config(**settings)
         if shaping != PROJECTION:
             check_preferring(config)
         shield = self.configured(config, shaping)
         feasible, way = refusal.begin(shield, pose, allowed)
         status, _ = episode.close(shield, [pose])
         info = SessionInfo(
-            id=id,
-            **self.about(),
-            next_t=0,
-            feasible=feasible,
-            spec_status=status,
-            main_task_done=False,
-            finished=False,
-            expires_at="",
-            margin=shield.config.margin,
+            id=id, **self.about(), next_t=0, feasible=feasible, spec_status=status, main_task_done=False,
+            finished=False, expires_at="", margin=shield.config.margin,
             rules=(Rule(self, shield).told(status),),
             any_signal=any_signal(shield, np.array([pose], np.float64)),
-        )
+        )  # fmt: skip
         return LocalSession(self, shield, shaping, info, pose, way)
 
     def configured(self, config: Config, shaping: str) -> Shield:
@@ -194,13 +183,11 @@ class LocalShield:
         """What a session's info holds of its policy, and of the task that it is for."""
         task = self.task
         return {
-            "policy_ids": (str(self.card["id"]),),
-            "map_id": task.grid.content_hash,
+            "policy_ids": (str(self.card["id"]),), "map_id": task.grid.content_hash,
             "spec": {"formula": str(task.formula), "regions": self.card["spec"].get("regions", {})},
-            "horizon": task.horizon,
-            "actions": task.robot.action_names,
+            "horizon": task.horizon, "actions": task.robot.action_names,
             "terminal_actions": tuple(np.flatnonzero(task.robot.terminal).tolist()),
-        }
+        }  # fmt: skip
 
     @cache  # noqa: B019  a preference takes seconds to prepare, and shields are few
     def _preference(self, name: str) -> Any:

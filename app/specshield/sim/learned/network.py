@@ -100,11 +100,9 @@ def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Singles]:
     """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
     if sorted(weights) != sorted(SHAPES):
         raise PolicyError(
-            "not the tensors of a foundation model",
-            path="weights",
-            got=sorted(weights),
+            "not the tensors of a foundation model", path="weights", got=sorted(weights),
             expected=str(sorted(SHAPES)),
-        )
+        )  # fmt: skip
     for name, shape in SHAPES.items():
         array = weights[name]
         if array.dtype != np.float32 or array.shape != shape or not np.isfinite(array).all():
