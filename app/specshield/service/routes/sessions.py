@@ -48,6 +48,7 @@ GONE = {"_404": "No such session; it may have expired.", "_503": "The store is a
         _409="`session-exists`: the id is taken.",
         _429="The server keeps no more sessions.",
         _503="The store is away: try again.",
+        _507="`insufficient-storage`: the disk is full.",
     ),
 )
 async def create(request: SessionRequest, server: ServerState, caller: Caller) -> Any:
