@@ -159,6 +159,12 @@ def test_a_config_that_tells_of_another_task_than_the_policies_is_found_out(case
     assert f"NOT as decided: from step 0: {name} differ" in said
 
 
+def test_a_config_that_no_server_wrote_breaks_nothing(case1, capsys, tmp_path):
+    for changed in ({"uncertainty": {"drift": 1.0}}, {"policy_ids": []}, {"slack": -5}, {"evaluation": "x"}):
+        status, said = told(capsys, tmp_path, with_config(case1[0], 0, **changed))
+        assert (status, "NOT decided again" in said) == (2, True), changed
+
+
 def test_a_switch_that_tells_of_another_rule_or_clock_is_found_out(server, capsys, tmp_path):
     pose, file = (4.5, 5.0, 0.0), tmp_path / "switched.record"
     with (

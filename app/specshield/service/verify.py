@@ -56,7 +56,7 @@ def verify(file: Path, settings: Settings) -> int:
     print(f"seal {found.seal}")
     try:
         shields, wrong = _shields(found, settings)
-    except SpecshieldError as error:
+    except (SpecshieldError, TypeError) as error:  # or a record that no server made
         print(f"NOT decided again: {error}")
         return 2
     for config, names in zip(found.configs, wrong, strict=True):
@@ -135,7 +135,7 @@ def _again(
 
 
 def _shields(found: Chain, settings: Settings) -> tuple[list[Shield], list[list[str]]]:
-    """As the server had them, one a rule, and what is `_unlike`. Raises SpecshieldError where one lacks."""
+    """As the server had them, one a rule; and `_unlike` of each. Raises SpecshieldError without one."""
     with tempfile.TemporaryDirectory() as folder:  # where there is no data folder, none is made
         if not settings.data_dir.is_dir():
             settings = settings.model_copy(update={"data_dir": Path(folder)})
@@ -158,7 +158,7 @@ def _shield(config: Config, pose: list[float], policies: Policies) -> tuple[Shie
 
 
 def _unlike(config: Config, asked: Mapping[str, Any]) -> list[str]:
-    """The fields of the config that are not as asked: who seals a record anew can write what they like."""
+    """What this config says otherwise of the task than one that a server makes for the same policies."""
     said = msgspec.to_builtins(config)
     said, asked = {**said, **said["spec"]}, {**asked, **asked["spec"]}
     return [name for name in asked if name != "spec" and said[name] != asked[name]]
