@@ -214,10 +214,9 @@ def _server(url: str) -> Iterator[Finding]:
     theirs = _object(told).get("info", {}).get("version")
     if theirs not in (None, __version__):
         yield Finding(
-            "note",
-            f"the server is specshield {theirs}, this is {__version__}",
+            "note", f"the server is specshield {theirs}, this is {__version__}",
             "the same version on both sides",
-        )
+        )  # fmt: skip
     date = ready.headers.get("date")
     if date is not None:
         apart = email.utils.parsedate_to_datetime(date).timestamp() - began
