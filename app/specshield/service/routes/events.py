@@ -97,8 +97,8 @@ async def events(
 
     Without `after` or `Last-Event-ID` it begins with the next decision; with one of them it resumes where the
     reader was, without a gap and without doubles. Steps that were passed over have no event. The stream ends
-    when the session is finished, and when this server stops: then ask again. A reader who is too slow is cut
-    off.
+    when the session is finished, when its key is revoked, and when this server stops: then ask again. A
+    reader who is too slow is cut off.
     """
     stream = await server.watchers.open(key, after if last_event_id is None else last_event_id)
     return Response(status_code=204) if stream is None else EventStream(stream)
