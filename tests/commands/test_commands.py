@@ -13,6 +13,8 @@ import yaml
 
 from examples.own_house import HOUSE, REGIONS, ROBOT, RULE, occupancy
 from specshield.client import ShieldClient
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.marker import check_files
 from tests.serving import serving
 
 
@@ -82,6 +84,39 @@ def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
     assert f"port {port} is taken" in ill.stdout
     assert re.search(r"^wrong +the store at REDIS_URL does not answer", ill.stdout, re.M)
     assert "Traceback" not in ill.stderr
+
+
+def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):
+    data = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
+
+    def wrong(**environment):
+        told = command("doctor", **data, **environment)
+        assert (told.returncode, told.stderr) == (1, ""), told.stderr
+        (line,) = [line for line in told.stdout.splitlines() if line.startswith("wrong")]
+        assert told.stdout.splitlines()[-1] == "1 of these keep specshield from working"
+        return line
+
+    for name in ("MAPS", "MODELS"):
+        assert f"there is no folder {tmp_path}/none" in wrong(
+            **{f"SPECSHIELD_{name}_DIR": f"{tmp_path}/none"}
+        )
+    assert "SPECSHIELD_MAX_STEPS is not valid" in wrong(SPECSHIELD_MAX_STEPS="many")
+    unread = {"SPECSHIELD_DATA_URL": "nowhere://bucket/prefix"}
+    assert "files at 'nowhere://bucket/prefix' cannot be used" in wrong(**unread)
+    assert (
+        "files at 'nowhere://bucket/prefix' cannot be used"
+        in command("serve", "--port", 0, **data, **unread).stderr
+    )
+    store = EmbeddedStore(tmp_path / "store")
+    store.join()
+    try:
+        check_files(store.url, str(tmp_path / "files"), 5.0)
+        elsewhere = {"REDIS_URL": store.url, "SPECSHIELD_DATA_URL": str(tmp_path / "elsewhere")}
+        assert "keep their maps and policies elsewhere" in wrong(**elsewhere)
+        there = command("doctor", **data, **{**elsewhere, "SPECSHIELD_DATA_URL": str(tmp_path / "files")})
+        assert there.stdout.splitlines()[-1] == "all is well", there.stdout
+    finally:
+        store.leave()
 
 
 def test_a_session_is_watched_a_line_a_decision(tmp_path):

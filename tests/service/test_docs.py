@@ -59,6 +59,23 @@ def test_the_problems_that_any_operation_may_answer_are_told(told):
         assert ("503" in told) == (path.startswith("/v1/") or path == "/readyz"), (path, method)
 
 
+def test_when_to_ask_again_is_told_where_it_is_sent(told):
+    for path, method, operation in operations(told):
+        waits = {
+            status
+            for status, answer in operation["responses"].items()
+            if "Retry-After" in answer.get("headers", {})
+        }
+        assert waits == {"429", "503"} & set(operation["responses"]), (path, method)
+    assert "retry_after" in told["components"]["schemas"]["Problem"]["properties"]
+
+
+def test_all_that_keeps_something_may_lack_the_room(told):
+    for path in ("/v1/maps", "/v1/policies", "/v1/sessions"):
+        content = told["paths"][path]["post"]["responses"]["507"]["content"]["application/problem+json"]
+        assert list(content["examples"]) == ["insufficient-storage"], path
+
+
 def test_references_lead_somewhere(told):
     for name in re.findall(r'"#/components/schemas/(\w+)"', json.dumps(told)):
         assert name in told["components"]["schemas"]

@@ -3,7 +3,8 @@
 import asyncio
 import subprocess
 import sys
-from contextlib import contextmanager
+import time
+from contextlib import ExitStack, contextmanager
 
 import httpx
 import pytest
@@ -17,6 +18,8 @@ from tests.service.test_bad_input import problem
 from tests.service.world import START, grid_json, send_policy
 from tests.serving import HUNG, serving, wait_for
 
+POSE = [4.5, 5.0, 0.0]  # from which case 1 can be satisfied
+UNTOLD = 12.0  # [s] in which a stream that is open tells nothing, if nothing is decided: less than HEARTBEAT
 BARE = {"PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path)}
 
 
@@ -100,6 +103,37 @@ def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
     again = keys("revoke", "carol")
     assert again.returncode == 1
     assert "Traceback" not in again.stderr
+
+
+def test_a_revoked_key_ends_the_streams_of_events_that_it_opened_and_no_other(keyed):
+    def decide(client, t):
+        body = {"t": t, "poses": [POSE] * (t + 1), "logits": [0.0] * 20}
+        assert client.post("/v1/sessions/w/steps", json=body).status_code == 200
+
+    with ExitStack() as open:
+        own, other = (open.enter_context(caller(keyed, name)) for name in ("erin", "frank"))
+        for client in (own, other):
+            assert begin(client, id="w", initial_pose=POSE).status_code == 201
+        streams = {
+            (client, path): open.enter_context(client.stream("GET", path, timeout=UNTOLD))
+            for client in (own, other)
+            for path in ("/v1/sessions/w/events?after=-1", "/v1/events?session=w:-1")
+        }
+        lines = {asked: stream.iter_lines() for asked, stream in streams.items()}
+        on_keys(keyed, lambda keys: keys.revoke("erin"))
+        secret = on_keys(keyed, lambda keys: keys.create("erin"))  # who goes on with the session
+        began = time.monotonic()
+        for (client, path), told in lines.items():
+            if client is own:
+                assert not [line for line in told if line.startswith(("data", "event"))], path
+                assert client.get(path).status_code == 401
+        assert time.monotonic() - began < UNTOLD
+        own.headers["Authorization"] = f"Bearer {secret}"
+        decide(own, 0)
+        decide(other, 0)
+        for (client, path), told in lines.items():
+            if client is other:
+                assert any(line.startswith("data") for line in told), path
 
 
 def test_what_a_name_may_be(keyed):

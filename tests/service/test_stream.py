@@ -44,6 +44,22 @@ def test_a_step_in_messagepack_has_the_same_values(client, begin, step):
     assert client.post(path, content=msgpack.packb(body(0)), headers=PACKED).content == answer.content
 
 
+def test_what_a_caller_does_not_take_is_not_what_is_answered(client, begin):
+    path = f"/v1/sessions/{begin()['id']}/steps"
+    for accept, kind in (
+        ("application/msgpack;q=0", "application/json"),
+        ("application/msgpack; q=0.0, application/json", "application/json"),
+        ("*/*", "application/json"),
+        ("application/msgpack;q=0.5", "application/msgpack"),
+        ("application/json;q=0.1, application/msgpack", "application/msgpack"),
+    ):
+        answer = client.post(path, json=body(0), headers={"Accept": accept})
+        assert (answer.status_code, answer.headers["content-type"]) == (200, kind), accept
+    path = path.replace("steps", "trajectory")
+    for accept, kind in (("application/x-ndjson;q=0", "json"), ("application/x-ndjson", "x-ndjson")):
+        assert client.get(path, headers={"Accept": accept}).headers["content-type"] == f"application/{kind}"
+
+
 @pytest.mark.parametrize(
     ("content", "type", "path"),
     [

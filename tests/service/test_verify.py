@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from typing import Any
 
@@ -66,6 +67,9 @@ def test_what_was_sent_to_a_server_is_found_in_its_data_folder(server, client, b
     answer = client.get(f"/v1/sessions/{session['id']}/record")
     assert answer.status_code == 200
     assert told(capsys, tmp_path, answer.content, data_dir=server.data_dir)[0] == 0
+    other = with_config(answer.content, 0, signals={"battery": 91.0})
+    status, said = told(capsys, tmp_path, other, data_dir=server.data_dir)
+    assert (status, "from step 0: signals differ" in said) == (1, True)
     status, said = told(capsys, tmp_path, answer.content)
     assert (status, "the chain is whole" in said, "NOT decided again" in said) == (2, True, True)
     assert client.get("/v1/sessions/none/record").json()["type"] == "not-found"
@@ -98,17 +102,95 @@ def test_what_is_no_record_is_refused(content):
 
 def forged(content: bytes, t: int, **changed: Any) -> bytes:
     """A whole chain of which one step says something else: who holds the server can make one."""
-    file = msgspec.msgpack.decode(content)
+    file, steps = msgspec.msgpack.decode(content), list(chain.read(content).steps)
+    if t >= 0:
+        steps[t] = record.encode(msgspec.structs.replace(record.decode(steps[t]), **changed))
+    return sealed_anew(content, file["config"], steps)
+
+
+def sealed_anew(content: bytes, config: bytes, steps: list[bytes]) -> bytes:
+    """The record with this config and these steps, each of which holds the hash of what comes before it."""
     found = chain.read(content)
-    steps, last, start = list(found.steps), record.digest(file["config"]), 0
-    for i, step in enumerate(steps):
+    lines, steps, last, start = config.split(b"\n"), list(steps), record.digest(config.split(b"\n")[0]), 0
+    for t, step in enumerate(steps):
+        for i, old in enumerate(found.configs[1:], 1):
+            if old.begins == t:
+                lines[i] = lines[i].replace(
+                    old.before.encode(), record.link(last, found.rows[start:t]).hex().encode()
+                )
+                last, start = record.digest(lines[i]), t
         if step:
             kept = record.decode(step)
-            before = record.link(last, found.rows[start : i + 1])
-            kept = msgspec.structs.replace(kept, before=before, **(changed if i == t else {}))
-            steps[i] = record.encode(kept)
-            last, start = record.digest(steps[i]), i + 1
-    return chain.pack(file["config"], file["rows"], steps)[0]
+            kept = msgspec.structs.replace(kept, before=record.link(last, found.rows[start : t + 1]))
+            steps[t] = record.encode(kept)
+            last, start = record.digest(steps[t]), t + 1
+    return chain.pack(b"\n".join(lines), msgspec.msgpack.decode(content)["rows"], steps)[0]
+
+
+def with_config(content: bytes, rule: int, **changed: Any) -> bytes:
+    """A whole chain whose config says something else of this rule."""
+    file = msgspec.msgpack.decode(content)
+    configs = [json.loads(line) for line in file["config"].split(b"\n")]
+    for name, value in changed.items():
+        held = configs[rule]["spec"] if name in configs[rule]["spec"] else configs[rule]
+        assert held.get(name) != value
+        held[name] = value
+    lines = [json.dumps(config, separators=(",", ":")).encode() for config in configs]
+    return sealed_anew(content, b"\n".join(lines), file["steps"])
+
+
+FORGED: dict[str, Any] = {
+    "map_id": "0" * 64,
+    "robot": {"footprint": {"radius": 0.01, "offset": [0, 0]}, "on_contact": "stay", "actions": []},
+    "horizon": 3,
+    "terminal_actions": [],
+    "actions": [f"action {i}" for i in range(20)],
+    "formula": "F[0,60] x > 1",
+    "regions": {"Door": {"type": "circle", "center": [0.0, 0.0], "radius": 0.1}},
+}
+
+
+@pytest.mark.parametrize("name", FORGED)
+def test_a_config_that_tells_of_another_task_than_the_policies_is_found_out(case1, name, capsys, tmp_path):
+    assert with_config(case1[0], 0) == case1[0]
+    status, said = told(capsys, tmp_path, with_config(case1[0], 0, **{name: FORGED[name]}))
+    assert status == 1
+    assert "the chain is whole" in said
+    assert f"NOT as decided: from step 0: {name} differ" in said
+
+
+def test_a_config_that_no_server_wrote_breaks_nothing(case1, capsys, tmp_path):
+    for changed in ({"uncertainty": {"drift": 1.0}}, {"policy_ids": []}, {"slack": -5}, {"evaluation": "x"}):
+        status, said = told(capsys, tmp_path, with_config(case1[0], 0, **changed))
+        assert (status, "NOT decided again" in said) == (2, True), changed
+
+
+def test_a_switch_that_tells_of_another_rule_or_clock_is_found_out(server, capsys, tmp_path):
+    pose, file = (4.5, 5.0, 0.0), tmp_path / "switched.record"
+    with (
+        ShieldClient(server.url, timeout=60.0) as client,
+        client.sessions.create(policy_id="case1", initial_pose=pose) as session,
+    ):
+        for t in range(5):
+            if t == 3:
+                session.switch("case1", clock="keep", pose=pose)
+            decision = session.step(pose, np.zeros(20))
+            pose = decision.next_poses[decision.execute]
+        session.save_record(file)
+    content = file.read_bytes()
+    assert with_config(content, 1) == content
+    assert told(capsys, tmp_path, content)[0] == 0
+    for changed, expected in (
+        ({"horizon": 3}, "NOT as decided: from step 3: horizon differ"),
+        ({"formula": "F[0,60] x > 1"}, "NOT as decided: from step 3: formula differ"),
+        ({"clock": "restart"}, "NOT as it was: step 3: the origin"),
+        ({"clock": "restart", "origin": 3}, "NOT as decided: step 3"),
+    ):
+        status, said = told(capsys, tmp_path, with_config(content, 1, **changed))
+        assert status == 1, (changed, said)
+        assert expected in said
+    status, said = told(capsys, tmp_path, with_config(content, 0, clock="keep"))
+    assert "NOT as it was: step 0" in said
 
 
 def test_a_forged_chain_is_whole_and_its_answer_is_found_out(case1, capsys, tmp_path):

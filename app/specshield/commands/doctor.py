@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,6 +21,8 @@ from specshield.errors import SpecshieldError
 
 if TYPE_CHECKING:
     import httpx
+
+    from specshield.service.settings import Settings
 
 CLOCK = 2.0  # [s] by which this machine and a server may differ before it is said
 State = Literal["ok", "note", "wrong"]
@@ -36,11 +39,24 @@ class Finding:
 
 def doctor(url: str | None, port: int, parts: Sequence[str]) -> int:
     """Prints what is found. parts: the modules of a server. The exit status is 1 where something is wrong."""
-    checks: list[Callable[[], Iterator[Finding]]] = [_python, lambda: _parts(parts), _kernels, _disk, _store]
-    checks.append(lambda: _port(port) if url is None else _server(url))
-    wrong = sum(_shown(check) for check in checks)
+    wrong = sum(_shown(check) for check in _checks(url, port, parts))
     print("all is well" if not wrong else f"{wrong} of these keep specshield from working")
     return 1 if wrong else 0
+
+
+def _checks(url: str | None, port: int, parts: Sequence[str]) -> Iterator[Callable[[], Iterator[Finding]]]:
+    """Each imports its part of a server when it is due. A setting that is not valid is told once."""
+    yield from (_python, partial(_parts, parts), _kernels)
+    from specshield.service.settings import read_settings
+
+    try:
+        settings = read_settings()
+    except SpecshieldError as error:
+        invalid = Finding("wrong", str(error))
+        yield lambda: iter([invalid])
+    else:
+        yield from (partial(check, settings) for check in (_disk, _files, _store))
+    yield partial(_port, port) if url is None else partial(_server, url)
 
 
 def _shown(check: Callable[[], Iterator[Finding]]) -> int:
@@ -104,11 +120,9 @@ def _kernels() -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _disk() -> Iterator[Finding]:
+def _disk(settings: Settings) -> Iterator[Finding]:
     from specshield.service.library.files import check_writable
-    from specshield.service.settings import read_settings
 
-    settings = read_settings()
     there = settings.data_dir
     if there.exists():
         check_writable(there, "SPECSHIELD_DATA_DIR")
@@ -126,15 +140,22 @@ def _disk() -> Iterator[Finding]:
         yield Finding("ok", f"data folder {there.absolute()}, {free >> 30} GiB free")
 
 
-def _store() -> Iterator[Finding]:
-    from specshield.service.settings import read_settings
+def _files(settings: Settings) -> Iterator[Finding]:
+    for name, folder in (("MAPS", settings.maps_dir), ("MODELS", settings.models_dir)):
+        if not folder.is_dir():
+            yield Finding("wrong", f"there is no folder {folder}", f"mend SPECSHIELD_{name}_DIR, or unset it")
+
+
+def _store(settings: Settings) -> Iterator[Finding]:
     from specshield.service.storage.connect import connect
     from specshield.service.storage.embedded import EmbeddedStore
+    from specshield.service.storage.marker import check_first
+    from specshield.service.storage.objects import open_objects
 
-    settings = read_settings()
     if settings.redis_url is None:
         EmbeddedStore(settings.data_dir)
         yield Finding("ok", "the store is the server's own, in the data folder")
+        open_objects(settings.files_at)
         return
     import redis
 
@@ -144,12 +165,13 @@ def _store() -> Iterator[Finding]:
             connect(settings.redis_url, blocking=True, socket_timeout=settings.store_timeout)
         ) as store:
             store.ping()
+            took = 1000 * (time.perf_counter() - began)
+            yield Finding("ok", f"the store at REDIS_URL answers in {took:.1f} ms")
+            check_first(store, settings.files_at)
     except redis.RedisError as error:
         yield Finding(
             "wrong", f"the store at REDIS_URL does not answer: {error}", "start it, or mend REDIS_URL"
         )
-        return
-    yield Finding("ok", f"the store at REDIS_URL answers in {1000 * (time.perf_counter() - began):.1f} ms")
 
 
 def _port(port: int) -> Iterator[Finding]:
@@ -192,10 +214,9 @@ def _server(url: str) -> Iterator[Finding]:
     theirs = _object(told).get("info", {}).get("version")
     if theirs not in (None, __version__):
         yield Finding(
-            "note",
-            f"the server is specshield {theirs}, this is {__version__}",
+            "note", f"the server is specshield {theirs}, this is {__version__}",
             "the same version on both sides",
-        )
+        )  # fmt: skip
     date = ready.headers.get("date")
     if date is not None:
         apart = email.utils.parsedate_to_datetime(date).timestamp() - began

@@ -83,15 +83,11 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
     """
     settings = settings or Settings()
     app = FastAPIOffline(
-        title="specshield",
-        version=__version__,
-        description=DESCRIPTION,
-        openapi_tags=TAGS,
-        lifespan=lambda app: _life(app, settings, embedded),
-        redoc_url=None,
+        title="specshield", version=__version__, description=DESCRIPTION, openapi_tags=TAGS,
+        lifespan=lambda app: _life(app, settings, embedded), redoc_url=None,
         generate_unique_id_function=lambda route: "_".join([*map(str, route.tags), route.name]),
         swagger_ui_parameters={"defaultModelsExpandDepth": 0, "tryItOutEnabled": True},
-    )
+    )  # fmt: skip
     for module in (pages, specs, maps, robots, policies, sessions, pictures, events, system):
         app.include_router(module.router)
     app.include_router(events.overview)

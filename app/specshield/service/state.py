@@ -27,6 +27,12 @@ PICTURES = 32  # kept in memory, of 5 to 500 kB each
 TOO_MUCH = {"_503": "`busy`: too much is asked of the server just now; ask again after `Retry-After`."}
 
 
+RETRY = {"headers": {"Retry-After": {
+    "description": "Seconds after which to ask again: with every 503, and with `rate-limited`.",
+    "schema": {"type": "integer", "minimum": 1},
+}}}  # fmt: skip
+
+
 @dataclass
 class Server:
     """startup: how far this server has come. worker: this server's own, if it has one."""
@@ -75,4 +81,5 @@ def problems(**said: str) -> dict[int | str, dict[str, Any]]:
 def problem_documents(**said: str) -> dict[int | str, dict[str, Any]]:
     """The problem documents of the statuses that are named, with what is said of each."""
     content = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    return {int(status[1:]): {"description": text, "content": content} for status, text in said.items()}
+    found = {int(status[1:]): {"description": text, "content": content} for status, text in said.items()}
+    return {status: told | RETRY if status in (429, 503) else told for status, told in found.items()}

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -18,7 +19,7 @@ from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
 from specshield.service.sessions import chain, history, record
 from specshield.service.sessions.chain import Chain, Config
-from specshield.service.sessions.config import settings_of
+from specshield.service.sessions.config import asked_by, settings_of
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.rules import carried_over, way
 from specshield.service.sessions.session import columns
@@ -54,11 +55,14 @@ def verify(file: Path, settings: Settings) -> int:
     print("the chain is whole: no byte was changed since it was sealed")
     print(f"seal {found.seal}")
     try:
-        shields = _shields(found, settings)
-    except SpecshieldError as error:
+        shields, wrong = _shields(found, settings)
+    except (SpecshieldError, TypeError) as error:  # or a record that no server made
         print(f"NOT decided again: {error}")
         return 2
-    return _decide(found, shields)
+    for config, names in zip(found.configs, wrong, strict=True):
+        if names:
+            print(f"NOT as decided: from step {config.begins}: {', '.join(names)} differ from the policies'")
+    return 1 if any(wrong) else _decide(found, shields)
 
 
 def _decide(found: Chain, shields: Sequence[Shield]) -> int:
@@ -130,24 +134,31 @@ def _again(
     return made, pack_carry(decision.carry).unpacked()
 
 
-def _shields(found: Chain, settings: Settings) -> list[Shield]:
-    """As the server had them, one a rule. Raises SpecshieldError where map or policy are not at hand."""
+def _shields(found: Chain, settings: Settings) -> tuple[list[Shield], list[list[str]]]:
+    """As the server had them, one a rule; and `_unlike` of each. Raises SpecshieldError without one."""
     with tempfile.TemporaryDirectory() as folder:  # where there is no data folder, none is made
         if not settings.data_dir.is_dir():
             settings = settings.model_copy(update={"data_dir": Path(folder)})
         policies = Policies(settings, Maps(settings))
         last = len(found.rows) - 1
         starts = [found.rows[min(config.origin, last), :3].tolist() for config in found.configs]
-        return [_shield(config, start, policies) for config, start in zip(found.configs, starts, strict=True)]
+        made = [_shield(config, start, policies) for config, start in zip(found.configs, starts, strict=True)]
+        return [shield for shield, _ in made], [wrong for _, wrong in made]
 
 
-def _shield(config: Config, pose: list[float], policies: Policies) -> Shield:
+def _shield(config: Config, pose: list[float], policies: Policies) -> tuple[Shield, list[str]]:
     """pose: the first one that the rule looks at."""
-    proposers = [policies.policy(policies.record(id)) for id in config.policy_ids]
+    records = [policies.record(id) for id in config.policy_ids]
+    proposers = [policies.policy(each) for each in records]
     shield = replace(make_shield(proposers), config=settings_of(msgspec.structs.asdict(config)))
-    task = shield.task
-    if [*task.robot.action_names] != config.actions or str(task.formula) != config.spec.formula:
-        raise InputError("the policy at hand is for another task", expected=config.spec.formula)
-    if config.shaping != PROJECTION:
-        shield = replace(shield, preference=prepare(config.shaping, task, proposers, pose))
-    return shield
+    wrong = _unlike(config, asked_by(config.policy_ids, records[0].about, shield.task))
+    if config.shaping != PROJECTION and not wrong:
+        shield = replace(shield, preference=prepare(config.shaping, shield.task, proposers, pose))
+    return shield, wrong
+
+
+def _unlike(config: Config, asked: Mapping[str, Any]) -> list[str]:
+    """What this config says otherwise of the task than one that a server makes for the same policies."""
+    said = msgspec.to_builtins(config)
+    said, asked = {**said, **said["spec"]}, {**asked, **asked["spec"]}
+    return [name for name in asked if name != "spec" and said[name] != asked[name]]

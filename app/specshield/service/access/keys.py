@@ -8,6 +8,7 @@ the store, whatever key it shows, and a revoked key is refused that long after a
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import json
 import logging
@@ -59,6 +60,7 @@ class Keys:
         self._known: Mapping[str, Key] = self._own
         self._version: bytes | None = None
         self._read, self._tried_at = False, -math.inf
+        self._changed = asyncio.Event()
 
     # --- for servers
 
@@ -79,6 +81,14 @@ class Keys:
             raise Unauthorized("an API key is needed", path="Authorization", expected="Bearer <key>")
         return found
 
+    async def until_refused(self, authorization: bytes) -> None:
+        """Returns once the key that a request showed is refused. It is looked up when keys have changed."""
+        with contextlib.suppress(Unauthorized):
+            while True:
+                changed = self._changed
+                await self.check(authorization)
+                await changed.wait()
+
     async def refresh(self) -> None:
         """Reads the keys where they have changed; all who ask for that within MISS_EVERY share one reading.
         Without the store, what was read last holds. Once there was a key, the server is never open again.
@@ -94,6 +104,8 @@ class Keys:
                 if version is not None and version != self._version:
                     listed = {key.digest: key for key in await self.listed()}
                     self._known, self._version = {**self._own, **listed}, version
+                    self._changed.set()
+                    self._changed = asyncio.Event()
                 self._read = True
             except StoreError as error:
                 log.debug("the keys could not be read: %s", error)
@@ -122,11 +134,9 @@ class Keys:
         record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
             raise InputError(
-                "there is a key of this name",
-                path="name",
-                got=name,
+                "there is a key of this name", path="name", got=name,
                 expected="another; or revoke that one first",
-            )
+            )  # fmt: skip
         await _reached(self._store.hincrby(KEYS, "", 1))
         return secret
 

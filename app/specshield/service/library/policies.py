@@ -116,11 +116,9 @@ class Policies(Claimed):
     def _load(self, record: Record) -> Proposer:
         if record.card is None:
             raise PolicyError(
-                f"policy {record.id} is not ready",
-                path="policy_id",
-                got=record.id,
+                f"policy {record.id} is not ready", path="policy_id", got=record.id,
                 expected="a policy whose status is `ready`",
-            )
+            )  # fmt: skip
         folder = self._models / record.name if record.name else self._folder / record.id
         return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
 

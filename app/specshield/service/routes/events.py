@@ -26,7 +26,7 @@ overview = APIRouter(tags=["sessions"])
 
 
 class EventStream(Response):
-    """Sends what the stream gives until it ends, the reader goes away, or is too slow."""
+    """Sends what the stream gives until it ends or its key is refused, or the reader is gone or too slow."""
 
     media_type = EVENTS
 
@@ -41,17 +41,23 @@ class EventStream(Response):
                 pass
             group.cancel_scope.cancel()
 
+        async def until_refused(reading: anyio.CancelScope) -> None:
+            shown = dict(scope["headers"]).get(b"authorization", b"")
+            await scope["app"].state.server.keys.until_refused(shown)
+            reading.cancel()
+
         start = {"type": "http.response.start", "status": 200, "headers": self.raw_headers}
         async with anyio.create_task_group() as group:
             group.start_soon(until_gone)
             await send(start)
-            async for content in self._stream:
-                with anyio.move_on_after(SLOWEST) as sending:
-                    await send({"type": "http.response.body", "body": content, "more_body": True})
-                if sending.cancelled_caught:
-                    break  # unfinished: the server closes the connection
-            else:
-                await send({"type": "http.response.body", "body": b""})
+            with anyio.CancelScope() as reading:
+                group.start_soon(until_refused, reading)
+                async for content in self._stream:
+                    with anyio.move_on_after(SLOWEST) as sending:
+                        await send({"type": "http.response.body", "body": content, "more_body": True})
+                    if sending.cancelled_caught:
+                        group.cancel_scope.cancel()  # unfinished: the server closes the connection
+            await send({"type": "http.response.body", "body": b""})
             group.cancel_scope.cancel()
         await self._stream.aclose()  # type: ignore[attr-defined]
 
@@ -91,8 +97,8 @@ async def events(
 
     Without `after` or `Last-Event-ID` it begins with the next decision; with one of them it resumes where the
     reader was, without a gap and without doubles. Steps that were passed over have no event. The stream ends
-    when the session is finished, and when this server stops: then ask again. A reader who is too slow is cut
-    off.
+    when the session is finished, when its key is revoked, and when this server stops: then ask again. A
+    reader who is too slow is cut off.
     """
     stream = await server.watchers.open(key, after if last_event_id is None else last_event_id)
     return Response(status_code=204) if stream is None else EventStream(stream)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import msgspec
@@ -26,6 +27,11 @@ def read_step(body: bytes | str, packed: bool) -> StepBody:
         return _msgpack.decode(body) if packed and isinstance(body, bytes) else _json.decode(body)
     except (msgspec.MsgspecError, UnicodeError, RecursionError):
         return _explained(_parsed(body, packed))
+
+
+def accepts(header: str, kind: str) -> bool:
+    """Whether a header Accept names this kind, and does not refuse it by q=0."""
+    return re.search(rf"{kind}(?!\s*;\s*q=0(\.0*)?\s*(,|$))", header) is not None
 
 
 def write_answer(answer: StepAnswer, packed: bool) -> bytes:

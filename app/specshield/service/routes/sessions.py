@@ -10,7 +10,7 @@ from fastapi.responses import StreamingResponse
 
 from specshield.service import examples
 from specshield.service.access.owners import Caller, Owner, scoped
-from specshield.service.routes.messages import MSGPACK
+from specshield.service.routes.messages import MSGPACK, accepts
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.sessions import SessionList, SessionRequest, SessionResponse, SwitchRequest
 from specshield.service.schemas.steps import (
@@ -48,6 +48,7 @@ GONE = {"_404": "No such session; it may have expired.", "_503": "The store is a
         _409="`session-exists`: the id is taken.",
         _429="The server keeps no more sessions.",
         _503="The store is away: try again.",
+        _507="`insufficient-storage`: the disk is full.",
     ),
 )
 async def create(request: SessionRequest, server: ServerState, caller: Caller) -> Any:
@@ -185,7 +186,7 @@ async def trajectory(
 ) -> Response:
     """x_0 to x_t with the answers, streamed: as one JSON object, or newline-delimited."""
     lines, rules = await server.sessions.trajectory(key)
-    if format == "ndjson" or (format is None and NDJSON in accept):
+    if format == "ndjson" or (format is None and accepts(accept, NDJSON)):
         return StreamingResponse(_each(lines), media_type=NDJSON)
     return StreamingResponse(_listed(lines, rules), media_type="application/json")
 

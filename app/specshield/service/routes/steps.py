@@ -12,7 +12,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from specshield.errors import SpecshieldError
 from specshield.service import problems
 from specshield.service.access.owners import scoped
-from specshield.service.routes.messages import MSGPACK, read_step, write_answer
+from specshield.service.routes.messages import MSGPACK, accepts, read_step, write_answer
 from specshield.service.state import Server
 
 PATH = re.compile(r"/v1/sessions/([A-Za-z0-9][A-Za-z0-9_.-]{0,63})/steps")
@@ -54,7 +54,7 @@ class StepRoute:
             problems.tell(scope, error)
             await problems.response(error)(scope, receive, send)
             return
-        packed = PACKED in headers.get(b"accept", b"")
+        packed = accepts(headers.get(b"accept", b"").decode("latin-1"), MSGPACK)
         content = write_answer(answer, packed)
         told = [(b"content-length", b"%d" % len(content)), (b"content-type", PACKED if packed else JSON)]
         await send({"type": "http.response.start", "status": 200, "headers": told})

@@ -79,8 +79,9 @@ class Problem(Answer):
     got: JsonValue = Field(None, description="What the field held, shortened.")
     expected: str | None = Field(None, description="What is valid there.")
     errors: list[FieldError] | None = Field(
-        None, description="Every field that failed, where there are several."
+        None, description="Every field that failed, if there are several."
     )
+    retry_after: int | None = Field(None, description="Of `rate-limited`: as the header Retry-After says.")
     proved: bool | None = Field(
         None, description="Of an infeasible rule: true where no future exists, false where none was found."
     )

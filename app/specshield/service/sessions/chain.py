@@ -49,7 +49,9 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     map_id: str
     spec: Spec
     robot: str | dict[str, Any]
+    horizon: int
     actions: list[str]
+    terminal_actions: list[int]
     seed: int
     threshold: float
     margin: float
@@ -65,6 +67,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     created_at: str = ""
     begins: int = msgspec.field(name="from", default=0)
     origin: int = 0
+    clock: Literal["keep", "restart"] = "restart"
     before: str = ""
     way: str = ""
 
@@ -154,12 +157,14 @@ def _names(configs: Sequence[Config]) -> list[list[str]]:
 
 def _check_switches(configs: Sequence[Config], names: Sequence[list[str]], rows: Floats) -> None:
     """That rules follow each other in time, and that a column holds its first value until its rule begins."""
-    if configs[0].begins or configs[0].origin:
+    if configs[0].begins or configs[0].origin or configs[0].clock == "keep":
         raise _broken(0, "the first rule does not begin with the session", None)
     for i in range(1, len(configs)):
         config, old = configs[i], configs[i - 1]
-        if not old.begins <= config.begins <= len(rows) or config.origin not in (config.begins, old.origin):
+        if not old.begins <= config.begins <= len(rows):
             raise _broken(config.begins, "a rule begins out of its turn", None)
+        if config.origin != (config.begins if config.clock == "restart" else old.origin):
+            raise _broken(config.begins, f"the origin of a rule is not what `{config.clock}` means", None)
         for column in range(len(names[i - 1]), len(names[i])):
             if (rows[: config.begins, 3 + column] != config.spec.signals[names[i][column]]).any():
                 raise _broken(config.begins, "a signal has values before its rule began", None)

@@ -15,16 +15,9 @@ from specshield.task import Task
 
 # The settings that are stored by the names that `Config` has for them.
 ALIKE = (
-    "seed",
-    "threshold",
-    "margin",
-    "slack",
-    "evaluation",
-    "max_steps",
-    "threshold_over",
-    "learn_map",
+    "seed", "threshold", "margin", "slack", "evaluation", "max_steps", "threshold_over", "learn_map",
     "map_memory",
-)
+)  # fmt: skip
 ANY_SIGNAL = "any_signal"  # is not asked for by itself: it goes with what is taken of the world
 
 

@@ -171,13 +171,9 @@ class Sessions:
             session, status, bounds = await self._run(self._closed, session)
             if not state.closed:
                 state = msgspec.structs.replace(
-                    session.state,
-                    length=len(session.rows),
-                    spec_status=status,
-                    finished=True,
-                    closed=True,
+                    session.state, length=len(session.rows), spec_status=status, finished=True, closed=True,
                     expires_at=self._expiry(),
-                )
+                )  # fmt: skip
                 change = Change(state.packed(), *session.added())
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue

@@ -204,12 +204,9 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
     }
     verdict, _ = shields.verdict(old, session.rows, session.signal_names)
     made = replace(
-        session,
-        rules=[*session.rules, config],
-        settings=settings_of(config),
-        rows=rules.widened(session.rows, session.signal_names, signals),
-        signal_names=names,
-    )
+        session, rules=[*session.rules, config], settings=settings_of(config),
+        rows=rules.widened(session.rows, session.signal_names, signals), signal_names=names,
+    )  # fmt: skip
     carry = None if session.state.carry is None else session.state.carry.unpacked()
     known = rules.carried_over(carry, old, config)
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
@@ -221,14 +218,9 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
     rows = made.since
     status = episode.close(shield, rows[:, :3], columns(rows, names))[0] if len(rows) else "pending"
     state = msgspec.structs.replace(
-        session.state,
-        length=len(made.rows),
-        next_t=t,
-        feasible=True,
-        spec_status=status,
-        head=record.digest(files.to_json(config)),
-        carry=None if carry is None else pack_carry(carry),
+        session.state, length=len(made.rows), next_t=t, feasible=True, spec_status=status,
+        head=record.digest(files.to_json(config)), carry=None if carry is None else pack_carry(carry),
         verdicts=(*session.state.verdicts, verdict),
         any_signal=any_signal(shield, seen[:, :3], columns(seen, names)),
-    )
+    )  # fmt: skip
     return replace(made, state=state)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import secrets
 import time
+from typing import Any
 
 from specshield.errors import InputError, StoreError
 from specshield.service.storage.connect import FAILURES, connect
@@ -44,9 +45,20 @@ def check_files(url: str, place: str, timeout: float) -> None:
         time.sleep(0.1)
         mine = files.read(FILE)
     if mine != theirs:
-        raise InputError(
-            f"the servers of this store keep their maps and policies elsewhere than in {place}",
-            path="SPECSHIELD_DATA_URL",
-            expected="one folder or URL for all servers and workers that share REDIS_URL. If these files are "
-            f"the right ones, delete the key {KEY} from the store and start all of them again",
-        )
+        raise _elsewhere(place)
+
+
+def check_first(store: Any, place: str) -> None:
+    """The same before a server starts: nothing is written, and nothing waited for. store: a blocking one."""
+    files, theirs = open_objects(place), store.get(KEY)
+    if theirs is not None and files.read(FILE) != theirs:
+        raise _elsewhere(place)
+
+
+def _elsewhere(place: str) -> InputError:
+    return InputError(
+        f"the servers of this store keep their maps and policies elsewhere than in {place}",
+        path="SPECSHIELD_DATA_URL",
+        expected="one folder or URL for all servers and workers that share REDIS_URL. If these files are "
+        f"the right ones, delete the key {KEY} from the store and start all of them again",
+    )
