@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, wraps
 from typing import Any, TypeVar, cast
@@ -181,14 +181,14 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
     return {name: float(value) for name, value in signals.items()}
 
 
-def check_signals(task: Task, signals: Mapping[str, float]) -> None:
-    """Raises SampleError for a signal that the task does not declare, or a value that is out of range."""
+def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
+    """Raises SampleError for a signal that is none of those a session's rules have read, or out of range."""
     for name, value in signals.items():
-        if name not in task.signals:
-            declared = f"one of {sorted(task.signals)}, as the spec declares them"
+        if name not in names:
+            declared = f"one of {sorted(names)}, which the session's rules read"
             raise SampleError(
                 f"unknown signal {name!r}", path=f"signals.{name}", got=name,
-                expected=declared if task.signals else "no signals: the rule declares none",
+                expected=declared if names else "no signals: the rule reads none",
             )  # fmt: skip
         if not -LARGEST <= value <= LARGEST:
             raise SampleError(

@@ -191,7 +191,10 @@ def test_a_server_switches_the_same_without_a_pose_where_rules_read_signals(
                 assert [[rule[name] for name in same] for rule in told.rules] == [
                     [rule[name] for name in same] for rule in mine.rules
                 ]
-            signals = {"battery": 9.0 - 0.1 * t} if "battery" in local.task.signals else None
+            reads = "battery" in local.task.signals or (t >= steps and rules[0] is READS)
+            signals = (
+                {"battery": 9.0 - 0.1 * t} if reads else None
+            )  # what the rule before read may be sent on
             decision = local.step(pose, [0.5, 0.0, 0.0, 0.2, None], signals=signals)
             asked = remote.step(pose, [0.5, 0.0, 0.0, 0.2, None], signals=signals)
             assert decision == replace(asked, timings={})

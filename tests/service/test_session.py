@@ -17,7 +17,7 @@ TASK = make_task(
 
 @pytest.mark.parametrize("signals", [{"weight": 1.0}, {"load": math.inf}, {"load": math.nan}])
 def test_signals_that_are_sent_are_checked(signals):
-    check_signals(TASK, {"load": 3.0})
+    check_signals(TASK.signals, {"load": 3.0})
     with pytest.raises(SampleError) as caught:
-        check_signals(TASK, signals)
+        check_signals(TASK.signals, signals)
     assert caught.value.path == f"signals.{next(iter(signals))}"

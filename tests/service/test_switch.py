@@ -193,15 +193,18 @@ def test_another_robot_with_other_signals_and_back(server, client, begin, step, 
     assert (shown["actions"], shown["terminal_actions"]) == (["crawl", "done", "rest"], [1])
     pose, crawled = poses[3], []
     for t in range(3, 6):
-        body: dict[str, Any] = {"logits": [0.0, None, 1.0], "signals": {"alarm": 0.1 * t}}
+        # A robot may go on sending what the rule before read.
+        body: dict[str, Any] = {
+            "logits": [0.0, None, 1.0],
+            "signals": {"alarm": 0.1 * t, "battery": 80.0 - t},
+        }
         answer = step(session, t, [pose], **body)
         crawled.append((t, [pose], body, answer.content))
         assert answer.json()["action_name"] in ("crawl", "rest")
         pose = answer.json()["next_poses"][0]
     problem(step(session, 6, [pose], logits=LOGITS), 422, "invalid-logits")
-    problem(
-        step(session, 6, [pose], logits=[0.0, None, 1.0], signals={"battery": 1.0}), 422, "invalid-samples"
-    )
+    unknown = step(session, 6, [pose], logits=[0.0, None, 1.0], signals={"charge": 1.0})
+    assert "['alarm', 'battery']" in problem(unknown, 422, "invalid-samples")["expected"]
     shown = switch(session, 6, LATER, clock="restart").json()
     assert shown["max_steps"] == 600
     assert step(session, 6, [pose], logits=LOGITS).json()["action_name"] in session["actions"]

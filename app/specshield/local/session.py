@@ -115,7 +115,7 @@ class LocalSession:
         over = self.main_task_done if main_task_done is None else main_task_done
         self._check(over)
         sent = {} if signals is None else wire.signal_values(signals)
-        check_signals(self.task, sent)
+        check_signals(self._first, sent)  # what another rule of the session reads is kept, too
         x_t = self._at(pose)
         held = self._held(sent)
         made = episode.decide(

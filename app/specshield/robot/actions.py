@@ -107,8 +107,9 @@ def robot_from_json(spec: Any) -> Robot:
     if isinstance(spec, str):
         if spec not in PRESETS:
             raise RobotError(
-                f"unknown robot {spec!r}", got=spec, expected=f"one of {sorted(PRESETS)}, or an object"
-            )
+                f"unknown robot {spec!r}", got=spec,
+                expected=f"one of {', '.join(sorted(PRESETS))}; or an object",
+            )  # fmt: skip
         return PRESETS[spec]
     _keys(spec, "", {"footprint", "actions"}, {"on_contact"})
     footprint = spec["footprint"]

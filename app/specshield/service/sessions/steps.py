@@ -224,7 +224,7 @@ def timed(
 
 def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Session, Decision, StepRecord]:
     shield, signals = shields.of(session), request.signals or {}
-    check_signals(shield.task, signals)
+    check_signals(session.signal_names, signals)
     state, logits = session.state, logits_of(request)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), signals))
     carry = None if state.carry is None else state.carry.unpacked()
