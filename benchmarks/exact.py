@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import njit  # not cached: on the disk it would not notice that the package's functions changed
 from numpy.typing import NDArray
 
 from specshield.robot.dynamics import Body, motion_count, step
@@ -51,14 +51,14 @@ class Goal(NamedTuple):
         return np.asarray(inside)
 
 
-@njit(cache=True)
+@njit
 def _is_near(goal: Goal, x: float, y: float) -> bool:
     off = math.hypot(x - goal.x, y - goal.y) - goal.radius if goal.radius < math.inf else -math.inf
     off = max(off, goal.xs[0] - x, x - goal.xs[1], goal.ys[0] - y, y - goal.ys[1])
     return -math.inf < off < ABOUT
 
 
-@njit(cache=True)
+@njit
 def _is_at(goal: Goal, x: float, y: float, theta: float) -> bool:
     if goal.radius < math.inf and not math.hypot(x - goal.x, y - goal.y) < goal.radius:
         return False
@@ -67,7 +67,7 @@ def _is_at(goal: Goal, x: float, y: float, theta: float) -> bool:
     )
 
 
-@njit(cache=True)
+@njit
 def _is_out(shut: Floats, x: float, y: float) -> bool:
     out = True
     for n in range(shut.shape[0]):
@@ -75,7 +75,7 @@ def _is_out(shut: Floats, x: float, y: float) -> bool:
     return out
 
 
-@njit(cache=True)
+@njit
 def fewest_steps(
     body: Body, goal: Goal, x: float, y: float, theta: float, steps: int, most: int, shut: Floats
 ) -> int:
