@@ -171,6 +171,7 @@ def changed(body, **fields):
         ({"format": "occupancy_grid", "info": {}}, "data"),
         (changed(grid_json(), data=[0, 0, 101]), ...),
         (changed(grid_json(), data="0"), "data"),
+        ({"format": "procthor", "house": [], "asset_sizes": {}, "resolution": 0.05}, "house"),
         (changed(grid_json(), info={**grid_json()["info"], "width": 5000}), "info.width"),
         (changed(grid_json(), info={**grid_json()["info"], "resolution": 0}), "info.resolution"),
         ({"format": "procthor", "house": {}, "asset_sizes": {}}, ...),

@@ -239,6 +239,7 @@ def _vector(value: Any, path: str) -> tuple[float, float, float]:
 
 
 def _parse(house: Any, asset_sizes: Any, resolution: Any) -> tuple[OccupancyGrid, dict[str, Region]]:
+    checks.mapping(house, "house")
     try:
         return load_house(house, asset_sizes, resolution)
     except MapError as error:
