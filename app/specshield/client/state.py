@@ -70,7 +70,7 @@ class SessionState:
     def id(self) -> str:
         return self.info.id
 
-    def _rule_at(self, t: int) -> str:
+    def rule_at(self, t: int) -> str:
         """The rule that decides step t, as far as this session and its `events` have heard."""
         begun = [rule["formula"] for rule in self._heard if rule["from"] <= t]
         return str(begun[-1] if begun else self.info.spec["formula"])

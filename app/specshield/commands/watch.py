@@ -27,12 +27,12 @@ def watch(
     with ShieldClient(url, api_key=os.environ.get("SPECSHIELD_API_KEY")) as client:
         found = client.sessions.get(session)
         after = -1 if after is None else after
-        rule = found._rule_at(after + 1)
+        rule = found.rule_at(after + 1)
         print(f"session {found.id}: {rule}")
         print(HEAD, flush=True)
         for seen, decision in enumerate(found.events(after), 1):
-            if rule != found._rule_at(decision.t):
-                rule = found._rule_at(decision.t)
+            if rule != found.rule_at(decision.t):
+                rule = found.rule_at(decision.t)
                 print(f"from step {decision.t}: {rule}", flush=True)
             print(line(decision), flush=True)
             for warning in decision.warnings:

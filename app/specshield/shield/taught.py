@@ -11,6 +11,7 @@ import struct
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from threading import Lock
 
 import numpy as np
@@ -88,8 +89,9 @@ class Taught:
 
     def to_bytes(self) -> bytes:
         known = self.followed
-        told = known.follows, known.halted, min(known.met, MOST_MET), known.alone, known.going, known.standing
-        return HEAD.pack(known.drawn, *told) + self.map.to_bytes()
+        chances = known.by_chance, known.going, known.standing
+        head = HEAD.pack(known.drawn, known.follows, known.halted, min(known.met, MOST_MET), *chances)
+        return head + self.map.to_bytes()
 
     @staticmethod
     def from_bytes(value: bytes | None) -> Taught:
@@ -284,11 +286,10 @@ def handed_on(
     if not shield.config.learn_map and not taught.map.revision:
         return None
     followed = replace(taught.followed, drawn=drawn)
-    if followed.follows and followed.alone >= SELDOM:
-        going = chance_of(shield, distribution, moved, nexts, nexts[drawn] if drawn >= 0 else pose)
-        followed = replace(
-            followed, going=going, standing=chance_of(shield, distribution, moved, nexts, pose)
-        )
+    if followed.follows and followed.by_chance >= SELDOM:
+        chance = partial(chance_of, shield, distribution, moved, nexts)
+        going, standing = chance(nexts[drawn] if drawn >= 0 else pose), chance(pose)
+        followed = replace(followed, going=going, standing=standing)
     return replace(taught, followed=followed).to_bytes()
 
 

@@ -3,7 +3,7 @@
 The shield knows poses, not what was executed. A pose on the way of a motion, and short of where f leads, is a
 contact of that motion, unless the end of another motion explains it. Where the robot did not move at all, it
 may have slipped, or its caller may have chosen to wait: so that counts only for a caller that executes what
-was drawn, as one that draws for itself would seldom have seemed to, and only the second time in a row.
+was drawn, beyond doubt (`Followed.surely`), and only the second time in a row.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ UNDER = 0.03  # [m] a footprint that covers a cell by more than this shows it fr
 class Followed:
     """What is known of how the caller follows: the motion drawn last (-1: none), whether all steps so far can
     be what was drawn, and the drawn motion that did nothing in the step before (-1: none). met: how many
-    contacts there were at this very pose. alone: how likely a caller that draws by itself does all
-    this. going, standing: how likely it goes where the drawn motion leads, and stays where it is.
+    contacts there were at this very pose. by_chance: the probability that a caller who draws by itself seems
+    to follow so far. going, standing: that it goes where the drawn motion leads next, and that it stays.
     """
 
     drawn: int = -1
     follows: bool = True
     halted: int = -1
     met: int = 0
-    alone: float = 1.0
+    by_chance: float = 1.0
     going: float = 1.0
     standing: float = 0.0
 
     @property
     def surely(self) -> bool:
-        """Whether the caller executes what is drawn."""
-        return self.follows and self.alone < SELDOM
+        """Whether it is beyond doubt that the caller executes what is drawn."""
+        return self.follows and self.by_chance < SELDOM
 
 
 def contact_of(
@@ -69,7 +69,7 @@ def contact_of(
     if drawn >= 0 and is_near(foreseen[drawn : drawn + 1], after, near):
         return -1, moved_on(followed, as_drawn=True)
     if is_near(before[None], after, near):  # it stands where it stood
-        followed = replace(followed, alone=followed.alone * followed.standing)
+        followed = replace(followed, by_chance=followed.by_chance * followed.standing)
         if drawn < 0 or not followed.surely:
             return -1, replace(followed, halted=-1)
         if followed.halted == drawn or followed.met or again:  # what stopped it a moment ago does so again
@@ -86,8 +86,8 @@ def contact_of(
 
 def moved_on(followed: Followed, as_drawn: bool = False) -> Followed:
     """After a motion that met nothing. as_drawn: whether it was the one that was drawn."""
-    if as_drawn and followed.alone >= SELDOM and followed.going < 1.0:
-        followed = replace(followed, alone=followed.alone * followed.going)
+    if as_drawn and followed.by_chance >= SELDOM and followed.going < 1.0:
+        followed = replace(followed, by_chance=followed.by_chance * followed.going)
     return replace(followed, halted=-1, met=0) if followed.halted >= 0 or followed.met else followed
 
 
