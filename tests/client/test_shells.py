@@ -322,6 +322,7 @@ def test_the_public_names():
         "close",
         "switch",
         "id",
+        "rule_at",
     }
 
 
