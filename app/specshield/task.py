@@ -175,9 +175,11 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
             )
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not -LARGEST <= value <= LARGEST:
             raise SampleError(
-                "a signal's initial value has to be a number in range", path=f"signals.{name}",
-                got=value, expected=SIGNAL,
-            )  # fmt: skip
+                "a signal's initial value has to be a number in range",
+                path=f"signals.{name}",
+                got=value,
+                expected=SIGNAL,
+            )
     return {name: float(value) for name, value in signals.items()}
 
 
@@ -187,9 +189,11 @@ def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
         if name not in names:
             declared = f"one of {sorted(names)}, which the session's rules read"
             raise SampleError(
-                f"unknown signal {name!r}", path=f"signals.{name}", got=name,
+                f"unknown signal {name!r}",
+                path=f"signals.{name}",
+                got=name,
                 expected=declared if names else "no signals: the rule reads none",
-            )  # fmt: skip
+            )
         if not -LARGEST <= value <= LARGEST:
             raise SampleError(
                 "a signal is out of range", path=f"signals.{name}", got=str(value), expected=SIGNAL
@@ -199,6 +203,8 @@ def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
 def _check_name(name: str, path: str, error: type[InputError]) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
         raise error(
-            f"{name!r} cannot be a name", path=path, got=name,
+            f"{name!r} cannot be a name",
+            path=path,
+            got=name,
             expected=f"up to {MAX_NAME} letters, digits and _; no keyword of formulas, no x, y, theta",
-        )  # fmt: skip
+        )

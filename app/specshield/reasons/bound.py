@@ -113,9 +113,13 @@ class _Ahead:
         spread(self.body, poses, nexts)
         further, also = nexts.reshape(-1, 3), np.repeat(met, count)
         keys = np.column_stack(
-            [np.round(SAME * further[:, :2]), np.round(SAME * np.cos(further[:, 2])),
-             np.round(SAME * np.sin(further[:, 2])), also]
-        )  # fmt: skip
+            [
+                np.round(SAME * further[:, :2]),
+                np.round(SAME * np.cos(further[:, 2])),
+                np.round(SAME * np.sin(further[:, 2])),
+                also,
+            ]
+        )
         _, first = np.unique(keys, axis=0, return_index=True)
         further, also = further[np.sort(first)], also[np.sort(first)]
         keeps = np.ones(len(further), np.bool_)

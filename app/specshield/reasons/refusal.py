@@ -61,9 +61,11 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
     most, horizon = shield.config.max_steps, shield.task.horizon
     if most is not None and most < horizon:
         raise InputError(
-            f"a session of {most} steps ends before its rule is decided", path="max_steps", got=most,
+            f"a session of {most} steps ends before its rule is decided",
+            path="max_steps",
+            got=most,
             expected=f"at least {horizon}, the rule's last step",
-        )  # fmt: skip
+        )
     try:
         start(shield, pose)
     except InfeasibleStart as error:
@@ -101,8 +103,11 @@ def switch(
                 return told.way
         raise InfeasibleSwitch(
             f"the new rule was not taken: {told.message}",
-            path=error.path, got=error.got, expected=error.expected, **told.details,
-        ) from None  # fmt: skip
+            path=error.path,
+            got=error.got,
+            expected=error.expected,
+            **told.details,
+        ) from None
 
 
 def refusal(

@@ -107,9 +107,10 @@ def robot_from_json(spec: Any) -> Robot:
     if isinstance(spec, str):
         if spec not in PRESETS:
             raise RobotError(
-                f"unknown robot {spec!r}", got=spec,
+                f"unknown robot {spec!r}",
+                got=spec,
                 expected=f"one of {', '.join(sorted(PRESETS))}; or an object",
-            )  # fmt: skip
+            )
         return PRESETS[spec]
     _keys(spec, "", {"footprint", "actions"}, {"on_contact"})
     footprint = spec["footprint"]
@@ -129,9 +130,11 @@ def robot_from_json(spec: Any) -> Robot:
     items = spec["actions"]
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ACTIONS:
         raise RobotError(
-            "a robot has a list of actions", path="actions", got=type(items).__name__,
+            "a robot has a list of actions",
+            path="actions",
+            got=type(items).__name__,
             expected=f"1 to {MAX_ACTIONS} actions",
-        )  # fmt: skip
+        )
     actions = tuple(_action(item, f"actions[{i}]") for i, item in enumerate(items))
     names = [action.name for action in actions]
     for i, name in enumerate(names):
@@ -186,9 +189,11 @@ def _action(item: Any, path: str) -> Action:
 def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
     if not isinstance(item, dict):
         raise RobotError(
-            "not an object", path=path or None, got=type(item).__name__,
+            "not an object",
+            path=path or None,
+            got=type(item).__name__,
             expected=f"an object with {sorted(required)}",
-        )  # fmt: skip
+        )
     missing, unknown = required - item.keys(), item.keys() - required - optional
     if missing or unknown:
         said = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(map(str, unknown))}"

@@ -254,9 +254,18 @@ def _arc_nears(
 
 @leaf
 def _nears_at(
-    ou: float, ov: float, reach: float, start: float, angle: float, at: float,
-    u0: float, v0: float, h: float, r: float, is_end: bool,
-) -> bool:  # fmt: skip
+    ou: float,
+    ov: float,
+    reach: float,
+    start: float,
+    angle: float,
+    at: float,
+    u0: float,
+    v0: float,
+    h: float,
+    r: float,
+    is_end: bool,
+) -> bool:
     """Whether the arc's point in the direction `at`, if the arc has it, is nearer than r to a square."""
     turned = (at - start) % (2.0 * math.pi)
     passed = turned if angle > 0.0 else (2.0 * math.pi - turned) % (2.0 * math.pi)

@@ -56,33 +56,38 @@ class Config:
     def __post_init__(self) -> None:
         if self.evaluation not in ("feasibility", "robustness"):
             raise InputError(
-                "unknown evaluation", path="evaluation", got=self.evaluation,
+                "unknown evaluation",
+                path="evaluation",
+                got=self.evaluation,
                 expected="'feasibility' or 'robustness'",
-            )  # fmt: skip
+            )
         binary = self.evaluation == "feasibility"
         if not math.isfinite(self.threshold) or (binary and not 0.0 < self.threshold <= 1.0):
             raise InputError(
-                "the threshold is out of range", path="threshold", got=self.threshold,
+                "the threshold is out of range",
+                path="threshold",
+                got=self.threshold,
                 expected="above 0 and at most 1" if binary else "a finite number of metres",
-            )  # fmt: skip
-        if not (math.isfinite(self.margin) and self.margin >= 0.0):
-            raise InputError(
-                "the margin is out of range", path="margin", got=self.margin, expected="0 or more metres"
             )
-        if self.slack < 0:
-            raise InputError(
-                "the slack is out of range", path="slack", got=self.slack, expected="0 or more steps"
-            )
+        for name, value, unit in (("margin", self.margin, "metres"), ("slack", self.slack, "steps")):
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(
+                    f"the {name} is out of range", path=name, got=value, expected=f"0 or more {unit}"
+                )
         if self.threshold_over == "episode" and not binary:
             raise InputError(
                 "a threshold over the episode is a probability, and evaluation 'robustness' has metres",
-                path="threshold_over", got="episode", expected="'step', or evaluation 'feasibility'",
-            )  # fmt: skip
+                path="threshold_over",
+                got="episode",
+                expected="'step', or evaluation 'feasibility'",
+            )
         if self.map_memory is not None and self.map_memory < 1:
             raise InputError(
-                "the map's memory is out of range", path="map_memory", got=self.map_memory,
+                "the map's memory is out of range",
+                path="map_memory",
+                got=self.map_memory,
                 expected="1 or more steps, or null for ever",
-            )  # fmt: skip
+            )
 
 
 @quick
@@ -116,9 +121,10 @@ def check_preferring(config: Config) -> None:
     if config.evaluation != "feasibility" or config.threshold != 1.0:
         raise InputError(
             "a preference chooses within the feasible set, and these settings leave mass outside it",
-            path="shaping", got=f"evaluation {config.evaluation!r}, threshold {config.threshold:g}",
+            path="shaping",
+            got=f"evaluation {config.evaluation!r}, threshold {config.threshold:g}",
             expected="shaping 'projection', or evaluation 'feasibility' with threshold 1",
-        )  # fmt: skip
+        )
 
 
 def make_shield(
@@ -133,13 +139,20 @@ def make_shield(
     for i, policy in enumerate(proposers):
         if policy.task.content_hash != task.content_hash:
             raise PolicyError(
-                "the policies were made for different tasks", path=f"policy_ids[{i}]",
-                got=policy.task.content_hash, expected=f"task {task.content_hash}, as policy_ids[0]",
-            )  # fmt: skip
+                "the policies were made for different tasks",
+                path=f"policy_ids[{i}]",
+                got=policy.task.content_hash,
+                expected=f"task {task.content_hash}, as policy_ids[0]",
+            )
     return Shield(
-        task, tuple(proposers), config or Config(), make_body(task.robot, task.grid),
-        view_of(task, task.formula), conjunction_of(task, task.formula), preference,
-    )  # fmt: skip
+        task,
+        tuple(proposers),
+        config or Config(),
+        make_body(task.robot, task.grid),
+        view_of(task, task.formula),
+        conjunction_of(task, task.formula),
+        preference,
+    )
 
 
 # A pose, and a motion that led nowhere from it; ~motion where it did nothing and may only have slipped.

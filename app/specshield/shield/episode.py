@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import blake2b
 from itertools import accumulate
 
@@ -19,15 +19,13 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, PoseError
-from specshield.portable import exp
-from specshield.quick import quick
 from specshield.robot.dynamics import Body, in_collision, successors, wrap
 from specshield.robot.oddity import oddities
 from specshield.shield import shaping
-from specshield.shield.caution import threshold
+from specshield.shield.answer import answer_of, unmodified
 from specshield.shield.caution.experience import learn, remember
 from specshield.shield.caution.threshold import chances, left_of, next_left
-from specshield.shield.decision import Carry, Config, Decision, Explanation, Mode, Reason, Shield, make_shield
+from specshield.shield.decision import Carry, Config, Decision, Explanation, Shield, make_shield
 from specshield.shield.feasibility import Prefix, futures, prefix_of
 from specshield.shield.judgement import (
     Judged,
@@ -74,9 +72,10 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
         found = f"the best robustness found is {best:.3f}" if len(rho) else "; ".join(warnings)
         raise InfeasibleStart(
             f"no way from here was found that keeps the rule: {found}",
-            path="initial_pose", got=[round(v, 3) for v in pose],
+            path="initial_pose",
+            got=[round(v, 3) for v in pose],
             expected="a pose from which the rule can be kept; or allow_infeasible",
-        )  # fmt: skip
+        )
 
 
 def check_place(shield: Shield, pose: Floats, path: str) -> None:
@@ -85,14 +84,18 @@ def check_place(shield: Shield, pose: Floats, path: str) -> None:
     u, v = grid.to_grid(pose[:2])
     if not (0.0 <= u < grid.width * grid.resolution and 0.0 <= v < grid.height * grid.resolution):
         raise PoseError(
-            "the pose is outside the map", path=path, got=got,
+            "the pose is outside the map",
+            path=path,
+            got=got,
             expected=f"within {list(grid.bounds)} (xmin, ymin, xmax, ymax)",
-        )  # fmt: skip
+        )
     if in_collision(shield.body, *pose):
         raise PoseError(
-            "the footprint touches an obstacle", path=path, got=got,
+            "the footprint touches an obstacle",
+            path=path,
+            got=got,
             expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
-        )  # fmt: skip
+        )
 
 
 def close(
@@ -105,10 +108,17 @@ def close(
 
 
 def decide(
-    shield: Shield, history: ArrayLike, logits: ArrayLike | None, main_task_done: bool = False,
-    signals: Signals | None = None, carry: Carry | None = None, witnesses: bool = False,
-    occupied: ArrayLike | None = None, free: ArrayLike | None = None, explain: Explainer | None = None,
-) -> Decision:  # fmt: skip
+    shield: Shield,
+    history: ArrayLike,
+    logits: ArrayLike | None,
+    main_task_done: bool = False,
+    signals: Signals | None = None,
+    carry: Carry | None = None,
+    witnesses: bool = False,
+    occupied: ArrayLike | None = None,
+    free: ArrayLike | None = None,
+    explain: Explainer | None = None,
+) -> Decision:
     """One decision of Algorithm 1, at t = len(history) - 1.
 
     history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main
@@ -139,11 +149,10 @@ def decide(
     asked = SATISFIED_ABOVE + care.margin
     margin_decided = prefix.low > asked or prefix.high <= asked  # whatever follows, it is kept or it is not
 
-    answer: _Answer
     withstands, doubts = spec_status == "satisfied", np.zeros(len(robot.motions), np.bool_)
     if t >= task.horizon or (spec_status == "satisfied" and margin_decided):
         judged = None
-        answer = _unmodified(shield, log_prior)
+        answer = unmodified(shield, log_prior)
     else:
         shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
         believed = tried_again(told, taught, judged, prefix, tail, spec_status, care)
@@ -160,7 +169,7 @@ def decide(
         if shield.config.threshold_over == "episode" and spec_status == "pending":
             chance = chances(shield, care, prefix, judged, doubts)
             left = left_of(shield, carry, chance)
-        answer = _answer(shield, log_prior, judged, main_task_done, weights, chance, left)
+        answer = answer_of(shield, log_prior, judged, main_task_done, weights, chance, left)
         if spec_status == "violated":
             answer = replace(answer, mode="violated")
 
@@ -209,74 +218,19 @@ def decide(
         any_signal=withstands if shield.config.any_signal and task.signals else None,
         explanations=explain(shield, prefix, judged, doubts) if explain is not None else (),
         carry=Carry(
-            t, nexts, certified, memory, residuals=remembered,
+            t,
+            nexts,
+            certified,
+            memory,
+            residuals=remembered,
             threshold_left=left if shield.config.threshold_over == "episode" else None,
             learned=handed_on(
                 shield, taught, int(robot.motion_of[moved]), moved, answer.distribution, nexts, poses[-1]
             ),
-            action=action, stuck=taught.stuck,
+            action=action,
+            stuck=taught.stuck,
         ),
-    )  # fmt: skip
-
-
-@quick
-@dataclass(frozen=True)
-class _Answer:
-    """conditional [A]: the model's log-probabilities given that it does not end, None where it does."""
-
-    distribution: Floats
-    mode: Mode
-    reason: Reason | None
-    conditional: Floats | None = None
-
-
-def _answer(
-    shield: Shield, log_prior: Floats | None, judged: Judged, main_task_done: bool, weights: Floats | None,
-    chance: Floats | None, left: float,
-) -> _Answer:  # fmt: skip
-    """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`.
-
-    weights [A]: the preference's log-weights inside S_t beside the model's log-probabilities. chance [A],
-    left: of a threshold over the episode (threshold.py).
-    """
-    terminal = shield.task.robot.terminal
-    any_feasible = judged.some
-    said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
-    certified = np.zeros(len(terminal))
-    certified[judged.completion] = 1.0
-    conditional, ending = (None, 0.0) if log_prior is None else shaping.going_on(log_prior, terminal)
-    if main_task_done or log_prior is None:
-        mode: Mode = "completion" if any_feasible else "fallback"
-        return _Answer(certified, mode, said if any_feasible else "infeasible", conditional)
-    mode = "shaped" if any_feasible else "fallback"
-    if conditional is None:  # the model ends for certain
-        return _Answer(exp(log_prior), mode, None if any_feasible else "infeasible")
-    config, attainable = shield.config, any_feasible
-    if config.evaluation == "robustness":
-        shaped = shaping.tilt(conditional, judged.values, config.threshold)
-        attainable = bool(judged.values.max() >= config.threshold)
-    elif chance is not None and chance.max() > 0.0:
-        shaped = threshold.shaped(conditional, chance, left)
-    elif config.threshold == 1.0 or config.threshold_over == "episode":
-        wanted = conditional if weights is None else conditional + weights
-        shaped = shaping.restrict(wanted, judged.feasible)
-    else:
-        shaped = shaping.soften(conditional, judged.feasible, config.threshold)
-    reason: Reason | None = said
-    if shaped is None:
-        reason = "zero_prior_mass" if attainable else "infeasible"
-    mode = "fallback" if shaped is None else "shaped"
-    body = certified if shaped is None else shaped
-    return _Answer(shaping.with_ending(body, log_prior, ending, terminal), mode, reason, conditional)
-
-
-def _unmodified(shield: Shield, log_prior: Floats | None) -> _Answer:
-    """The prior; without logits there is nothing left to do: `end`, or else the first action."""
-    if log_prior is not None:
-        return _Answer(exp(log_prior), "prior", None)
-    idle = np.zeros(len(shield.task.robot.actions))
-    idle[int(np.argmax(shield.task.robot.terminal))] = 1.0
-    return _Answer(idle, "prior", None)
+    )
 
 
 def _history(poses: ArrayLike) -> Floats:

@@ -151,9 +151,19 @@ def simulated(
         prefix.high <= SATISFIED_ABOVE
     )  # then every row is wanted whole: parts of the rule are judged on it
     finite = _simulate_and_rate(
-        body, prefix.view, prefix.known, prefix.t, prefix.poses[-1], prefix.held,
-        prefix.task.robot.wait_motion, not violated, motions, poses, rho, leaves,
-    )  # fmt: skip
+        body,
+        prefix.view,
+        prefix.known,
+        prefix.t,
+        prefix.poses[-1],
+        prefix.held,
+        prefix.task.robot.wait_motion,
+        not violated,
+        motions,
+        poses,
+        rho,
+        leaves,
+    )
     said = warnings if finite else [*warnings, NOT_FINITE]
     return Futures(motions, poses, rho, leaves, preferred, tuple(dict.fromkeys(said)))
 
@@ -161,10 +171,13 @@ def simulated(
 def together(tried: Futures, more: Futures) -> Futures:
     """Both, as `more` prefers."""
     return Futures(
-        np.concatenate([tried.motions, more.motions]), np.concatenate([tried.poses, more.poses]),
-        np.concatenate([tried.rho, more.rho]), np.concatenate([tried.leaves, more.leaves]), more.preferred,
+        np.concatenate([tried.motions, more.motions]),
+        np.concatenate([tried.poses, more.poses]),
+        np.concatenate([tried.rho, more.rho]),
+        np.concatenate([tried.leaves, more.leaves]),
+        more.preferred,
         tuple(dict.fromkeys([*tried.warnings, *more.warnings])),
-    )  # fmt: skip
+    )
 
 
 def rho_of(prefix: Prefix, tried: Futures) -> tuple[Floats, Floats]:
@@ -178,9 +191,19 @@ def rho_of(prefix: Prefix, tried: Futures) -> tuple[Floats, Floats]:
 
 @kernel
 def _simulate_and_rate(
-    body: Body, view: View, known: Floats, t: int, pose: Floats, held: Floats, wait: int, gives_up: bool,
-    motions: Ints, poses: Floats, rho: Floats, leaves: Floats,
-) -> bool:  # fmt: skip
+    body: Body,
+    view: View,
+    known: Floats,
+    t: int,
+    pose: Floats,
+    held: Floats,
+    wait: int,
+    gives_up: bool,
+    motions: Ints,
+    poses: Floats,
+    rho: Floats,
+    leaves: Floats,
+) -> bool:
     """Simulates each row of motions (N, T - t) from x_t, pose (3,), and computes rho (N,) of the joint
     trajectory; poses (N, T - t, 3) and leaves (N, tree.size) are written. False where the arithmetic was not
     finite on some row.

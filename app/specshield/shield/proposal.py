@@ -81,9 +81,14 @@ class _Failed:
 
 
 def ask(
-    proposer: Proposer, history: Floats, signals: Mapping[str, Floats], margin: float, count: int, steps: int,
+    proposer: Proposer,
+    history: Floats,
+    signals: Mapping[str, Floats],
+    margin: float,
+    count: int,
+    steps: int,
     least: int = 1,
-) -> tuple[Proposal | None, str | None]:  # fmt: skip
+) -> tuple[Proposal | None, str | None]:
     """Asks a proposer; returns its proposal and None, or None and a sentence that says why it was not used.
 
     Each of `least` rows or more has to hold `steps` motions, all below `count`. The proposer gets copies of

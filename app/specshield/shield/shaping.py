@@ -36,22 +36,27 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
         if main_task_done:
             return None
         raise LogitsError(
-            "logits are missing", path="logits", got=None,
+            "logits are missing",
+            path="logits",
+            got=None,
             expected=f"{n} numbers; null once main_task_done is true",
-        )  # fmt: skip
+        )
     array = np.asarray(logits, dtype=np.float64)
     if array.shape != (n,):
         raise LogitsError(
-            "the wrong number of logits", path="logits",
+            "the wrong number of logits",
+            path="logits",
             got=array.shape[0] if array.ndim == 1 else list(array.shape),
             expected=f"{n}, one for each of {', '.join(robot.action_names)}",
-        )  # fmt: skip
+        )
     i = _wrong(array)
     if 0 <= i < n:
         raise LogitsError(
-            "a logit is NaN or +infinity", path=f"logits[{i}]", got=str(array[i]),
+            "a logit is NaN or +infinity",
+            path=f"logits[{i}]",
+            got=str(array[i]),
             expected="a number, or null for -inf",
-        )  # fmt: skip
+        )
     if i == n:
         raise LogitsError(
             "every logit is null", path="logits", got="all null", expected="at least one finite logit"

@@ -48,9 +48,11 @@ class Uncertainty:
             value = getattr(self, name)
             if not (math.isfinite(value) and 0.0 <= value <= highest):
                 raise InputError(
-                    f"the {name} of the uncertainty is out of range", path=f"uncertainty.{name}", got=value,
+                    f"the {name} of the uncertainty is out of range",
+                    path=f"uncertainty.{name}",
+                    got=value,
                     expected=f"from 0 to {highest:g}",
-                )  # fmt: skip
+                )
 
 
 class Noise(NamedTuple):

@@ -109,9 +109,11 @@ def _read(formula: Formula, samples: Mapping[str, ArrayLike]) -> _Seen:
     missing = [name for name in formula.names if name not in samples]
     if missing:
         raise SampleError(
-            f"there are no samples of {missing[0]}", path=missing[0], got=sorted(samples),
+            f"there are no samples of {missing[0]}",
+            path=missing[0],
+            got=sorted(samples),
             expected=", ".join(formula.names),
-        )  # fmt: skip
+        )
     arrays = {name: _sampled(name, samples[name]) for name in formula.names or samples}
     lengths = {name: array.shape[-1] for name, array in arrays.items()}
     if len(set(lengths.values())) > 1:
@@ -142,9 +144,12 @@ def _sampled(name: str, samples: ArrayLike) -> Floats:
     if not np.isfinite(array).all():
         where = tuple(np.argwhere(~np.isfinite(array))[0])
         raise SampleError(
-            f"the sample of {name} at step {where[-1]} is {array[where]}", path=name,
-            got=str(array[where]), expected="finite numbers", time=int(where[-1]),
-        )  # fmt: skip
+            f"the sample of {name} at step {where[-1]} is {array[where]}",
+            path=name,
+            got=str(array[where]),
+            expected="finite numbers",
+            time=int(where[-1]),
+        )
     return array
 
 

@@ -36,9 +36,10 @@ def value(term: Term, samples: Mapping[str, Floats], start: int, stop: int) -> A
                 time = start + (int(np.argwhere(~np.isfinite(result))[0][-1]) if np.ndim(result) else 0)
                 raise SampleError(
                     f"'{term}' is not finite at step {time}",
-                    expected="samples on which the formula's arithmetic is finite", time=time,
+                    expected="samples on which the formula's arithmetic is finite",
+                    time=time,
                     expression=str(term),
-                )  # fmt: skip
+                )
             return result
     raise TypeError(f"not a term: {term!r}")
 

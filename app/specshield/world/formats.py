@@ -65,18 +65,22 @@ def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tupl
     if format.files != files:
         ways = {True: "files (multipart/form-data)", False: "a JSON object"}
         raise InputError(
-            f"a map of the format {name} is not sent this way", path="format", got=ways[files],
+            f"a map of the format {name} is not sent this way",
+            path="format",
+            got=ways[files],
             expected=f"{ways[format.files]} with {' and '.join(format.required)}",
-        )  # fmt: skip
+        )
     for member in format.required:
         if member not in members:
             raise MapError("this member is missing", path=member, expected=f"it belongs to the format {name}")
     for member in members:
         if member not in format.members:
             raise MapError(
-                f"the format {name} has no such member", path=str(member)[:200], got=members[member],
+                f"the format {name} has no such member",
+                path=str(member)[:200],
+                got=members[member],
                 expected=_one_of(sorted(format.members)),
-            )  # fmt: skip
+            )
     defaults = {member: schema["default"] for member, schema in format.members.items() if "default" in schema}
     return format.parse(**{**defaults, **members})
 

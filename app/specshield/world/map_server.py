@@ -40,9 +40,11 @@ def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
     occupied_thresh = _scalar(document, "occupied_thresh", 0.0, 1.0)
     if free_thresh >= occupied_thresh:
         raise MapError(
-            "free_thresh has to be below occupied_thresh", path="free_thresh", got=free_thresh,
+            "free_thresh has to be below occupied_thresh",
+            path="free_thresh",
+            got=free_thresh,
             expected=f"< {occupied_thresh:g}",
-        )  # fmt: skip
+        )
     negate = checks.member(document, "negate", "")
     if negate not in (0, 1):  # True and False as well
         raise checks.wrong("flag", "negate", negate, "0 or 1")

@@ -37,9 +37,11 @@ class OccupancyGrid:
         occupied = np.array(self.occupied, dtype=np.bool_, order="C")
         if occupied.ndim != 2:
             raise MapError(
-                "cells have to be an array [height, width]", path="cells", got=list(occupied.shape),
+                "cells have to be an array [height, width]",
+                path="cells",
+                got=list(occupied.shape),
                 expected="two axes",
-            )  # fmt: skip
+            )
         check_size(occupied.shape[1], occupied.shape[0])
         occupied.flags.writeable = False
         object.__setattr__(self, "occupied", occupied)
@@ -120,9 +122,11 @@ def check_size(width: int, height: int) -> None:
     for path, side in (("width", width), ("height", height)):
         if not 1 <= side <= MAX_SIDE:
             raise MapError(
-                f"a map cannot have {width} x {height} cells", path=path, got=side,
+                f"a map cannot have {width} x {height} cells",
+                path=path,
+                got=side,
                 expected=f"1 to {MAX_SIDE} cells",
-            )  # fmt: skip
+            )
 
 
 @kernel

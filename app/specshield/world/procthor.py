@@ -153,8 +153,10 @@ def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Floats, Floats]]:
         if asset not in sizes:
             raise MapError(
                 f"{path} has the asset {asset!r}, which asset_sizes does not have",
-                path=f"{path}.assetId", got=checks.shown(asset), expected="a key of asset_sizes",
-            )  # fmt: skip
+                path=f"{path}.assetId",
+                got=checks.shown(asset),
+                expected="a key of asset_sizes",
+            )
         half = np.array(_size(sizes[asset], f"asset_sizes.{asset}")) / 2
         x, y, z = _vector(checks.member(thing, "position", path), f"{path}.position")
         degrees = _vector(checks.member(thing, "rotation", path), f"{path}.rotation")

@@ -53,8 +53,10 @@ class Rectangle:
         if not (self.min[0] < self.max[0] and self.min[1] < self.max[1]):
             raise MapError(
                 "a rectangle's min has to be below its max on both axes",
-                path="max", got=list(self.max), expected=f"x > {self.min[0]:g} and y > {self.min[1]:g}",
-            )  # fmt: skip
+                path="max",
+                got=list(self.max),
+                expected=f"x > {self.min[0]:g} and y > {self.min[1]:g}",
+            )
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,10 @@ class Polygon:
         if first >= 0:
             raise MapError(
                 f"the polygon's edges {first} and {second} (counted by first vertex) touch or cross",
-                path="vertices", got=[first, second], expected="a simple polygon, no vertex repeated",
-            )  # fmt: skip
+                path="vertices",
+                got=[first, second],
+                expected="a simple polygon, no vertex repeated",
+            )
 
 
 @dataclass(frozen=True)
@@ -249,15 +253,19 @@ def region_from_json(spec: Any, path: str) -> Region:
     kind = checks.member(spec, "type", path)
     if not isinstance(kind, str) or kind not in KINDS:
         raise MapError(
-            f"{path} is not a known kind of region", path=f"{path}.type", got=kind,
+            f"{path} is not a known kind of region",
+            path=f"{path}.type",
+            got=kind,
             expected="one of " + ", ".join(KINDS),
-        )  # fmt: skip
+        )
     names = [field.name for field in fields(KINDS[kind])]
     if extra := sorted(set(map(str, spec)) - {"type", *names}):
         raise MapError(
             f"a {kind} has no member {extra[0]!r}",
-            path=f"{path}.{extra[0]}", got=extra[0], expected="type, " + ", ".join(names),
-        )  # fmt: skip
+            path=f"{path}.{extra[0]}",
+            got=extra[0],
+            expected="type, " + ", ".join(names),
+        )
     values = [checks.member(spec, name, path) for name in names]
     if kind == "union":
         return _union_from_json(values[0], path)
@@ -273,9 +281,11 @@ def _union_from_json(members: Any, path: str) -> Union:
         where = f"{path}.members[{i}]"
         if isinstance(spec, Mapping) and spec.get("type") == "union":
             raise MapError(
-                "a union cannot be a member of a union", path=where, got="union",
+                "a union cannot be a member of a union",
+                path=where,
+                got="union",
                 expected="circle, rectangle or polygon",
-            )  # fmt: skip
+            )
         part = region_from_json(spec, where)
         assert not isinstance(part, Union)
         parts.append(part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import threading
 import time
@@ -74,8 +75,10 @@ class Crowd:
         return moment
 
     def back_since(self, moment: float) -> list[float]:
-        """For each robot, the seconds from then to the first good answer to a request that it sent later."""
-        answered = [0.0] * len(self.robots)
+        """For each robot, the seconds from then to the first good answer to a request that it sent later. One
+        that asked nothing just then has waited since it asked.
+        """
+        answered, asked = [0.0] * len(self.robots), [math.inf] * len(self.robots)
         looked = [max(0, len(robot.tries) - 50) for robot in self.robots]
 
         def look() -> bool:
@@ -83,8 +86,10 @@ class Crowd:
                 while not answered[i] and looked[i] < len(robot.tries):
                     tried = robot.tries[looked[i]]
                     looked[i] += 1
+                    if tried.ended > moment:
+                        asked[i] = min(asked[i], max(tried.began, moment))
                     if tried.began >= moment and tried.status in (200, 201):
-                        answered[i] = tried.ended - moment
+                        answered[i] = tried.ended - asked[i]
                 if not robot.is_alive() and not answered[i]:
                     raise RuntimeError(f"{robot.name} gave up: {robot.episodes[-1].problem}")
             return all(answered)

@@ -38,9 +38,15 @@ class Aimed:
 
 
 def aim(
-    shield: Shield, care: Care, prefix: Prefix, tried: Futures, whole: Floats, leaves: Floats, follows: bool,
+    shield: Shield,
+    care: Care,
+    prefix: Prefix,
+    tried: Futures,
+    whole: Floats,
+    leaves: Floats,
+    follows: bool,
     before: Aimed | None = None,
-) -> Aimed:  # fmt: skip
+) -> Aimed:
     """The most that can be had of the margin and the slack.
 
     whole [N], leaves [N, size]: rho of the futures on the whole of `prefix.formula`, and its leaves. A future
@@ -63,9 +69,19 @@ def aim(
     def at(most: int) -> tuple[Best, bool]:
         rows, robustness = np.empty(motions, np.int64), np.empty(motions)
         highest = _best_open(
-            parts, still, prefix.t, asked, most, leaves, whole, tried.motions, follows, margin,
-            rows, robustness,
-        )  # fmt: skip
+            parts,
+            still,
+            prefix.t,
+            asked,
+            most,
+            leaves,
+            whole,
+            tried.motions,
+            follows,
+            margin,
+            rows,
+            robustness,
+        )
         return Best(robustness, rows), highest > margin
 
     motions = len(task.robot.motions)
@@ -95,9 +111,16 @@ def aim(
 
 @kernel
 def _ask(
-    parts: Conjuncts, known: Floats, t: int, noise: Noise, stride: float, least: int, chance: float,
-    still: Bools, asked: Ints,
-) -> tuple[int, int]:  # fmt: skip
+    parts: Conjuncts,
+    known: Floats,
+    t: int,
+    noise: Noise,
+    stride: float,
+    least: int,
+    chance: float,
+    still: Bools,
+    asked: Ints,
+) -> tuple[int, int]:
     """Writes which conjuncts (K,) are open, and how many steps early each F of them is asked for. The steps
     of the F whose deadline is next, and the most of any. A window keeps at least half its length.
     """
@@ -115,9 +138,19 @@ def _ask(
 
 @kernel
 def _best_open(
-    parts: Conjuncts, still: Bools, t: int, asked: Ints, most: int, leaves: Floats, whole: Floats,
-    motions: Ints, follows: bool, margin: float, rows: Ints, robustness: Floats,
-) -> float:  # fmt: skip
+    parts: Conjuncts,
+    still: Bools,
+    t: int,
+    asked: Ints,
+    most: int,
+    leaves: Floats,
+    whole: Floats,
+    motions: Ints,
+    follows: bool,
+    margin: float,
+    rows: Ints,
+    robustness: Floats,
+) -> float:
     """Writes the best future of each motion by what is open, and its robustness; the highest of them.
 
     The way that the robot is on stays its motion's future (`rows`) where it keeps enough, though another may

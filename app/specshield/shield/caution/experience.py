@@ -210,21 +210,29 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
         slipped = noise.slips * asked / (noise.slips * asked + standing) if standing > 0.0 else 1.0
         odds = seen.odds * standing / (standing + asked)
         return Seen(
-            seen.moved + slipped, seen.lost + slipped * min(1.0, miss / way), odds,
-            seen.noisy, seen.moves, seen.turns, seen.exact, seen.standing,
+            seen.moved + slipped,
+            seen.lost + slipped * min(1.0, miss / way),
+            odds,
+            seen.noisy,
+            seen.moves,
+            seen.turns,
+            seen.exact,
+            seen.standing,
             seen.slipping * _slip(noise) if still < miss else 1.0,
-        )  # fmt: skip
+        )
     gone = math.hypot(foreseen[motion, 0] - before[0], foreseen[motion, 1] - before[1])
     dx, dy = pose[0] - foreseen[motion, 0], pose[1] - foreseen[motion, 1]
     return Seen(
-        seen.moved + 1.0, seen.lost,
+        seen.moved + 1.0,
+        seen.lost,
         min(seen.odds * (1.0 + noise.lost / noise.kept), MOST_ODDS),
         seen.noisy + 1.0,
         seen.moves + dx * dx + dy * dy,
         seen.turns + wrap(pose[2] - foreseen[motion, 2]) ** 2,
         seen.exact + (1.0 if miss <= EXACT and gone > EXACT else 0.0),
-        seen.standing, 1.0,
-    )  # fmt: skip
+        seen.standing,
+        1.0,
+    )
 
 
 @leaf

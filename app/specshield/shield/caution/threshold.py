@@ -56,9 +56,20 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         parts, leaves = _from_now_on(parts, leaves, prefix, tried)
     sigma = math.hypot(noise.move, care.stride * noise.turn)
     _chances(
-        parts, begins, still, prefix.t, noise, care.stride, sigma, care.margin,
-        leaves, tried.rho, tried.motions, task.robot.wait_motion, values,
-    )  # fmt: skip
+        parts,
+        begins,
+        still,
+        prefix.t,
+        noise,
+        care.stride,
+        sigma,
+        care.margin,
+        leaves,
+        tried.rho,
+        tried.motions,
+        task.robot.wait_motion,
+        values,
+    )
     motion_of = task.robot.motion_of
     if judged.some:
         values[doubts & ~judged.feasible_motion] = 0.0
@@ -92,9 +103,20 @@ def _widened(task: Task, formula: Formula) -> Formula:
 
 @kernel
 def _chances(
-    parts: Conjuncts, begins: Ints, still: Bools, t: int, noise: Noise, stride: float, sigma: float,
-    margin: float, leaves: Floats, rho: Floats, motions: Ints, wait: int, values: Floats,
-) -> None:  # fmt: skip
+    parts: Conjuncts,
+    begins: Ints,
+    still: Bools,
+    t: int,
+    noise: Noise,
+    stride: float,
+    sigma: float,
+    margin: float,
+    leaves: Floats,
+    rho: Floats,
+    motions: Ints,
+    wait: int,
+    values: Floats,
+) -> None:
     """Writes V of each motion (M,), which is zero where no future keeps the rule. begins (K,): the first step
     of each conjunct's window; a G of `parts` may begin before it.
     """
@@ -159,9 +181,17 @@ def _deadline(
 
 @leaf
 def _in_time(
-    noise: Noise, spread: float, slips: bool, due: Ints, free: Ints, within: Ints, motions: Ints, wait: int,
-    dwells: int, late: Floats,
-) -> float:  # fmt: skip
+    noise: Noise,
+    spread: float,
+    slips: bool,
+    due: Ints,
+    free: Ints,
+    within: Ints,
+    motions: Ints,
+    wait: int,
+    dwells: int,
+    late: Floats,
+) -> float:
     """The probability that a robot which keeps to a future's motions (T - t,) is in time for all that is due.
 
     due, free, within (K,): of `_deadline`. slips: whether motions slip. dwells: no wait among the first so

@@ -57,9 +57,14 @@ class Followed:
 
 
 def contact_of(
-    body: Body, followed: Followed, before: Floats, after: Floats, foreseen: Floats, near: Near = NEAR,
+    body: Body,
+    followed: Followed,
+    before: Floats,
+    after: Floats,
+    foreseen: Floats,
+    near: Near = NEAR,
     again: bool = False,
-) -> tuple[int, Followed]:  # fmt: skip
+) -> tuple[int, Followed]:
     """The motion that stopped short between two poses (3,), -1 for none, and what is known of the caller now.
 
     foreseen [M, 3]: where f leads from `before`. near: what noise explains. again: whether the drawn motion

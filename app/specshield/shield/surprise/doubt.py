@@ -26,9 +26,14 @@ DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else
 
 
 def tried_again(
-    told: Shield, taught: Taught, judged: Judged, prefix: Prefix, tail: bytes | None, status: Verdict,
+    told: Shield,
+    taught: Taught,
+    judged: Judged,
+    prefix: Prefix,
+    tail: bytes | None,
+    status: Verdict,
     care: Care,
-) -> tuple[Taught, tuple[Shield, Prefix, Judged, bool]] | None:  # fmt: skip
+) -> tuple[Taught, tuple[Shield, Prefix, Judged, bool]] | None:
     """The first guess that leaves a way without what was tried in vain, else, where all the marks leave none,
     the first that leaves any, and how it was judged. None where no guess is needed, or none leaves a way.
     told: the shield on the policy's map; judged: where all the marks are believed.
@@ -68,9 +73,15 @@ def doubted(taught: Taught, t: int) -> Iterator[Taught]:
 
 
 def recovered(
-    told: Shield, shield: Shield, taught: Taught, judged: Judged, prefix: Prefix, tail: bytes | None,
-    status: Verdict, care: Care,
-) -> Judged:  # fmt: skip
+    told: Shield,
+    shield: Shield,
+    taught: Taught,
+    judged: Judged,
+    prefix: Prefix,
+    tail: bytes | None,
+    status: Verdict,
+    care: Care,
+) -> Judged:
     """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words. If what is
     in the way may go again, it is waited for, as long as that gives up no more. Where no future is better
     than to stand for ever, contacts and what led nowhere are set aside: they may be why.
@@ -103,9 +114,14 @@ def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
 
 
 def _awaited(
-    told: Shield, shield: Shield, taught: Taught, prefix: Prefix, tail: bytes | None, status: Verdict,
+    told: Shield,
+    shield: Shield,
+    taught: Taught,
+    prefix: Prefix,
+    tail: bytes | None,
+    status: Verdict,
     care: Care,
-) -> int | None:  # fmt: skip
+) -> int | None:
     """The first motion of the way that there would be if all that came in the way were gone; the one that
     waits where something known hinders that motion. None where there is no such way, or no such motion.
     """

@@ -1,0 +1,80 @@
+"""The distribution that answers a step, by what futures say of its actions (Algorithm 1, steps 4 to 6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from specshield.arrays import Floats
+from specshield.portable import exp
+from specshield.quick import quick
+from specshield.shield import shaping
+from specshield.shield.caution import threshold
+from specshield.shield.decision import Mode, Reason, Shield
+from specshield.shield.judgement import Judged
+
+
+@quick
+@dataclass(frozen=True)
+class Answer:
+    """conditional [A]: the model's log-probabilities given that it does not end, None where it does."""
+
+    distribution: Floats
+    mode: Mode
+    reason: Reason | None
+    conditional: Floats | None = None
+
+
+def answer_of(
+    shield: Shield,
+    log_prior: Floats | None,
+    judged: Judged,
+    main_task_done: bool,
+    weights: Floats | None,
+    chance: Floats | None,
+    left: float,
+) -> Answer:
+    """Steps 4 to 6. A terminal action keeps exactly its prior mass, and has none in `completion`.
+
+    weights [A]: the preference's log-weights inside S_t beside the model's log-probabilities. chance [A],
+    left: of a threshold over the episode (threshold.py).
+    """
+    terminal = shield.task.robot.terminal
+    any_feasible = judged.some
+    said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
+    certified = np.zeros(len(terminal))
+    certified[judged.completion] = 1.0
+    conditional, ending = (None, 0.0) if log_prior is None else shaping.going_on(log_prior, terminal)
+    if main_task_done or log_prior is None:
+        mode: Mode = "completion" if any_feasible else "fallback"
+        return Answer(certified, mode, said if any_feasible else "infeasible", conditional)
+    mode = "shaped" if any_feasible else "fallback"
+    if conditional is None:  # the model ends for certain
+        return Answer(exp(log_prior), mode, None if any_feasible else "infeasible")
+    config, attainable = shield.config, any_feasible
+    if config.evaluation == "robustness":
+        shaped = shaping.tilt(conditional, judged.values, config.threshold)
+        attainable = bool(judged.values.max() >= config.threshold)
+    elif chance is not None and chance.max() > 0.0:
+        shaped = threshold.shaped(conditional, chance, left)
+    elif config.threshold == 1.0 or config.threshold_over == "episode":
+        wanted = conditional if weights is None else conditional + weights
+        shaped = shaping.restrict(wanted, judged.feasible)
+    else:
+        shaped = shaping.soften(conditional, judged.feasible, config.threshold)
+    reason: Reason | None = said
+    if shaped is None:
+        reason = "zero_prior_mass" if attainable else "infeasible"
+    mode = "fallback" if shaped is None else "shaped"
+    body = certified if shaped is None else shaped
+    return Answer(shaping.with_ending(body, log_prior, ending, terminal), mode, reason, conditional)
+
+
+def unmodified(shield: Shield, log_prior: Floats | None) -> Answer:
+    """The prior; without logits there is nothing left to do: `end`, or else the first action."""
+    if log_prior is not None:
+        return Answer(exp(log_prior), "prior", None)
+    idle = np.zeros(len(shield.task.robot.actions))
+    idle[int(np.argmax(shield.task.robot.terminal))] = 1.0
+    return Answer(idle, "prior", None)
