@@ -6,6 +6,7 @@ import asyncio
 import os
 import time
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -74,6 +75,23 @@ def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end()
 
     left = run(scenario)
     asyncio.run(_ends(left))
+
+
+def test_a_child_whose_caller_is_gone_says_nothing_of_it(capfd: pytest.CaptureFixture[str]) -> None:
+    template = Template()
+    try:
+        template.fork(1 << 30, 1).close()
+        with template.fork(1 << 30, 1) as calls:  # by its first word the one before has been forked
+            calls.setblocking(True)
+            assert calls.recv(1)
+            process = template._process
+            assert process is not None
+            forks = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+            while len(forks.read_text().split()) > 1:
+                time.sleep(0.01)
+    finally:
+        template.stop()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_child_that_keeps_much_memory_or_has_nothing_to_do_ends() -> None:

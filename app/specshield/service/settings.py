@@ -15,6 +15,7 @@ from specshield.errors import InputError
 from specshield.service.access.site import AUTHORITY
 from specshield.service.storage.connect import FORMS, connect
 
+LONGEST = 24 * 3600  # [s] that a wait may be set to: timers do not take every number
 HEADER_TEXT = re.compile(r"[!-~]([ -~]*[!-~])?")
 
 
@@ -39,7 +40,9 @@ class Settings(BaseSettings):
         None, validation_alias=AliasChoices("redis_url", "REDIS_URL"),
         description="The store, as storage/connect.py says; unset, the server starts its own.",
     )  # fmt: skip
-    store_timeout: float = Field(2.0, gt=0, description="Longest wait for one answer of the store [s].")
+    store_timeout: float = Field(
+        2.0, gt=0, le=LONGEST, description="Longest wait for one answer of the store [s]."
+    )
     store_replicas: int = Field(
         0, ge=0, le=8,
         description="Replicas of the store at REDIS_URL that have to have a step before it is answered.",
@@ -70,16 +73,19 @@ class Settings(BaseSettings):
     max_header_bytes: int = Field(32 << 10, ge=1024, description="Largest head of a request [bytes].")
     max_connections: int = Field(2000, ge=8, description="Most connections at once to one server process.")
     request_timeout: float = Field(
-        15.0, gt=0, description="Longest that a request's head, or its body, may take to arrive [s]."
+        15.0,
+        gt=0,
+        le=LONGEST,
+        description="Longest that a request's head, or its body, may take to arrive [s].",
     )
     min_body_rate: int = Field(
         64 << 10, ge=1, description="A body may take 1 s more for each so many of its bytes [bytes]."
     )
     keep_alive_timeout: float = Field(
-        30.0, gt=0, description="A connection without a request is closed after this long [s]."
+        30.0, gt=0, le=LONGEST, description="A connection without a request is closed after this long [s]."
     )
     heavy_timeout: float = Field(
-        20.0, gt=0, description="Longest that reading an upload or drawing a map may take [s]."
+        20.0, gt=0, le=LONGEST, description="Longest that reading an upload or drawing a map may take [s]."
     )
     heavy_memory: int = Field(
         1 << 30, ge=256 << 20, description="Most memory of a process that does it [bytes]."

@@ -9,6 +9,7 @@ end when the server closes their socket, or is gone.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import importlib
@@ -45,8 +46,8 @@ def template(control: socket.socket) -> None:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             memory, nice = LIMITS.unpack(message)
             _limit(memory, nice)
-            with socket.socket(fileno=descriptors[0]) as calls:
-                serve(calls)
+            with contextlib.suppress(ConnectionError), socket.socket(fileno=descriptors[0]) as calls:
+                serve(calls)  # until the server closes the socket, which it does where a caller is gone
             os._exit(0)
         os.close(descriptors[0])
 

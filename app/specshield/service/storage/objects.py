@@ -48,7 +48,7 @@ def open_objects(place: str) -> Objects:
         from fsspec.core import url_to_fs
 
         files, root = url_to_fs(place, use_listings_cache=False, skip_instance_cache=True)
-    except (ImportError, ValueError) as error:
+    except (ImportError, ValueError, OSError) as error:  # OSError: it is tried to reach the server
         raise InputError(
             f"files at {place!r} cannot be used: {error}",
             expected="a folder, or a URL such as s3://bucket/prefix with the package that reads it (s3fs)",
