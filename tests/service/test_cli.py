@@ -55,6 +55,18 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
         ),
         (
             "serve",
+            {"SPECSHIELD_STORE_TIMEOUT": "inf"},
+            "SPECSHIELD_STORE_TIMEOUT is not valid: 'inf'",
+            "less than or equal to 86400",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_DATA_URL": "ftp://127.0.0.1:1/files"},
+            "files at 'ftp://127.0.0.1:1/files' cannot be used",
+            "a folder, or a URL such as",
+        ),
+        (
+            "serve",
             {"SPECSHIELD_STORE_REPLICAS": "1"},
             "SPECSHIELD_STORE_REPLICAS is not valid: '1'",
             "0 unless REDIS_URL is set",
