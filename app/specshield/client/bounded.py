@@ -8,6 +8,7 @@ With asyncio a try is cancelled.
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import ssl
 import threading
@@ -157,11 +158,25 @@ class AsyncNetwork(httpcore.AnyIOBackend):
 
 
 class Transport(httpx.HTTPTransport):
-    """httpx's own transport with the network above; an HTTP proxy of the environment is used."""
+    """httpx's own transport with the network above; an HTTP proxy of the environment is used.
+
+    A forked process has its parent's connections too, and what one of the two sends there the other answers
+    to: so it opens its own.
+    """
 
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
-        _connect_by(self, url, Network(), httpcore.ConnectionPool, httpcore.HTTPProxy)
+        self._url, self._process = url, os.getpid()
+        self._connect()
+
+    def _connect(self) -> None:
+        _connect_by(self, self._url, Network(), httpcore.ConnectionPool, httpcore.HTTPProxy)
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        if self._process != os.getpid():
+            self._process = os.getpid()
+            self._connect()
+        return super().handle_request(request)
 
 
 class AsyncTransport(httpx.AsyncHTTPTransport):

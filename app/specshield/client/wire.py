@@ -263,7 +263,8 @@ def error_of(reply: Reply) -> SpecshieldError:
         return _GATEWAY[reply.status](
             f"the server cannot be reached: status {reply.status}", status=reply.status
         )
-    document = document or {}
+    if document is None:
+        document = {"title": f"status {reply.status}, and no more", "expected": "a specshield server there"}
     default = _BY_STATUS.get(reply.status) or (InputError if 400 <= reply.status < 500 else ServerError)
     cls = _BY_TYPE.get(str(document.get("type")), default)
     error = cls(

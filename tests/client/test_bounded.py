@@ -1,0 +1,43 @@
+"""The client's connections."""
+
+import multiprocessing
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import httpx
+
+from specshield.client import bounded
+
+
+class _Port(BaseHTTPRequestHandler):
+    """Answers with the port that the request's connection comes from."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self):
+        content = str(self.client_address[1]).encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_):
+        pass
+
+
+def test_a_forked_process_opens_connections_of_its_own():
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _Port)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = httpx.URL(f"http://127.0.0.1:{server.server_port}")
+    fork = multiprocessing.get_context("fork")
+    ports = fork.SimpleQueue()
+    with httpx.Client(base_url=url, transport=bounded.Transport(url)) as client:
+        first = client.get("/").text
+        child = fork.Process(target=lambda: [ports.put(client.get("/").text) for _ in range(2)])
+        child.start()
+        its = [ports.get(), ports.get()]
+        child.join()
+        assert its[0] == its[1] != first  # it keeps its own, too
+        assert client.get("/").text == first
+    server.shutdown()
+    server.server_close()
