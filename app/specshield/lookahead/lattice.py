@@ -10,7 +10,7 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.policy.lattice import Corners, pose_of
+from specshield.policy.lattice import pose_of
 from specshield.policy.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -18,11 +18,14 @@ from specshield.policy.progress import (
     SETTLED,
     STACK,
     Rules,
+    goals_of,
     read_predicates,
     value_count,
 )
-from specshield.policy.reachability.tables import Tables, slack
+from specshield.policy.reachability.guide import make_scratch
+from specshield.policy.reachability.tables import Guide, Tables, slack
 from specshield.policy.shape import heading_count
+from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 
 COARSE_PITCH = 0.4  # [m] as fine as the stand-ins deserve; chosen by hand, nothing measured
@@ -76,10 +79,9 @@ def make_planes(
     rows, columns = (math.ceil(n * body.resolution / pitch - 1e-9) for n in body.occupied.shape)
     pad = math.ceil(longest / pitch - 1e-9) + 1
     width, cells = columns + 2 * pad, (rows + 2 * pad) * (columns + 2 * pad)
-    goal = np.flatnonzero(rules.kind != ALWAYS)
-    dwell = rules.kind[goal] == EVENTUALLY_ALWAYS
-    first = rules.a[goal] + np.where(dwell, rules.c2[goal], 0)
-    last = np.where(dwell, rules.c1[goal] + rules.c2[goal], rules.b[goal])
+    goal = goals_of(rules)
+    first = rules.a[goal] + rules.c2[goal]
+    last = np.where(rules.kind[goal] == EVENTUALLY_ALWAYS, rules.c1[goal] + rules.c2[goal], rules.b[goal])
     slot = _slots(first, last, horizon, 1)
     slots, shape = slot.max() + 1, (headings, cells)
     if slots * headings * cells > MAX_ENTRIES:
@@ -104,7 +106,7 @@ def make_planes(
     if tables is None:
         return planes
     planes = planes._replace(possible=np.zeros((slots, *shape), np.uint8))
-    _rule_out(body, rules, tables, planes)
+    _rule_out(Guide(body, rules, tables, -1, NOTHING_BARRED), planes)
     return planes
 
 
@@ -174,21 +176,20 @@ def _survey(body: Body, rules: Rules, planes: Planes) -> None:
 
 
 @kernel
-def _rule_out(body: Body, rules: Rules, tables: Tables, planes: Planes) -> None:
+def _rule_out(guide: Guide, planes: Planes) -> None:
     """Leaves `possible` 0 where the tables leave no slack, for each set of settled goals at each step."""
     headings, cells = planes.valid.shape
-    status, run = np.zeros(rules.kind.shape[0], np.int8), np.zeros(rules.kind.shape[0], np.int64)
-    corners = Corners(np.empty(4, np.int64), np.empty(4))
+    scratch = make_scratch(guide.rules, 1)
+    scratch.status[:], scratch.run[:] = PENDING, 0
     for t in range(planes.slot.shape[0] - 1):
         for mask in range(planes.slot.shape[1]):
             slot = planes.slot[t, mask]
             if slot < 0:
                 continue
             for g in range(planes.goal.shape[0]):
-                status[planes.goal[g]] = SETTLED if mask >> g & 1 else PENDING
+                scratch.status[planes.goal[g]] = SETTLED if mask >> g & 1 else PENDING
             for h in range(headings):
                 for c in range(cells):
                     if planes.valid[h, c]:
-                        x, y, theta = pose_at(body, planes, h, c)
-                        spare = slack(body, rules, tables, x, y, theta, t, status, run, corners)
-                        planes.possible[slot, h, c] = spare >= 0.0
+                        x, y, theta = pose_at(guide.body, planes, h, c)
+                        planes.possible[slot, h, c] = slack(guide, x, y, theta, t, scratch) >= 0.0

@@ -108,8 +108,7 @@ class LookAhead:
         """D after each motion above the least of them, [M]: the mean over the likely stand-ins."""
         t = len(history) - 1
         rules = self.rules._replace(signals=self.rules.signals.copy())
-        status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
-        replay(rules, rules.margin, history, signal_rows(self.task, signals, t + 1), status, run)
+        status, _ = replay(rules, rules.margin, history, signal_rows(self.task, signals, t + 1))
         mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
         weights = inner(self.shares.T, belief.probabilities())
         asked = np.argsort(-weights, kind="stable")[:LEADERS]

@@ -32,10 +32,10 @@ from specshield.arrays import Bools, Codes, Floats, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch
-from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of
+from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of, values_at
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
-from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to, values_at
+from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to
 from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
 from specshield.policy.planner.method import Settings
