@@ -34,6 +34,9 @@ MAX_ENTRIES = 40_000_000  # poses times steps and sets of settled goals: what so
 KEPT_ENTRIES = 500_000  # of them that a table of D keeps, 1 MB
 
 
+Pose = tuple[float, float, float]
+
+
 class Planes(NamedTuple):
     """The lattice and the formula's windows. Poses [H, N]: a padded plane of cells for each heading.
 
@@ -131,20 +134,18 @@ def _slots(first: Ints, last: Ints, horizon: int, every: int) -> Ints:
 
 
 @inlined
-def pose_at(body: Body, planes: Planes, h: int, c: int) -> tuple[float, float, float]:
+def pose_at(body: Body, planes: Planes, h: int, c: int) -> Pose:
     """The map-frame pose of cell c of the plane of heading h."""
     j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
     return pose_of(body, planes.pitch, planes.valid.shape[0], j, i, h)
 
 
 @leaf
-def is_blocked(
-    body: Body, motion: int, x: float, y: float, theta: float, after: tuple[float, float, float]
-) -> bool:
-    """Whether f stopped the motion from (x, y, theta) short; after: where it led."""
-    moved = math.hypot(after[0] - x, after[1] - y)
+def is_blocked(body: Body, motion: int, pose: Pose, after: Pose) -> bool:
+    """Whether f stopped the motion from a pose short; after: where it led."""
+    moved = math.hypot(after[0] - pose[0], after[1] - pose[1])
     move, rotation = displacement(body, motion)
-    return moved < 0.5 * abs(move) or not (rotation == 0.0 or after[2] != theta)
+    return moved < 0.5 * abs(move) or not (rotation == 0.0 or after[2] != pose[2])
 
 
 @kernel
@@ -152,7 +153,7 @@ def blocked_at(body: Body, x: float, y: float, theta: float) -> Bools:
     """Which motions an obstacle stops short at a pose, shape (M,)."""
     blocked = np.empty(motion_count(body), np.bool_)
     for m in range(len(blocked)):
-        blocked[m] = is_blocked(body, m, x, y, theta, step(body, x, y, theta, m))
+        blocked[m] = is_blocked(body, m, (x, y, theta), step(body, x, y, theta, m))
     return blocked
 
 

@@ -28,7 +28,7 @@ from specshield.lookahead.belief import STYLE, Belief
 from specshield.lookahead.desirability import UNKEEPABLE, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import Goals, make_goals
-from specshield.lookahead.lattice import Planes, blocked_at, make_planes
+from specshield.lookahead.lattice import Planes, make_planes
 from specshield.lookahead.preferences import AHEADS, PreferenceKind
 from specshield.lookahead.surrogate import WANDER, stand_in_for
 from specshield.policy.progress import SETTLED, Rules, make_rules, replay
@@ -93,11 +93,10 @@ class LookAhead:
         if going_on.sum() <= 0.0:  # the model ends for certain: it says nothing of where it would go
             return memory, np.zeros(len(prior))
         said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(robot.motions)) / going_on.sum()
-        blocked = blocked_at(self.body, *pose)
         end = float(prior[robot.terminal].sum())
         possible = float(prior[feasible & ~robot.terminal].sum()) / float(going_on.sum())
         forced = -float(going_on.sum()) * math.log(possible) if possible > 0.0 else FORCED
-        belief = beliefs.update(belief, self.body, self.goals, pose, blocked, said, end, max(forced, 0.0))
+        belief = beliefs.update(belief, self.body, self.goals, pose, said, end, max(forced, 0.0))
         over = len(history) > self.task.horizon  # no motion changes what the rule says
         if over or belief.forced < FORCED or belief.trust < NEGLIGIBLE:
             return belief.to_bytes(), np.zeros(len(prior))
