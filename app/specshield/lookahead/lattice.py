@@ -89,18 +89,32 @@ def make_planes(
     slots, shape = slot.max() + 1, (headings, cells)
     if slots * headings * cells > MAX_ENTRIES:
         raise Unsupported(
-            "the task is too large for look-ahead", path="shaping",
+            "the task is too large for look-ahead",
+            path="shaping",
             got=f"{slots} steps and sets of settled goals times {headings} x {cells} poses",
             expected=f"at most {MAX_ENTRIES} in all; or shaping 'projection'",
-        )  # fmt: skip
+        )
     steady = np.flatnonzero(rules.kind == ALWAYS)
     due = _bits(rules.a[steady], rules.b[steady], steady, horizon)
     opened = _bits(first, last, np.arange(len(goal)), horizon)
     planes = Planes(
-        pitch, pad, width, np.zeros(shape, np.uint8), np.zeros((motion_count(body), *shape), np.float32),
-        np.zeros(shape, np.int32), np.zeros(shape, np.int32), goal, first, last, due, opened, slot, slot,
-        np.full(cells, -1), np.zeros((0, *shape), np.uint8),
-    )  # fmt: skip
+        pitch,
+        pad,
+        width,
+        np.zeros(shape, np.uint8),
+        np.zeros((motion_count(body), *shape), np.float32),
+        np.zeros(shape, np.int32),
+        np.zeros(shape, np.int32),
+        goal,
+        first,
+        last,
+        due,
+        opened,
+        slot,
+        slot,
+        np.full(cells, -1),
+        np.zeros((0, *shape), np.uint8),
+    )
     _survey(body, rules, planes)
     rooms = planes.valid.any(axis=0)
     planes.row[rooms] = np.arange(rooms.sum())

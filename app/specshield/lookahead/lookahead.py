@@ -114,9 +114,19 @@ class LookAhead:
         asked = asked[weights[asked] >= NEGLIGIBLE]
         costs = np.empty((len(asked), len(self.task.robot.motions)))
         expand_all(
-            self.body, rules, self.goals, self.planes, self.tables, self.leads, asked, STYLE, t, mask,
-            history[-1], costs,
-        )  # fmt: skip
+            self.body,
+            rules,
+            self.goals,
+            self.planes,
+            self.tables,
+            self.leads,
+            asked,
+            STYLE,
+            t,
+            mask,
+            history[-1],
+            costs,
+        )
         known = np.all(costs < UNKEEPABLE, axis=0)
         if not known.any():
             return np.zeros(costs.shape[1])
@@ -144,8 +154,10 @@ def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     if len(goals.distance) == 0:
         raise Unsupported(
             "the robot can turn freely nowhere on this map, so there is nowhere to think of it as going",
-            path="shaping", got="lookahead", expected="'projection'",
-        )  # fmt: skip
+            path="shaping",
+            got="lookahead",
+            expected="'projection'",
+        )
     planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
     entries = int((planes.slot >= 0).sum()) * planes.valid.size
     places, shares = _leads(goals, min(max(WORK // entries, FEWEST), MOST))

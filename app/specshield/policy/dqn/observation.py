@@ -62,10 +62,16 @@ def make_state(scene: Scene, inputs: int) -> State:
     """A state without content. inputs: the observation's size."""
     count = scene.rules.kind.shape[0]
     return State(
-        np.empty(3), np.empty(count, np.int8), np.empty(count, np.int64), np.empty(count),
-        np.empty((motion_count(scene.body), 3)), np.empty(inputs, np.float32),
-        np.empty(value_count(scene.rules)), np.empty(STACK), np.empty(count),
-    )  # fmt: skip
+        np.empty(3),
+        np.empty(count, np.int8),
+        np.empty(count, np.int64),
+        np.empty(count),
+        np.empty((motion_count(scene.body), 3)),
+        np.empty(inputs, np.float32),
+        np.empty(value_count(scene.rules)),
+        np.empty(STACK),
+        np.empty(count),
+    )
 
 
 @inlined

@@ -76,7 +76,7 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
 @leaf
 def _reach(
     world: World, way: Way, k: int, f: int, n: int, stop: int, need: Ints, tree: Tree, most: int, grain: float
-) -> tuple[int, int]:  # fmt: skip
+) -> tuple[int, int]:
     """Goes on from motions[:n] to where literal k holds, by motions[:stop] and by field f, and keeps what has
     to hold on the way. grain [m]: poses that differ by less count once, but not near the literal. How many
     motions there are then, -1 where it is not found; how many poses were made.

@@ -80,9 +80,18 @@ class Beam(NamedTuple):
 
 @kernel
 def beam_search(
-    guide: Guide, t: int, pose: Floats, status: Int8s, run: Ints, share: int, band: float, target: float,
-    scratch: Scratch, motions: Ints, taken: Ints,
-) -> None:  # fmt: skip
+    guide: Guide,
+    t: int,
+    pose: Floats,
+    status: Int8s,
+    run: Ints,
+    share: int,
+    band: float,
+    target: float,
+    scratch: Scratch,
+    motions: Ints,
+    taken: Ints,
+) -> None:
     """Keeps the poses of most slack at every step, until each root has a way or no pose is left.
 
     pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. share: the poses kept for each root.

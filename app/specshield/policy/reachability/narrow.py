@@ -33,9 +33,18 @@ MAX_LEGS = 16  # searches on one way
 
 @kernel
 def continue_narrow(
-    guide: Guide, narrow: Bools, top: Floats, effort: Floats, past: float, history: Floats, signals: Floats,
-    wanted: Bools, lowest: float, motions: Ints, poses: Floats,
-) -> int:  # fmt: skip
+    guide: Guide,
+    narrow: Bools,
+    top: Floats,
+    effort: Floats,
+    past: float,
+    history: Floats,
+    signals: Floats,
+    wanted: Bools,
+    lowest: float,
+    motions: Ints,
+    poses: Floats,
+) -> int:
     """`continue_all` for a rule with narrow predicates: those of the obligations `narrow` (K,).
 
     top [tables]: the latest feasible time of each table [steps]. effort [searches, 4]: for the way from x_t.
@@ -76,9 +85,15 @@ def continue_narrow(
 
 @kernel
 def _go(
-    guide: Guide, narrow: Bools, top: Floats, effort: Floats, t: int, motions: Ints, poses: Floats,
+    guide: Guide,
+    narrow: Bools,
+    top: Floats,
+    effort: Floats,
+    t: int,
+    motions: Ints,
+    poses: Floats,
     scratch: Scratch,
-) -> bool:  # fmt: skip
+) -> bool:
     """Goes on from motions[:1] to the horizon; whether every goal was settled. The arguments are those of
     `climb`.
     """

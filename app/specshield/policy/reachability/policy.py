@@ -270,7 +270,8 @@ def _extent(task: Task, body: Body, rules: Rules, settings: Settings) -> tuple[f
     least = math.ceil(100.0 * pitch / COARSEST) / 100.0
     would = f"options.pitch {least:.2f} or more" if least <= 1.0 else "fewer windows that overlap"
     raise PolicyError(
-        "the tables are too large", path="options.pitch",
+        "the tables are too large",
+        path="options.pitch",
         got=f"{entries} entries for each pose at a pitch of {settings.pitch:g} m",
         expected=would,
-    )  # fmt: skip
+    )

@@ -97,9 +97,16 @@ def begin(
 
 @kernel
 def continue_all(
-    guide: Guide, width: int, past: float, history: Floats, signals: Floats, wanted: Bools, lowest: float,
-    motions: Ints, poses: Floats,
-) -> int:  # fmt: skip
+    guide: Guide,
+    width: int,
+    past: float,
+    history: Floats,
+    signals: Floats,
+    wanted: Bools,
+    lowest: float,
+    motions: Ints,
+    poses: Floats,
+) -> int:
     """Writes a continuation after each `wanted` (M,) first motion into motions (M, T - t), and where it leads
     into poses (M, T - t, 3); returns the motion of most slack. -1, and nothing is written, where none that is
     wanted has a slack of at least `lowest` [steps]; no beam looks for a way after one that has less.
@@ -195,9 +202,18 @@ def _follow(
         way = np.empty((1, min(motions.shape[0] - n, ESCAPE_LENGTH)), np.int64)
         taken = np.empty(1, np.int64)
         beam_search(
-            guide, t + n, poses[n - 1 : n], status.reshape(1, -1), run.reshape(1, -1), width,
-            high - (t + n) - ESCAPE_LOSS, high + ESCAPE_GAIN, scratch, way, taken,
-        )  # fmt: skip
+            guide,
+            t + n,
+            poses[n - 1 : n],
+            status.reshape(1, -1),
+            run.reshape(1, -1),
+            width,
+            high - (t + n) - ESCAPE_LOSS,
+            high + ESCAPE_GAIN,
+            scratch,
+            way,
+            taken,
+        )
         if taken[0] == 0:
             break
         copy_progress(status, run, scratch.status, scratch.run)
@@ -238,9 +254,18 @@ def _beam_out(
         some, rest = roots[:few], roots[few:]
         way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
         beam_search(
-            guide, t + 1, poses[some, 0], starts.status[some], starts.run[some], share, band, np.inf, scratch,
-            way, taken,
-        )  # fmt: skip
+            guide,
+            t + 1,
+            poses[some, 0],
+            starts.status[some],
+            starts.run[some],
+            share,
+            band,
+            np.inf,
+            scratch,
+            way,
+            taken,
+        )
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:

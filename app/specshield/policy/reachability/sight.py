@@ -76,9 +76,17 @@ def reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
 
 @kernel
 def look(
-    body: Body, rules: Rules, k: int, pitch: float, headings: int, free: Bools, spread: Floats, beside: float,
-    outer: Bools, inner: Bools,
-) -> None:  # fmt: skip
+    body: Body,
+    rules: Rules,
+    k: int,
+    pitch: float,
+    headings: int,
+    free: Bools,
+    spread: Floats,
+    beside: float,
+    outer: Bools,
+    inner: Bools,
+) -> None:
     """Writes, for each pose of a lattice over the cells `free` [ny, nx], whether predicate k holds somewhere
     within `beside` [m] of it, and whether it holds by as much all about it, [ny, nx, H].
 

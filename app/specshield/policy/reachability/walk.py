@@ -214,9 +214,17 @@ def _deepen(
 
 @leaf
 def rejoin(
-    guide: Guide, t: int, turn: int, move: int, base: Ints, led: Floats, at: int, motions: Ints,
-    poses: Floats, scratch: Scratch,
-) -> bool:  # fmt: skip
+    guide: Guide,
+    t: int,
+    turn: int,
+    move: int,
+    base: Ints,
+    led: Floats,
+    at: int,
+    motions: Ints,
+    poses: Floats,
+    scratch: Scratch,
+) -> bool:
     """Goes on from motions[:1] by `turn` and `move`, then by `base`, a way to every goal: see `join`.
 
     led (T - t, 3): the poses of `base`, which are taken over from where the robot is at the very same pose.

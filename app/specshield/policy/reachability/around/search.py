@@ -73,9 +73,15 @@ def is_known(guide: Guide, past: float, history: Floats, signals: Floats, poses:
 
 @kernel
 def go_around(
-    guide: Guide, past: float, history: Floats, signals: Floats, fields: Floats, poses: Floats, motions: Ints,
+    guide: Guide,
+    past: float,
+    history: Floats,
+    signals: Floats,
+    fields: Floats,
+    poses: Floats,
+    motions: Ints,
     most: int,
-) -> int:  # fmt: skip
+) -> int:
     """Searches for a way from x_t to every goal. Returns its first motion; then motions (M, T - t) hold it,
     and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the search came to `most`
     poses. The robot has to be one that can wait.
