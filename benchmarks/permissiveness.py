@@ -26,9 +26,11 @@ from benchmarks.worlds import KINDS, NEAR, SHAPES, explore, make_world, sample
 from evaluation.shipped import shipped
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
-from specshield.policy.progress import STACK, advance, make_rules, read_predicates, replay, value_count
+from specshield.policy.progress import make_rules, replay
+from specshield.policy.reachability.guide import make_scratch
 from specshield.policy.reachability.policy import ReachabilityPolicy, Settings, synthesise
-from specshield.policy.reachability.tables import slack
+from specshield.policy.reachability.tables import Guide, slack
+from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, in_collision, motion_count, simulate, step
 from specshield.shield.episode import Config, Decision, Shield, decide, make_shield, start
 from specshield.shield.proposal import Proposer
@@ -108,29 +110,21 @@ class Slack:
     """Steps to spare by a policy's tables."""
 
     def __init__(self, policy: ReachabilityPolicy, body: Body) -> None:
-        self.tables, self.body, self.rules = policy.tables, body, make_rules(policy.task)
-        k = len(self.rules.kind)
-        self.status, self.run, self.predicates = np.zeros(k, np.int8), np.zeros(k, np.int64), np.empty(k)
-        self.values, self.stack = np.empty(value_count(self.rules)), np.empty(STACK)
+        wait = policy.task.robot.wait_motion
+        self.guide = Guide(body, make_rules(policy.task), policy.tables, wait, NOTHING_BARRED)
+        self.scratch = make_scratch(self.guide.rules, motion_count(body))
 
     def here(self, history: Floats) -> float:
-        replay(self.rules, self.rules.margin, history, np.empty((len(history), 0)), self.status, self.run)
-        t = len(history) - 1
-        return float(
-            slack(self.body, self.rules, self.tables, *history[-1].tolist(), t, self.status, self.run)
-        )
+        rules, scratch = self.guide.rules, self.scratch
+        progress = replay(rules, rules.margin, history, np.empty((len(history), 0)))
+        scratch.status[:], scratch.run[:] = progress
+        return float(slack(self.guide, *history[-1].tolist(), len(history) - 1, scratch))
 
     def after(self, history: Floats) -> Floats:
         """[M]: after each motion from x_t."""
-        replay(self.rules, self.rules.margin, history, np.empty((len(history), 0)), self.status, self.run)
-        out, t = np.empty(motion_count(self.body)), len(history)
-        for m in range(len(out)):
-            pose = step(self.body, *history[-1].tolist(), m)
-            status, run = self.status.copy(), self.run.copy()
-            read_predicates(self.rules, *pose, self.values, self.stack, self.predicates)
-            advance(self.rules, t, self.predicates, status, run)
-            out[m] = slack(self.body, self.rules, self.tables, *pose, t, status, run)
-        return out
+        last = history[-1].tolist()
+        after = [step(self.guide.body, *last, m) for m in range(motion_count(self.guide.body))]
+        return np.array([self.here(np.concatenate([history, [pose]])) for pose in after])
 
 
 class Model:

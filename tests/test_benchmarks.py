@@ -52,8 +52,7 @@ def is_tie(plain, dqn, history, m):
     ours = np.concatenate([history, poses])
     parted = int(np.argmax(np.abs(theirs - ours).max(axis=1) > ROUNDING))
     rules = make_rules(dqn.task)
-    status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
-    replay(rules, rules.margin, ours[:parted], np.zeros((parted, 0)), status, run)
+    status, _ = replay(rules, rules.margin, ours[:parted], np.zeros((parted, 0)))
     seen = plain.observe(parted - 1, ours[None, parted - 1], status[None] == SETTLED, status[None] == BROKEN)
     with torch.no_grad():
         second, first = np.sort(plain.network(torch.from_numpy(seen)).numpy()[0])[-2:]

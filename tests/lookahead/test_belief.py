@@ -35,7 +35,7 @@ def observed():
     goals = goals_of((UNIT, 0), (-UNIT, 0))
     begun = beliefs.begin(2, MOTIONS)
     pose = np.array([0.5, 0.5, 0.0])
-    return begun, beliefs.update(begun, body, goals, pose, np.zeros(MOTIONS, bool), SAID, 0.1, 0.25)
+    return begun, beliefs.update(begun, body, goals, pose, SAID, 0.1, 0.25)
 
 
 def test_before_anything_is_seen(observed):

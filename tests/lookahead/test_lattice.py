@@ -51,8 +51,8 @@ def test_steps_that_share_a_number():
 
 def test_a_motion_is_blocked_where_it_goes_less_than_half_its_way():
     body, _, _ = make_world("F[0,1] B")
-    assert not is_blocked(body, GO, *WEST, EAST)
-    assert is_blocked(body, GO, *WEST, (0.19, 0.1, 0.0))
-    assert not is_blocked(body, BACK, *EAST, (0.19, 0.1, 0.0))
-    assert not is_blocked(body, STOP, *WEST, WEST)
+    assert not is_blocked(body, GO, WEST, EAST)
+    assert is_blocked(body, GO, WEST, (0.19, 0.1, 0.0))
+    assert not is_blocked(body, BACK, EAST, (0.19, 0.1, 0.0))
+    assert not is_blocked(body, STOP, WEST, WEST)
     assert blocked_at(body, *WEST).tolist() == [False, True, False]  # GO, BACK, STOP

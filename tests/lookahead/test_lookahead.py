@@ -112,7 +112,7 @@ def test_exact_steps_and_the_lattice_charge_alike(which):
     free = [s for s, (i, j, _) in enumerate(STATES) if not body.occupied[j, i]]
     for s in free:
         pose = WORLD.pose(*STATES[s])
-        e[s] = follow(body, goals, lead, STYLE, *pose, blocked_at(body, *pose), log_r)
+        e[s] = follow(body, goals, lead, STYLE, tuple(pose), blocked_at(body, *pose), log_r)
         r[s], left[s] = np.exp(log_r), price_left(body, goals, lead, *pose[:2])
     assert np.ptp(left) > 1.0 or lead != len(goals.distance) - 1
     planes, table = solve_cells(r, e, step_price(lead), left)
@@ -239,7 +239,7 @@ def seeks(goal):
     def speak(t, pose, random):
         blocked = blocked_at(ahead.body, *pose)
         log_r, style = np.empty(len(blocked)), np.array(SHARP_STYLE)
-        end = follow(ahead.body, ahead.goals, goal, style, *pose, blocked, log_r)
+        end = follow(ahead.body, ahead.goals, goal, style, tuple(pose), blocked, log_r)
         of = TASK.robot.motion_of
         shares = np.bincount(of[~TASK.robot.terminal])
         return np.where(TASK.robot.terminal, np.log(max(end, 1e-4)), log_r[of] - np.log(shares[of]))

@@ -68,7 +68,7 @@ def test_the_features_of_a_motion(body, motion, bearing, blocked, expected):
 def test_one_that_goes_somewhere_says_the_softmax_of_its_features(body):
     """The way is straight ahead: 2 for going there, -2 for either turn, -1 for waiting."""
     log_r = np.empty(MOTIONS)
-    end = follow(body, goals_of((UNIT, 0)), 0, STYLE, 0.5, 0.5, 0.0, NONE, log_r)
+    end = follow(body, goals_of((UNIT, 0)), 0, STYLE, (0.5, 0.5, 0.0), NONE, log_r)
     weights = np.exp([2.0, -2.0, -2.0, -1.0])
     np.testing.assert_allclose(np.exp(log_r), weights / weights.sum(), rtol=1e-12)
     assert end == end_chance(300) < 1e-9
@@ -79,7 +79,7 @@ def test_one_that_goes_somewhere_says_the_softmax_of_its_features(body):
 def test_one_that_wanders_goes_ahead_where_it_can(body):
     log_r = np.empty(MOTIONS)
     for blocked, ahead in ((NONE, AHEAD), (np.arange(MOTIONS) == FORWARD, 0.0)):
-        assert follow(body, goals_of((UNIT, 0)), WANDER, STYLE, 0.5, 0.5, 0.0, blocked, log_r) == WANDER_END
+        assert follow(body, goals_of((UNIT, 0)), WANDER, STYLE, (0.5, 0.5, 0.0), blocked, log_r) == WANDER_END
         weights = np.exp([ahead, TURN, TURN, OTHER])
         np.testing.assert_allclose(np.exp(log_r), weights / weights.sum(), rtol=1e-12)
 
@@ -98,7 +98,7 @@ def test_a_stand_in_on_the_lattice_is_the_same_as_at_the_pose():
     goals, log_r = goals_of((UNIT, 0)), np.empty(3)
     stand_in = stand_in_for(body, goals, planes, 0, STYLE)
     at = place(planes, 1)
-    end = follow(body, goals, 0, STYLE, *EAST, np.array([True, False, False]), log_r)
+    end = follow(body, goals, 0, STYLE, EAST, np.array([True, False, False]), log_r)
     np.testing.assert_allclose(stand_in.motions[:, 0, at], log_r, rtol=1e-6)
     weights = np.exp([-2.0, -2.0, -1.0])  # blocked; back, away from the goal; standing still
     np.testing.assert_allclose(np.exp(log_r), weights / weights.sum(), rtol=1e-12)

@@ -10,17 +10,19 @@ import pytest
 from specshield.policy.lattice import (
     INVALID,
     NO_TIME,
-    STEP_CODES,
+    Corners,
     bilinear,
     coordinates,
     coordinates_ahead,
     corner,
+    find_corners,
     heading_after,
-    interpolate,
     leads_back,
     make_lattice,
     pose_of,
+    read_corners,
 )
+from specshield.policy.planner.fields import OUT_OF_REACH, UNREACHED, Fields, to_go
 from specshield.policy.shape import heading_count
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body
@@ -71,11 +73,16 @@ def test_the_corners_about_a_place():
 
 
 CELLS = np.array([[0, 1], [2, -1]], np.int32)  # the fourth cell has no row
-CODES = np.array([[0, 64], [128, 192], [256, INVALID]], np.uint16)  # of two headings
+CODES = np.array([[1, 65], [129, 193], [257, INVALID]], np.uint16)  # of two headings
 
 
-def steps_at(v, u, h, zero=0.0, largest=INVALID):
-    return interpolate(CELLS, CODES, zero, largest, -7.0, v, u, h)
+def steps_at(v, u, h):
+    """As the tables and the planner's fields have it, whose codes begin at 1 and at 0."""
+    corners = Corners(np.empty(4, np.int64), np.empty(4))
+    found = read_corners(corners, find_corners(CELLS, v, u, corners), CODES, np.inf, h)
+    codes = np.where(CODES == INVALID, INVALID, CODES - 1).astype(np.uint16)
+    assert to_go(Fields(CELLS, codes[None], 1.0), 0, v, u, h) == found
+    return found
 
 
 def test_a_table_between_its_crossings():
@@ -86,11 +93,14 @@ def test_a_table_between_its_crossings():
     assert steps_at(0.0, 0.5, 0.0) == 1.0  # between 0 and 128 codes
     assert steps_at(0.5, 0.0, 1.0) == 1.0  # one of the two corners is invalid: the other alone
     assert steps_at(0.5, 0.5, 0.0) == pytest.approx((0.0 + 2.0 + 4.0) / 3.0)  # the corner without a row
-    assert steps_at(1.0, 1.0, 0.0) == -7.0  # no valid corner
-    assert steps_at(-2.0, 0.0, 0.0) == -7.0  # outside
+    assert steps_at(1.0, 1.0, 0.0) == np.inf  # no valid corner
+    assert steps_at(-2.0, 0.0, 0.0) == np.inf  # outside
     assert steps_at(-0.5, 0.0, 1.0) == 1.0  # at the edge: the row that there is
-    assert steps_at(1.0, 0.0, 0.0, largest=128) == 2.0  # what is above counts as that
-    assert steps_at(0.0, 0.0, 1.0, zero=1.0) == 63.0 / STEP_CODES
+
+
+def test_what_no_way_leads_from_is_as_far_as_can_be_told():
+    fields = Fields(CELLS, np.full((1, 3, 2), UNREACHED, np.uint16), 1.0)
+    assert to_go(fields, 0, 0.0, 0.0, 0.0) == OUT_OF_REACH
 
 
 def test_a_full_table_at_one_heading():

@@ -122,12 +122,16 @@ class Plan:
         for i, (kind, said) in enumerate(self._lines):
             told.append(self._text(0.0, edge / 2 + LINE * unit * (i + 0.8), said, SIZE, kind, "start"))
         size = f'width="800" height="{800 * foot / wide:.0f}"'
-        return "\n".join([
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" {size} role="img">',
-            f"<title>{escape(self._title)}</title><style>{STYLE}</style>",
-            f'<rect class="paper" x="{left:g}" y="{top:g}" width="{wide:g}" height="{foot:g}"/>',
-            *self._parts, *told, "</svg>\n",
-        ]).encode()  # fmt: skip
+        return "\n".join(
+            [
+                f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" {size} role="img">',
+                f"<title>{escape(self._title)}</title><style>{STYLE}</style>",
+                f'<rect class="paper" x="{left:g}" y="{top:g}" width="{wide:g}" height="{foot:g}"/>',
+                *self._parts,
+                *told,
+                "</svg>\n",
+            ]
+        ).encode()
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
         """A point of the map in the picture, whose y goes down."""

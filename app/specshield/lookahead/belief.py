@@ -17,6 +17,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel
 from specshield.lookahead.goals import Goals, cell_of
+from specshield.lookahead.lattice import Pose, blocked_at
 from specshield.lookahead.surrogate import FEATURES, WANDER, bearing_of, features_of, follow
 from specshield.portable import exp, inner, log, solve
 from specshield.robot.dynamics import Body, displacements
@@ -94,25 +95,18 @@ def begin(goals: int, motions: int) -> Belief:
 
 
 def update(
-    belief: Belief,
-    body: Body,
-    goals: Goals,
-    pose: Floats,
-    blocked: Bools,
-    said: Floats,
-    end: float,
-    forced: float,
+    belief: Belief, body: Body, goals: Goals, pose: Floats, said: Floats, end: float, forced: float
 ) -> Belief:
     """The belief after what the model said at x_t (3,).
 
-    blocked [M]: the motions that an obstacle stops short. said [M]: the motions' probabilities, given that
-    the model does not end; end: the probability that it does. forced: the KL of projection's answer [nats].
+    said [M]: the motions' probabilities, given that the model does not end; end: the probability that it
+    does. forced: the KL of projection's answer [nats].
     """
     said = np.maximum(said, LEAST_SAID) / np.maximum(said, LEAST_SAID).sum()
     log_said = log(said)
-    charges = np.empty(len(belief.cost))
     x, y, theta = (float(v) for v in pose)
-    _charge(body, goals, belief.style, x, y, theta, blocked, said, log_said, end, charges)
+    blocked = blocked_at(body, x, y, theta)
+    charges = _charge(body, goals, belief.style, (x, y, theta), blocked, said, log_said, end)
     usual = float(inner(said, log_said - log((1.0 - FLOOR) * belief.habit + FLOOR / len(said))))
     sided = _sided(body, said)  # one that wanders turns to either side: to which is no error of the stand-in
     excess = TRACK * belief.excess + float(inner(belief.probabilities(), charges)) - usual
@@ -149,24 +143,22 @@ def _charge(
     body: Body,
     goals: Goals,
     style: Floats,
-    x: float,
-    y: float,
-    theta: float,
+    pose: Pose,
     blocked: Bools,
     said: Floats,
     log_said: Floats,
     end: float,
-    charges: Floats,
-) -> None:
+) -> Floats:
     """Of each goal and of wandering: the KL of the motions said from the stand-in's, and the log loss of the
-    end, into charges [G + 1].
+    end, [G + 1].
     """
-    motions, wander = said.shape[0], charges.shape[0] - 1
-    log_r = np.empty(motions)
+    motions, wander = said.shape[0], goals.distance.shape[0]
+    charges, log_r = np.empty(wander + 1), np.empty(motions)
     for g in range(charges.shape[0]):
-        ends = follow(body, goals, g if g < wander else WANDER, style, x, y, theta, blocked, log_r)
+        ends = follow(body, goals, g if g < wander else WANDER, style, pose, blocked, log_r)
         chance = 0.98 * ends + 0.005
         charges[g] = -(end * math.log(chance) + (1.0 - end) * math.log(1.0 - chance))
         for m in range(motions):
             r = (1.0 - FLOOR) * math.exp(log_r[m]) + FLOOR / motions
             charges[g] += said[m] * (log_said[m] - math.log(r))
+    return charges

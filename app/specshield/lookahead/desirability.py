@@ -115,7 +115,7 @@ def _back(
     """
     cost, least, total = sums
     (headings, cells), edge = ahead.shape, _edge(planes)
-    last, one = cells - edge, np.float32(1.0)
+    last = cells - edge
     least[:] = UNKEEPABLE
     total[:] = 0.0
     for m in range(cost.shape[0]):
@@ -125,19 +125,14 @@ def _back(
         part = np.float32(max(turn - low, 0.0)) if turn - low > 1e-6 else np.float32(0.0)
         g0, g1 = ahead[(h + low) % headings], ahead[(h + low + 1) % headings]
         if move == 0.0:  # between two headings of the same cell
-            _mix(g0[edge:last], g1[edge:last], one - part, part, cost[m])
+            _mix(g0[edge:last], g1[edge:last], part, cost[m])
         else:  # between four cells of the nearest heading
             g = g0 if part < 0.5 else g1
             angle = 2.0 * math.pi * h / headings
             du, dv = round(move * math.cos(angle), 6), round(move * math.sin(angle), 6)
             i, j = int(np.floor(du)), int(np.floor(dv))
             p, q = np.float32(du - i), np.float32(dv - j)
-            at = edge + j * planes.width + i
-            to, up = at + last - edge, planes.width
-            _blend(
-                g[at:to], g[at + 1 : to + 1], g[at + up : to + up], g[at + up + 1 : to + up + 1],
-                (one - q) * (one - p), (one - q) * p, q * (one - p), q * p, cost[m],
-            )  # fmt: skip
+            _blend(g, edge + j * planes.width + i, planes.width, p, q, cost[m])
         log_r = stand_in.motions[m, h, edge:last]
         _charge(planes.free[m, h, edge:last], ahead[h, edge:last], log_r, cost[m], least)
     for m in range(cost.shape[0]):
@@ -146,30 +141,27 @@ def _back(
 
 
 @kernel
-def _mix(a: Singles, b: Singles, wa: np.float32, wb: np.float32, out: Singles) -> None:
-    """As `_blend`, of two: it takes two thirds of the time, and most motions turn."""
+def _mix(a: Singles, b: Singles, part: np.float32, out: Singles) -> None:
+    """As `_blend`, of two; part: the share of b. It takes two thirds of the time, and most motions turn."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for c in range(out.shape[0]):
-        va, vb = wa if a[c] < UNKEEPABLE else zero, wb if b[c] < UNKEEPABLE else zero
+        va, vb = one - part if a[c] < UNKEEPABLE else zero, part if b[c] < UNKEEPABLE else zero
         weight = va + vb
         value = (va * a[c] + vb * b[c]) / max(weight, np.float32(1e-6)) + TIGHT * (one - weight)
         out[c] = value if weight > np.float32(1e-3) else UNKEEPABLE
 
 
 @kernel
-def _blend(
-    a: Singles,
-    b: Singles,
-    c: Singles,
-    d: Singles,
-    wa: np.float32,
-    wb: np.float32,
-    wc: np.float32,
-    wd: np.float32,
-    out: Singles,
-) -> None:
-    """Bilinear over the corners from which the rule can be kept, at a price for the others."""
-    zero, one = np.float32(0.0), np.float32(1.0)
+def _blend(g: Singles, at: int, width: int, p: np.float32, q: np.float32, out: Singles) -> None:
+    """Bilinear over the corners from which the rule can be kept, at a price for the others.
+
+    at: the first cell of the lower left corners; width: cells of a row. p, q: the shares of the right and of
+    the upper corners.
+    """
+    zero, one, n = np.float32(0.0), np.float32(1.0), out.shape[0]
+    a, b = g[at : at + n], g[at + 1 : at + 1 + n]
+    c, d = g[at + width : at + width + n], g[at + width + 1 : at + width + 1 + n]
+    wa, wb, wc, wd = (one - q) * (one - p), (one - q) * p, q * (one - p), q * p
     for k in range(out.shape[0]):
         va, vb = wa if a[k] < UNKEEPABLE else zero, wb if b[k] < UNKEEPABLE else zero
         vc, vd = wc if c[k] < UNKEEPABLE else zero, wd if d[k] < UNKEEPABLE else zero

@@ -60,7 +60,7 @@ def expand_all(
             for m in range(motions):
                 child = start[d + 1] + (n - start[d]) * motions + m
                 x, y, theta = step(body, u, v, w, m)
-                blocked[n, m] = is_blocked(body, m, u, v, w, (x, y, theta))
+                blocked[n, m] = is_blocked(body, m, (u, v, w), (x, y, theta))
                 pose[child, 0], pose[child, 1], pose[child, 2] = x, y, theta
                 read_predicates(rules, x, y, theta, values, stack, read)
                 settled[child] = _settle(rules, planes, t + d + 1, settled[n], read)
@@ -77,7 +77,7 @@ def expand_all(
                 if d == levels:
                     cost[n] = desirability(body, planes, tables[asked[k]], t + d, settled[n], u, v, w)
                 else:
-                    ends = follow(body, goals, lead, style, u, v, w, blocked[n], log_r)
+                    ends = follow(body, goals, lead, style, (u, v, w), blocked[n], log_r)
                     first = start[d + 1] + (n - start[d]) * motions
                     total = _log_sum(log_r, cost[first : first + motions])
                     if total > -float(UNKEEPABLE):

@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from specshield.arrays import Bools, Codes, Floats, Int8s
 from specshield.compiled import kernel, leaf
-from specshield.policy.geodesic import geodesic_distance
+from specshield.policy.geodesic import downhill, falling, geodesic_distance
 from specshield.robot.dynamics import Body, swing_radius
 from specshield.world.occupancy import OccupancyGrid
 
@@ -57,7 +57,7 @@ def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
         if np.any(free & np.isinf(to_go)):  # through a door too narrow to turn in
             to_go = np.where(np.isinf(to_go), geodesic_distance(free, goal, pitch), to_go)
         distance[g] = np.where(np.isfinite(to_go), np.minimum(100.0 * to_go, NO_PATH - 1), NO_PATH)
-        _steer(_falling(free, onward, pitch), way[g])
+        _steer(falling(free, onward, pitch), way[g])
     return Goals(pitch, distance, way)
 
 
@@ -75,36 +75,11 @@ def _places(roomy: Bools, gap: int) -> list[tuple[int, int]]:
     return places if len(places) <= MAX_GOALS else _places(roomy, gap + 1)
 
 
-def _falling(free: Bools, onward: Floats, pitch: float) -> Floats:
-    """A height [h, w] that falls along the way to a goal: in roomy space the distance `onward` to the goal;
-    beside an obstacle, where the robot cannot turn, higher, so that the way first leads off it.
-    """
-    reached = np.isfinite(onward)
-    off = geodesic_distance(free, reached, pitch)
-    return np.where(reached, onward, onward[reached].max(initial=0.0) + pitch + off)
-
-
 @kernel
 def _steer(height: Floats, way: Int8s) -> None:
     """The direction from each cell to the one STEER cells down the steepest way."""
-    rows, columns = height.shape
-    after = np.empty(rows * columns, np.int64)
-    for j in range(rows):
-        for i in range(columns):
-            best, at = 0.0, j * columns + i
-            for dj in range(-1, 2):
-                for di in range(-1, 2):
-                    row, column = j + dj, i + di
-                    inside = 0 <= row < rows and 0 <= column < columns
-                    if (dj != 0 or di != 0) and inside and height[row, column] < np.inf:
-                        fall = (height[j, i] - height[row, column]) / math.hypot(dj, di)
-                        if fall > best:
-                            best, at = fall, row * columns + column
-            after[j * columns + i] = at
-    for start in range(rows * columns):
-        at = start
-        for _ in range(STEER):
-            at = after[at]
+    columns = height.shape[1]
+    for start, at in enumerate(downhill(height, STEER)):
         dv, du = at // columns - start // columns, at % columns - start % columns
         length = max(math.hypot(du, dv), 1e-9)
         way[start // columns, start % columns, 0] = round(UNIT * du / length)

@@ -10,7 +10,7 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.policy.lattice import Corners, pose_of
+from specshield.policy.lattice import pose_of
 from specshield.policy.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -18,17 +18,23 @@ from specshield.policy.progress import (
     SETTLED,
     STACK,
     Rules,
+    goals_of,
     read_predicates,
     value_count,
 )
-from specshield.policy.reachability.tables import Tables, slack
+from specshield.policy.reachability.guide import make_scratch
+from specshield.policy.reachability.tables import Guide, Tables, slack
 from specshield.policy.shape import heading_count
+from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
 
 COARSE_PITCH = 0.4  # [m] as fine as the stand-ins deserve; chosen by hand, nothing measured
 MOST_HEADINGS = 24  # one for each 15 degrees; chosen by hand, nothing measured
 MAX_ENTRIES = 40_000_000  # poses times steps and sets of settled goals: what solving one stand-in costs
 KEPT_ENTRIES = 500_000  # of them that a table of D keeps, 1 MB
+
+
+Pose = tuple[float, float, float]
 
 
 class Planes(NamedTuple):
@@ -76,26 +82,39 @@ def make_planes(
     rows, columns = (math.ceil(n * body.resolution / pitch - 1e-9) for n in body.occupied.shape)
     pad = math.ceil(longest / pitch - 1e-9) + 1
     width, cells = columns + 2 * pad, (rows + 2 * pad) * (columns + 2 * pad)
-    goal = np.flatnonzero(rules.kind != ALWAYS)
-    dwell = rules.kind[goal] == EVENTUALLY_ALWAYS
-    first = rules.a[goal] + np.where(dwell, rules.c2[goal], 0)
-    last = np.where(dwell, rules.c1[goal] + rules.c2[goal], rules.b[goal])
+    goal = goals_of(rules)
+    first = rules.a[goal] + rules.c2[goal]
+    last = np.where(rules.kind[goal] == EVENTUALLY_ALWAYS, rules.c1[goal] + rules.c2[goal], rules.b[goal])
     slot = _slots(first, last, horizon, 1)
     slots, shape = slot.max() + 1, (headings, cells)
     if slots * headings * cells > MAX_ENTRIES:
         raise Unsupported(
-            "the task is too large for look-ahead", path="shaping",
+            "the task is too large for look-ahead",
+            path="shaping",
             got=f"{slots} steps and sets of settled goals times {headings} x {cells} poses",
             expected=f"at most {MAX_ENTRIES} in all; or shaping 'projection'",
-        )  # fmt: skip
+        )
     steady = np.flatnonzero(rules.kind == ALWAYS)
     due = _bits(rules.a[steady], rules.b[steady], steady, horizon)
     opened = _bits(first, last, np.arange(len(goal)), horizon)
     planes = Planes(
-        pitch, pad, width, np.zeros(shape, np.uint8), np.zeros((motion_count(body), *shape), np.float32),
-        np.zeros(shape, np.int32), np.zeros(shape, np.int32), goal, first, last, due, opened, slot, slot,
-        np.full(cells, -1), np.zeros((0, *shape), np.uint8),
-    )  # fmt: skip
+        pitch,
+        pad,
+        width,
+        np.zeros(shape, np.uint8),
+        np.zeros((motion_count(body), *shape), np.float32),
+        np.zeros(shape, np.int32),
+        np.zeros(shape, np.int32),
+        goal,
+        first,
+        last,
+        due,
+        opened,
+        slot,
+        slot,
+        np.full(cells, -1),
+        np.zeros((0, *shape), np.uint8),
+    )
     _survey(body, rules, planes)
     rooms = planes.valid.any(axis=0)
     planes.row[rooms] = np.arange(rooms.sum())
@@ -104,7 +123,7 @@ def make_planes(
     if tables is None:
         return planes
     planes = planes._replace(possible=np.zeros((slots, *shape), np.uint8))
-    _rule_out(body, rules, tables, planes)
+    _rule_out(Guide(body, rules, tables, -1, NOTHING_BARRED), planes)
     return planes
 
 
@@ -129,20 +148,18 @@ def _slots(first: Ints, last: Ints, horizon: int, every: int) -> Ints:
 
 
 @inlined
-def pose_at(body: Body, planes: Planes, h: int, c: int) -> tuple[float, float, float]:
+def pose_at(body: Body, planes: Planes, h: int, c: int) -> Pose:
     """The map-frame pose of cell c of the plane of heading h."""
     j, i = c // planes.width - planes.pad, c % planes.width - planes.pad
     return pose_of(body, planes.pitch, planes.valid.shape[0], j, i, h)
 
 
 @leaf
-def is_blocked(
-    body: Body, motion: int, x: float, y: float, theta: float, after: tuple[float, float, float]
-) -> bool:
-    """Whether f stopped the motion from (x, y, theta) short; after: where it led."""
-    moved = math.hypot(after[0] - x, after[1] - y)
+def is_blocked(body: Body, motion: int, pose: Pose, after: Pose) -> bool:
+    """Whether f stopped the motion from a pose short; after: where it led."""
+    moved = math.hypot(after[0] - pose[0], after[1] - pose[1])
     move, rotation = displacement(body, motion)
-    return moved < 0.5 * abs(move) or not (rotation == 0.0 or after[2] != theta)
+    return moved < 0.5 * abs(move) or not (rotation == 0.0 or after[2] != pose[2])
 
 
 @kernel
@@ -150,7 +167,7 @@ def blocked_at(body: Body, x: float, y: float, theta: float) -> Bools:
     """Which motions an obstacle stops short at a pose, shape (M,)."""
     blocked = np.empty(motion_count(body), np.bool_)
     for m in range(len(blocked)):
-        blocked[m] = is_blocked(body, m, x, y, theta, step(body, x, y, theta, m))
+        blocked[m] = is_blocked(body, m, (x, y, theta), step(body, x, y, theta, m))
     return blocked
 
 
@@ -174,21 +191,20 @@ def _survey(body: Body, rules: Rules, planes: Planes) -> None:
 
 
 @kernel
-def _rule_out(body: Body, rules: Rules, tables: Tables, planes: Planes) -> None:
+def _rule_out(guide: Guide, planes: Planes) -> None:
     """Leaves `possible` 0 where the tables leave no slack, for each set of settled goals at each step."""
     headings, cells = planes.valid.shape
-    status, run = np.zeros(rules.kind.shape[0], np.int8), np.zeros(rules.kind.shape[0], np.int64)
-    corners = Corners(np.empty(4, np.int64), np.empty(4))
+    scratch = make_scratch(guide.rules, 1)
+    scratch.status[:], scratch.run[:] = PENDING, 0
     for t in range(planes.slot.shape[0] - 1):
         for mask in range(planes.slot.shape[1]):
             slot = planes.slot[t, mask]
             if slot < 0:
                 continue
             for g in range(planes.goal.shape[0]):
-                status[planes.goal[g]] = SETTLED if mask >> g & 1 else PENDING
+                scratch.status[planes.goal[g]] = SETTLED if mask >> g & 1 else PENDING
             for h in range(headings):
                 for c in range(cells):
                     if planes.valid[h, c]:
-                        x, y, theta = pose_at(body, planes, h, c)
-                        spare = slack(body, rules, tables, x, y, theta, t, status, run, corners)
-                        planes.possible[slot, h, c] = spare >= 0.0
+                        x, y, theta = pose_at(guide.body, planes, h, c)
+                        planes.possible[slot, h, c] = slack(guide, x, y, theta, t, scratch) >= 0.0

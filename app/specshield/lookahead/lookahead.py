@@ -28,7 +28,7 @@ from specshield.lookahead.belief import STYLE, Belief
 from specshield.lookahead.desirability import UNKEEPABLE, solve
 from specshield.lookahead.expansion import expand_all
 from specshield.lookahead.goals import Goals, make_goals
-from specshield.lookahead.lattice import Planes, blocked_at, make_planes
+from specshield.lookahead.lattice import Planes, make_planes
 from specshield.lookahead.preferences import AHEADS, PreferenceKind
 from specshield.lookahead.surrogate import WANDER, stand_in_for
 from specshield.policy.progress import SETTLED, Rules, make_rules, replay
@@ -93,11 +93,10 @@ class LookAhead:
         if going_on.sum() <= 0.0:  # the model ends for certain: it says nothing of where it would go
             return memory, np.zeros(len(prior))
         said = np.bincount(robot.motion_of[~robot.terminal], going_on, len(robot.motions)) / going_on.sum()
-        blocked = blocked_at(self.body, *pose)
         end = float(prior[robot.terminal].sum())
         possible = float(prior[feasible & ~robot.terminal].sum()) / float(going_on.sum())
         forced = -float(going_on.sum()) * math.log(possible) if possible > 0.0 else FORCED
-        belief = beliefs.update(belief, self.body, self.goals, pose, blocked, said, end, max(forced, 0.0))
+        belief = beliefs.update(belief, self.body, self.goals, pose, said, end, max(forced, 0.0))
         over = len(history) > self.task.horizon  # no motion changes what the rule says
         if over or belief.forced < FORCED or belief.trust < NEGLIGIBLE:
             return belief.to_bytes(), np.zeros(len(prior))
@@ -108,17 +107,26 @@ class LookAhead:
         """D after each motion above the least of them, [M]: the mean over the likely stand-ins."""
         t = len(history) - 1
         rules = self.rules._replace(signals=self.rules.signals.copy())
-        status, run = np.zeros(len(rules.kind), np.int8), np.zeros(len(rules.kind), np.int64)
-        replay(rules, rules.margin, history, signal_rows(self.task, signals, t + 1), status, run)
+        status, _ = replay(rules, rules.margin, history, signal_rows(self.task, signals, t + 1))
         mask = sum(1 << g for g, k in enumerate(self.planes.goal) if status[k] == SETTLED)
         weights = inner(self.shares.T, belief.probabilities())
         asked = np.argsort(-weights, kind="stable")[:LEADERS]
         asked = asked[weights[asked] >= NEGLIGIBLE]
         costs = np.empty((len(asked), len(self.task.robot.motions)))
         expand_all(
-            self.body, rules, self.goals, self.planes, self.tables, self.leads, asked, STYLE, t, mask,
-            history[-1], costs,
-        )  # fmt: skip
+            self.body,
+            rules,
+            self.goals,
+            self.planes,
+            self.tables,
+            self.leads,
+            asked,
+            STYLE,
+            t,
+            mask,
+            history[-1],
+            costs,
+        )
         known = np.all(costs < UNKEEPABLE, axis=0)
         if not known.any():
             return np.zeros(costs.shape[1])
@@ -146,8 +154,10 @@ def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     if len(goals.distance) == 0:
         raise Unsupported(
             "the robot can turn freely nowhere on this map, so there is nowhere to think of it as going",
-            path="shaping", got="lookahead", expected="'projection'",
-        )  # fmt: skip
+            path="shaping",
+            got="lookahead",
+            expected="'projection'",
+        )
     planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
     entries = int((planes.slot >= 0).sum()) * planes.valid.size
     places, shares = _leads(goals, min(max(WORK // entries, FEWEST), MOST))

@@ -17,7 +17,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Singles
 from specshield.compiled import kernel, leaf
 from specshield.lookahead.goals import NO_PATH, Goals, cell_of
-from specshield.lookahead.lattice import Planes, pose_at
+from specshield.lookahead.lattice import Planes, Pose, pose_at
 from specshield.robot.dynamics import Body, displacement, longest_motions
 
 FEATURES = 4  # of a motion, see `features_of`
@@ -35,15 +35,7 @@ LEAST_MOTION = 1e-9  # [m], [rad] divides in place of the longest move or turn o
 
 @leaf
 def follow(
-    body: Body,
-    goals: Goals,
-    goal: int,
-    style: Floats,
-    x: float,
-    y: float,
-    theta: float,
-    blocked: Bools,
-    out: Floats,
+    body: Body, goals: Goals, goal: int, style: Floats, pose: Pose, blocked: Bools, out: Floats
 ) -> float:
     """log r of each motion at a pose, into out (M,); returns the chance that the stand-in ends there.
 
@@ -53,8 +45,8 @@ def follow(
     if goal == WANDER:
         _wander(body, blocked, out)
         return WANDER_END
-    row, column = cell_of(body, goals, x, y)
-    bearing = bearing_of(body, goals, goal, row, column, theta)
+    row, column = cell_of(body, goals, pose[0], pose[1])
+    bearing = bearing_of(body, goals, goal, row, column, pose[2])
     for m in range(out.shape[0]):
         progress, turning, stopped, idle = features_of(body, bearing, m, blocked[m])
         out[m] = style[0] * progress + style[1] * turning + style[2] * stopped + style[3] * idle
@@ -167,11 +159,11 @@ def stand_in_for(body: Body, goals: Goals, planes: Planes, goal: int, style: Flo
         for c in range(cells):
             if not planes.valid[h, c]:
                 continue
-            x, y, theta = pose_at(body, planes, h, c)
-            left[c] = price_left(body, goals, goal, x, y)
+            pose = pose_at(body, planes, h, c)
+            left[c] = price_left(body, goals, goal, pose[0], pose[1])
             for m in range(count):
                 blocked[m] = planes.free[m, h, c] == 0.0
-            ends[h, c] = follow(body, goals, goal, style, x, y, theta, blocked, log_r)
+            ends[h, c] = follow(body, goals, goal, style, pose, blocked, log_r)
             for m in range(count):
                 motions[m, h, c] = log_r[m]
     return StandIn(motions, ends, step_price(goal), left)

@@ -30,12 +30,14 @@ def _same(poses: Floats, a: int, b: int) -> bool:
 
 
 @leaf
-def copy_way(motions: Ints, poses: Floats, source: int, target: int) -> None:
-    """Copies what follows the first motion `source` to `target`. motions (M, n), poses (M, n, 3)."""
-    for i in range(1, motions.shape[1]):
-        motions[target, i] = motions[source, i]
-        for k in range(3):
-            poses[target, i, k] = poses[source, i, k]
+def copy_ways(motions: Ints, poses: Floats, twin: Ints) -> None:
+    """Gives each motion what follows its twin (M,). motions (M, n), poses (M, n, 3)."""
+    for m in range(twin.shape[0]):
+        if twin[m] != m:
+            for i in range(1, motions.shape[1]):
+                motions[m, i] = motions[twin[m], i]
+                for k in range(3):
+                    poses[m, i, k] = poses[twin[m], i, k]
 
 
 @leaf

@@ -13,13 +13,10 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from specshield.arrays import Bools
-from specshield.compiled import kernel
-from specshield.policy.lattice import pose_of
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, STACK, Rules, read_predicates, value_count
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules, goals_of
+from specshield.policy.reachability.sight import look, reads
 from specshield.policy.shape import headings_of, side_of
 from specshield.robot.dynamics import Body, longest_motions, swing_radius
-from specshield.rule.values import HEADING
-from specshield.stl.program import VALUE
 from specshield.task import Task
 
 # Of a lattice: 3 s to make on one core, and 10 MB a table (python -m benchmarks.floors).
@@ -55,33 +52,22 @@ def places_that_matter(task: Task, body: Body, rules: Rules, pitch: float) -> Bo
     """
     ny, nx = side_of(task.grid, pitch)
     kept = np.ones((ny, nx), np.bool_)
-    goals = np.flatnonzero(rules.kind != ALWAYS)
+    goals = goals_of(rules)
     edges = [t for k in np.flatnonzero(rules.kind == ALWAYS) for t in (rules.a[k], rules.b[k] + 1)]
     over = max([int(rules.last[k]) for k in goals] + [int(t) for t in edges if t <= task.horizon], default=0)
     if task.robot.wait_motion < 0:
         over = task.horizon
     move = longest_motions(body)[0]
     for k in goals:
-        code = slice(int(rules.programs.starts[k]), int(rules.programs.starts[k + 1]))
-        reads = rules.programs.args[code][rules.programs.ops[code] == VALUE]
-        if np.any(reads == HEADING):
+        _, heading, _ = reads(rules, int(k))
+        if heading:
             continue
-        there = _holds_about(body, rules, int(k), ny, nx, pitch, pitch + 2.0 * swing_radius(body))
+        outer, inner = np.zeros((ny, nx, 1), np.bool_), np.zeros((ny, nx, 1), np.bool_)
+        near = pitch + 2.0 * swing_radius(body)
+        look(body, rules, int(k), pitch, 4, np.full((ny, nx), True), np.zeros(1), near, outer, inner)
+        there = outer[..., 0]
         if there.any():
             first = rules.a[k] + (rules.b[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
             steps = max(int(rules.last[k]), over - int(first))
             kept &= distance_transform_edt(~there) * pitch <= steps * move + pitch
     return kept
-
-
-@kernel
-def _holds_about(body: Body, rules: Rules, k: int, ny: int, nx: int, pitch: float, about: float) -> Bools:
-    """Whether predicate k, which does not read the heading, holds within `about` [m] of each cell."""
-    found = np.zeros((ny, nx), np.bool_)
-    values, stack, out = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
-    for j in range(ny):
-        for i in range(nx):
-            x, y, theta = pose_of(body, pitch, 4, j, i, 0.0)
-            read_predicates(rules, x, y, theta, values, stack, out)
-            found[j, i] = out[k] > -about
-    return found

@@ -94,3 +94,35 @@ def _upwind(distance: Floats, done: Bools, i: int, j: int) -> float:
     if abs(a - b) >= 1.0:  # one of them is finite, since some neighbour is settled
         return min(a, b) + 1.0
     return (a + b + math.sqrt(2.0 - (a - b) ** 2)) / 2.0
+
+
+def falling(free: Bools, onward: Floats, resolution: float) -> Floats:
+    """A height [height, width] that falls along the way to a goal: the distance `onward` to it through roomy
+    space; where that is inf, beside an obstacle, higher, so that the way first leads off it.
+    """
+    reached = np.isfinite(onward)
+    off = geodesic_distance(free, reached, resolution)
+    return np.where(reached, onward, onward[reached].max(initial=0.0) + resolution + off)
+
+
+@kernel
+def downhill(height: Floats, steps: int) -> Ints:
+    """The cell, row * width + column, so many steps down the steepest way from each. [height * width]."""
+    rows, columns = height.shape
+    after = np.empty(rows * columns, np.int64)
+    for j in range(rows):
+        for i in range(columns):
+            best, at = 0.0, j * columns + i
+            for dj in range(-1, 2):
+                for di in range(-1, 2):
+                    row, column = j + dj, i + di
+                    inside = 0 <= row < rows and 0 <= column < columns
+                    if (dj != 0 or di != 0) and inside and height[row, column] < np.inf:
+                        fall = (height[j, i] - height[row, column]) / math.hypot(dj, di)
+                        if fall > best:
+                            best, at = fall, row * columns + column
+            after[j * columns + i] = at
+    found = np.arange(rows * columns)
+    for _ in range(steps):
+        found = after[found]
+    return found

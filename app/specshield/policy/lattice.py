@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from specshield.arrays import Bools, Bytes, Codes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
-from specshield.policy.progress import STACK, Rules, read_predicates, value_count
-from specshield.policy.shape import heading_count
+from specshield.policy.progress import Rules
+from specshield.policy.shape import heading_count, side_of
 from specshield.robot.dynamics import (
     TOUCH,
     Body,
@@ -30,9 +30,9 @@ from specshield.robot.dynamics import (
     swing_radius,
     unhindered,
 )
-from specshield.rule.values import HEADING
-from specshield.stl.program import VALUE
-from specshield.world.regions import turns_with_robot
+from specshield.rule.values import HEADING, REGIONS, fill_place, fill_signals, region_count
+from specshield.stl.program import STACK_SIZE, VALUE, Programs, evaluate_packed
+from specshield.world.regions import PackedRegions, turns_with_robot
 
 STEP_CODES = 64.0  # codes of a step in a table of steps
 INVALID = 65535  # the code of a pose that is in collision or breaks what the table keeps
@@ -73,8 +73,7 @@ def make_lattice(body: Body, pitch: float, cells: Bools | None = None) -> Lattic
     """Simulates every motion from every pose of the lattice once, or of those `cells` [ny, nx] alone: the
     other poses count as not valid.
     """
-    height, width = body.occupied.shape
-    ny, nx = (max(math.ceil(n * body.resolution / pitch - 1e-9), 1) for n in (height, width))
+    ny, nx = side_of(body, pitch)
     moves, rotations = displacements(body)
     headings = heading_count([float(r) for r in rotations if r != 0.0])
     moving = np.flatnonzero(moves != 0.0)
@@ -137,35 +136,6 @@ def corner(v: float, u: float, n: int) -> tuple[int, int, float]:
     return j + (n >> 1), i + (n & 1), wj * wi
 
 
-@inlined
-def interpolate(
-    cell: Int32s, code: Codes, zero: float, largest: int, nothing: float, v: float,
-    u: float, h: float,
-) -> float:  # fmt: skip
-    """A table of steps at lattice coordinates: linear in x, y and heading over the corners that are valid.
-
-    cell [ny, nx]: the row of each cell in `code` [cells, H], -1 if none. Codes are zero + STEP_CODES * steps,
-    or INVALID; what is above `largest` counts as that. nothing: the result where no corner is valid.
-    """
-    ny, nx = cell.shape
-    low, high, f = _beside(h, code.shape[1])
-    total, weights = 0.0, 0.0
-    for n in range(4):
-        j, i, across = corner(v, u, n)
-        if j < 0 or j >= ny or i < 0 or i >= nx or across == 0.0 or cell[j, i] < 0:
-            continue
-        row = cell[j, i]
-        w, found = across * (1.0 - f), code[row, low]
-        if w >= 1e-9 and found != INVALID:
-            total += w * (min(int(found), largest) - zero)
-            weights += w
-        w, found = across * f, code[row, high]
-        if w >= 1e-9 and found != INVALID:
-            total += w * (min(int(found), largest) - zero)
-            weights += w
-    return total / (STEP_CODES * weights) if weights > 1e-6 else nothing
-
-
 class Corners(NamedTuple):
     """The crossings about a place that some table knows: rows of the table (4,), bilinear weights (4,)."""
 
@@ -175,7 +145,9 @@ class Corners(NamedTuple):
 
 @inlined
 def find_corners(cell: Int32s, v: float, u: float, corners: Corners) -> int:
-    """Writes the crossings about a place; returns how many there are. cell [ny, nx]: as in `interpolate`."""
+    """Writes the crossings about a place; returns how many there are. cell [ny, nx]: the row of each in the
+    table, -1 for none.
+    """
     ny, nx = cell.shape
     found = 0
     for n in range(4):
@@ -189,8 +161,11 @@ def find_corners(cell: Int32s, v: float, u: float, corners: Corners) -> int:
 
 @inlined
 def read_corners(corners: Corners, count: int, code: Codes, nothing: float, h: float) -> float:
-    """`interpolate` with codes from 1 on, at the first `count` of the corners about a place."""
-    low, high, f = _beside(h, code.shape[1])
+    """A table of steps at the first `count` of the corners about a place: linear in x, y and heading over
+    those that are valid. Codes [cells, H] are 1 + STEP_CODES * steps, or INVALID. nothing: the result where
+    none is valid.
+    """
+    low, high, f = beside(h, code.shape[1])
     total, weights = 0.0, 0.0
     for n in range(count):
         row, across = corners.row[n], corners.weight[n]
@@ -206,7 +181,7 @@ def read_corners(corners: Corners, count: int, code: Codes, nothing: float, h: f
 
 
 @inlined
-def _beside(h: float, headings: int) -> tuple[int, int, float]:
+def beside(h: float, headings: int) -> tuple[int, int, float]:
     """The headings of a lattice on both sides of h, and the share of the way from the one to the other."""
     k = int(np.floor(h))
     low = k if 0 <= k < headings else k % headings  # nearly always the former, and a division takes long
@@ -294,12 +269,20 @@ def _simulate_all(
 
 
 @kernel
-def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
-    """Where each obligation's predicate holds, [K, ny, nx, H]; 0 where the pose is not valid."""
+def values_at(
+    body: Body, lattice: Lattice, regions: PackedRegions, programs: Programs, signals: Floats
+) -> Singles:
+    """Each predicate's robustness over the lattice, [P, ny, nx, H]; -inf where the pose is not valid.
+
+    The programs read x, y, theta, the regions, then `signals` (S,).
+    """
     ny, nx, headings = lattice.valid.shape
-    out = np.zeros((rules.kind.shape[0], ny, nx, headings), np.uint8)
-    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
-    turns_matter = reads_heading(rules)
+    count = programs.starts.shape[0] - 1
+    out = np.full((count, ny, nx, headings), -np.inf, np.float32)
+    values = np.empty(REGIONS + region_count(regions) + signals.shape[0])
+    stack, read = np.empty(STACK_SIZE), np.empty(count)
+    turns_matter = reads_heading(programs, regions)
+    fill_signals(regions, signals, values)
     for j in range(ny):
         for i in range(nx):
             fresh = True
@@ -308,17 +291,25 @@ def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
                     continue
                 if fresh or turns_matter:
                     x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
-                    read_predicates(rules, x, y, theta, values, stack, predicates)
+                    fill_place(regions, x, y, theta, values)
+                    for p in range(count):
+                        read[p] = evaluate_packed(p, programs, values, stack)
                     fresh = False
-                for k in range(predicates.shape[0]):
-                    out[k, j, i, h] = predicates[k] > rules.margin
+                for p in range(count):
+                    out[p, j, i, h] = read[p]
     return out
 
 
+def holds_at(body: Body, rules: Rules, lattice: Lattice) -> Bytes:
+    """Where each obligation's predicate holds, [K, ny, nx, H]; 0 where the pose is not valid."""
+    values = values_at(body, lattice, rules.regions, rules.programs, rules.signals)
+    return (values > rules.margin).astype(np.uint8)
+
+
 @leaf
-def reads_heading(rules: Rules) -> bool:
+def reads_heading(programs: Programs, regions: PackedRegions) -> bool:
     """Whether some predicate may depend on where the robot looks, and not only on where it is."""
-    reads, programs, regions = False, rules.programs, rules.regions
+    reads = False
     for i in range(programs.ops.shape[0]):
         reads = reads or (programs.ops[i] == VALUE and programs.args[i] == HEADING)
     for r in range(regions.plain.shape[0]):

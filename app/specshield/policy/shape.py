@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from specshield.robot.dynamics import Body
 from specshield.task import Task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -39,9 +40,9 @@ def headings_of(task: Task) -> int:
     return heading_count([turn for _, turn in task.robot.motions if turn != 0.0])
 
 
-def side_of(grid: OccupancyGrid, pitch: float) -> tuple[int, int]:
+def side_of(grid: OccupancyGrid | Body, pitch: float) -> tuple[int, int]:
     """Rows and columns of a lattice on a map."""
-    ny, nx = (max(math.ceil(n * grid.resolution / pitch - 1e-9), 1) for n in (grid.height, grid.width))
+    ny, nx = (max(math.ceil(n * grid.resolution / pitch - 1e-9), 1) for n in grid.occupied.shape)
     return ny, nx
 
 

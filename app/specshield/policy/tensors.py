@@ -33,9 +33,11 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
         got = None if isinstance(weights, Path) else f"{len(weights)} bytes"
         reason = "the file cannot be opened" if isinstance(error, OSError) else str(error)
         raise PolicyError(
-            f"the weights cannot be read: {reason}", path="weights", got=got,
+            f"the weights cannot be read: {reason}",
+            path="weights",
+            got=got,
             expected=f"a safetensors file with arrays of {', '.join(KINDS)}",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def named_arrays(
@@ -54,10 +56,11 @@ def named_arrays(
         array = tensors.get(name)
         if array is None or array.dtype != dtype or array.ndim != rank:
             raise PolicyError(
-                f"the array {name!r} is missing or of another kind", path=f"weights.{name}",
+                f"the array {name!r} is missing or of another kind",
+                path=f"weights.{name}",
                 got=None if array is None else f"{array.dtype} {list(array.shape)}",
                 expected=f"{dtype.__name__}, rank {rank}",
-            )  # fmt: skip
+            )
     return [np.require(tensors[name], requirements=["C", "W"]) for name in wanted]
 
 

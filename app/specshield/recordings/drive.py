@@ -52,9 +52,10 @@ def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floa
             if topic not in known:
                 raise InputError(
                     "the bag does not say which poses are meant" if topic is None else "no poses there",
-                    path="--topic", got=topic,
+                    path="--topic",
+                    got=topic,
                     expected=f"one of {', '.join(sorted(known)) or 'none in this bag'}",
-                )  # fmt: skip
+                )
             found = [
                 (at * 1e-9, *_planar(POSES[c.msgtype](reader.deserialize(raw, c.msgtype))))
                 for c, at, raw in reader.messages(connections=[known[topic]])

@@ -61,9 +61,10 @@ def write_mcap(recording: Recording, path: Path) -> None:
             lines = [
                 fox.SceneEntity(timestamp=now, frame_id=FRAME, id=name, lines=[_line(way[:, :2], color)])
                 for name, way, color in (
-                    ("driven", driven, DRIVEN), ("continuation", recording.ahead(item.t), AHEAD)
+                    ("driven", driven, DRIVEN),
+                    ("continuation", recording.ahead(item.t), AHEAD),
                 )
-            ]  # fmt: skip
+            ]
             scenes.log(fox.SceneUpdate(entities=lines), log_time=at)
             if item.decision is not None:
                 decisions.log(json.dumps(item.decision).encode(), log_time=at)
@@ -75,9 +76,13 @@ def _regions(recording: Recording, now: fox.Timestamp) -> list[fox.SceneEntity]:
         lines = outlines(region)
         x, y = lines[0][:-1].mean(axis=0)
         label = fox.TextPrimitive(
-            pose=_pose(x, y, 0.0), billboard=True, font_size=12.0, scale_invariant=True, color=REGION,
+            pose=_pose(x, y, 0.0),
+            billboard=True,
+            font_size=12.0,
+            scale_invariant=True,
+            color=REGION,
             text=name,
-        )  # fmt: skip
+        )
         drawn, id = [_line(line, REGION) for line in lines], f"region/{name}"
         found.append(fox.SceneEntity(timestamp=now, frame_id=FRAME, id=id, texts=[label], lines=drawn))
     return found
@@ -87,10 +92,16 @@ def _grid(grid: OccupancyGrid, now: fox.Timestamp) -> fox.Grid:
     """One byte a cell: 1 is occupied."""
     field = fox.PackedElementField(name="occupied", offset=0, type=fox.PackedElementFieldNumericType.Uint8)
     return fox.Grid(
-        timestamp=now, frame_id=FRAME, pose=_pose(*grid.origin), column_count=grid.width,
-        cell_size=fox.Vector2(x=grid.resolution, y=grid.resolution), row_stride=grid.width, cell_stride=1,
-        fields=[field], data=grid.occupied.astype(np.uint8).tobytes(),
-    )  # fmt: skip
+        timestamp=now,
+        frame_id=FRAME,
+        pose=_pose(*grid.origin),
+        column_count=grid.width,
+        cell_size=fox.Vector2(x=grid.resolution, y=grid.resolution),
+        row_stride=grid.width,
+        cell_stride=1,
+        fields=[field],
+        data=grid.occupied.astype(np.uint8).tobytes(),
+    )
 
 
 def _pose(x: float, y: float, theta: float) -> fox.Pose:
@@ -100,7 +111,10 @@ def _pose(x: float, y: float, theta: float) -> fox.Pose:
 
 def _line(points: Floats, color: fox.Color) -> fox.LinePrimitive:
     return fox.LinePrimitive(
-        type=fox.LinePrimitiveLineType.LineStrip, pose=_pose(0.0, 0.0, 0.0), thickness=2.0,
-        scale_invariant=True, points=[fox.Point3(x=float(x), y=float(y), z=0.0) for x, y in points],
+        type=fox.LinePrimitiveLineType.LineStrip,
+        pose=_pose(0.0, 0.0, 0.0),
+        thickness=2.0,
+        scale_invariant=True,
+        points=[fox.Point3(x=float(x), y=float(y), z=0.0) for x, y in points],
         color=color,
-    )  # fmt: skip
+    )

@@ -75,9 +75,10 @@ def of_record(
 
     if len(chain.configs) > 1:
         raise InputError(
-            "the session had several rules, and one is written to a file", got=len(chain.configs),
+            "the session had several rules, and one is written to a file",
+            got=len(chain.configs),
             expected="a session without a switch",
-        )  # fmt: skip
+        )
     config, names = chain.configs[0], chain.names[0]
     begun = datetime.fromisoformat(config.created_at).timestamp() if config.created_at else 0.0
     items = []
@@ -88,9 +89,16 @@ def of_record(
         pose = (held[0], held[1], held[2])
         items.append(TrajectoryItem(t, pose, dict(zip(names, held[3:], strict=True)), json.loads(told)))
     return Recording(
-        config.id, config.spec.formula, config.actions, {**rooms, **parse_regions(config.spec.regions)},
-        items, grid, robot_from_json(config.robot), begun, step_seconds,
-    )  # fmt: skip
+        config.id,
+        config.spec.formula,
+        config.actions,
+        {**rooms, **parse_regions(config.spec.regions)},
+        items,
+        grid,
+        robot_from_json(config.robot),
+        begun,
+        step_seconds,
+    )
 
 
 def map_of_service(client: ShieldClient, map_id: str) -> tuple[OccupancyGrid, Mapping[str, Region]]:

@@ -64,9 +64,13 @@ def robots(url: str) -> Iterator[Executor]:
 
 
 def run(
-    robots: Executor, case: str, runs: int, seed: int,
-    on_progress: Callable[[int], None] = lambda _: None, named: bool = False,
-) -> Campaign:  # fmt: skip
+    robots: Executor,
+    case: str,
+    runs: int,
+    seed: int,
+    on_progress: Callable[[int], None] = lambda _: None,
+    named: bool = False,
+) -> Campaign:
     """`runs` pairs of episodes of a case, the i-th decided by `seed` and i alone. on_progress: how many are
     done.
 

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from specshield.arrays import Bools, Floats
-from specshield.policy.geodesic import geodesic_distance
+from specshield.policy.geodesic import downhill, falling, geodesic_distance
 from specshield.robot.dynamics import displacements, step, successors
 from specshield.sim.cases import Case
 from specshield.sim.senses import RAYS, Senses, scan, see
@@ -97,21 +97,5 @@ def waypoints(case: Case) -> Floats:
     goal = np.zeros_like(free)
     goal[case.cell(case.target)] = True
     onward = geodesic_distance(comfortable | goal, goal, grid.resolution)  # it may stand beside a wall
-    reached = np.isfinite(onward)
-    off_the_wall = geodesic_distance(free, reached, grid.resolution)
-    to_go = np.where(reached, onward, onward[reached].max() + grid.resolution + off_the_wall)
-
-    h, w = free.shape
-    padded = np.pad(to_go, 1, constant_values=np.inf)
-    rows, columns = np.indices((h, w))
-    best, following = np.zeros((h, w)), rows * w + columns
-    for i, j in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
-        with np.errstate(invalid="ignore"):
-            steepness = (to_go - padded[1 + i : 1 + i + h, 1 + j : 1 + j + w]) / math.hypot(i, j)
-        better = steepness > best
-        best[better] = steepness[better]
-        following[better] = ((rows + i) * w + columns + j)[better]
-    cell = np.arange(h * w)
-    for _ in range(LOOK_AHEAD):
-        cell = following.ravel()[cell]
-    return grid.centres.reshape(-1, 2)[cell].reshape(h, w, 2)
+    cell = downhill(falling(free, onward, grid.resolution), LOOK_AHEAD)
+    return grid.centres.reshape(-1, 2)[cell].reshape(*free.shape, 2)

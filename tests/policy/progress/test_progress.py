@@ -45,15 +45,11 @@ def status_of(rules, xs, signals=()):
     poses = np.zeros((len(xs), 3))
     poses[:, 0] = xs
     rows = np.reshape(signals, (len(xs), -1)).astype(float)
-    k = len(rules.kind)
-    status, run = np.full(k, 9, np.int8), np.full(k, 9)
-    replay(rules, rules.margin, poses, rows, status, run)
-    return status
+    return replay(rules, rules.margin, poses, rows)[0]
 
 
 def recalled(rules, past, xs):
-    status, run = np.full(len(rules.kind), 9, np.int8), np.full(len(rules.kind), 9)
-    recall(rules, past, *trace(xs), status, run)
+    status, run = recall(rules, past, *trace(xs))
     return status.tolist(), run.tolist()
 
 

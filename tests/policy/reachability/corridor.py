@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from specshield.policy.progress import make_rules
-from specshield.policy.reachability.guide import Guide
 from specshield.policy.reachability.policy import Settings, synthesise
+from specshield.policy.reachability.tables import Guide
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import make_body
 from specshield.task import make_task

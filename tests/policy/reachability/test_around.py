@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from specshield.policy.heap import Heap
 from specshield.policy.progress import PENDING, SETTLED, make_rules
 from specshield.policy.reachability.around.field import distances, goal_cells, spare_on
-from specshield.policy.reachability.around.search import Tree, _slot_of
+from specshield.policy.reachability.around.search import _slot_of
 from specshield.policy.reachability.policy import synthesise
+from specshield.policy.reachability.tables import Guide
+from specshield.policy.tree import make_tree
 from specshield.robot import STRETCH
-from specshield.robot.barred import in_vain
+from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import make_body, simulate
 from specshield.stl import robustness
 from specshield.task import make_task
@@ -19,40 +20,28 @@ from specshield.world.occupancy import OccupancyGrid
 from tests.policy.rooms import OCCUPIED, flat
 
 
-def empty(rows):
-    ints = (np.zeros(rows, np.int32) for _ in range(3))
-    heap = Heap(np.empty(rows, np.int32), np.empty(rows))
-    return Tree(
-        np.zeros((rows, 3)),
-        np.zeros((rows, 1), np.int8),
-        np.zeros((rows, 1), np.int64),
-        *ints,
-        np.zeros(rows),
-        heap,
-    )
-
-
 def test_poses_that_are_turned_away_take_no_room_and_hide_nothing():
     random, rows = np.random.default_rng(0), 512
-    tree, seen, count = empty(rows + 1), np.full(4 * rows, -1, np.int32), 0
+    tree, count = make_tree(rows + 1, 1), 0
+    tree.status[:], tree.made[:] = PENDING, 0
     kept = []
     for _ in range(20 * rows):  # ten times what the table holds
         pose = random.uniform(0.0, 20.0, 3)
         tree.pose[count] = pose
-        slot = _slot_of(tree, count, seen)
+        slot = _slot_of(tree, count)
         if slot < 0:
             continue
-        assert seen[slot] == count
+        assert tree.table[slot] == count
         if random.random() < 0.9 or count == rows:
-            seen[slot] = -1
+            tree.table[slot] = -1
         else:
             kept.append(pose)
             count += 1
     assert count > rows / 2
-    assert (seen >= 0).sum() == count
+    assert (tree.table >= 0).sum() == count
     for pose in kept:  # none of those that were kept is new
         tree.pose[count] = pose
-        assert _slot_of(tree, count, seen) < 0
+        assert _slot_of(tree, count) < 0
 
 
 def test_where_a_search_on_one_of_several_maps_gives_up_nothing_else_is_tried():
@@ -122,11 +111,12 @@ def test_distances_lead_through_the_door_that_is_open():
     assert goals[0].sum() == 20  # cells of 20 cm whose centres lie in East
     assert not goals[1].any()  # of an `always`
     fields = distances(body, goals)
+    guide = Guide(body, rules, synthesise(task).tables, task.robot.wait_motion, NOTHING_BARRED)
     # From (0.7, 1.5) over the upper door, about (2.05, 2.75), to East's corner (3.1, 1.9).
     over = np.hypot(2.05 - 0.7, 2.75 - 1.5) + np.hypot(3.1 - 2.05, 2.75 - 1.9)
     status = np.array([PENDING, PENDING], np.int8)
-    spare = spare_on(body, rules, fields, 0.2, 0.7, 1.5, 0.0, 10, status)
+    spare = spare_on(guide, fields, 0.2, 0.7, 1.5, 0.0, 10, status)
     assert spare == pytest.approx(60 - 10 - over / 0.2, abs=2.0)
-    assert spare_on(body, rules, fields, 0.2, 3.5, 1.5, 0.0, 10, status) == 50.0
+    assert spare_on(guide, fields, 0.2, 3.5, 1.5, 0.0, 10, status) == 50.0
     status[0] = SETTLED
-    assert spare_on(body, rules, fields, 0.2, 0.7, 1.5, 0.0, 10, status) == np.inf
+    assert spare_on(guide, fields, 0.2, 0.7, 1.5, 0.0, 10, status) == np.inf

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from specshield.policy.lattice import STEP_CODES, Corners
+from specshield.policy.lattice import STEP_CODES
 from specshield.policy.progress import BROKEN, PENDING, SETTLED
 from specshield.policy.reachability.beam import beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
@@ -28,8 +28,7 @@ def begun(guide, first, motion, t=0):
     """Room for a way from step t, its first motion made, with the progress that belongs to it."""
     steps = len(guide.tables.phase) - 1 - t
     motions, poses = np.full(steps, -1), np.zeros((steps, 3))
-    scratch = make_scratch(guide.rules, motion_count(guide.body))
-    scratch.status[:], scratch.run[:] = PENDING, 0
+    scratch = scratch_of(guide, PENDING, 0)
     motions[0], poses[0] = motion, first
     update_progress(guide.rules, t + 1, *poses[0], scratch)
     return motions, poses, scratch
@@ -40,13 +39,14 @@ def every(motions):
     return np.ones(motions, np.bool_), -np.inf
 
 
-def corners():
-    return Corners(np.empty(4, np.int64), np.empty(4))
+def scratch_of(guide, status, run):
+    scratch = make_scratch(guide.rules, motion_count(guide.body))
+    scratch.status[:], scratch.run[:] = status, run
+    return scratch
 
 
 def slack_at(guide, where, t, status=PENDING, run=0):
-    status, run = np.array([status], np.int8), np.array([run])
-    return slack(guide.body, guide.rules, guide.tables, *where, t, status, run, corners())
+    return slack(guide, *where, t, scratch_of(guide, status, run))
 
 
 def test_the_codes_of_the_tables(visit):
@@ -69,19 +69,16 @@ def test_the_slack_of_a_pose(visit):
 def test_a_dwell_under_way_leaves_what_comes_after_it():
     """Two of three steps in A are over at step 3; then there are four cells to B by step 12."""
     guide = guide_of(make_corridor("F[0,4] G[0,2] A and F[0,12] B", A=1, B=5))
-    status, run = np.array([PENDING, PENDING], np.int8), np.array([2, 0])
-    here = slack(guide.body, guide.rules, guide.tables, *pose(1), 3, status, run, corners())
+    here = slack(guide, *pose(1), 3, scratch_of(guide, PENDING, [2, 0]))
     assert here == 12 - 4 - 3  # it is over at step 4, and the cell before B will do
 
 
 def test_the_score_of_each_motion(visit):
-    scores = np.empty(4)
-    status, run = np.array([PENDING], np.int8), np.array([0])
-    scratch = corners(), corners()
-    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, -1, scores, *scratch)
-    assert scores.tolist() == pytest.approx([9.0, 7.0, 7.0, 8.0])
-    score(visit.body, visit.rules, visit.tables, *pose(2), 0, status, run, WAIT, LEFT, scores, *scratch)
-    assert scores[RIGHT] == HOPELESS
+    scratch = scratch_of(visit, PENDING, 0)
+    score(visit, *pose(2), 0, -1, scratch)
+    assert scratch.scores.tolist() == pytest.approx([9.0, 7.0, 7.0, 8.0])
+    score(visit, *pose(2), 0, LEFT, scratch)
+    assert scratch.scores[RIGHT] == HOPELESS
 
 
 def test_a_climb_turns_goes_and_stays(visit):

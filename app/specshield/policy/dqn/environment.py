@@ -99,9 +99,11 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> F
         if len(kept) >= n:
             return kept[:n]
     raise MapError(
-        "the map has next to no free space for this robot", path="map",
-        got=f"a radius of {task.robot.radius:g} m", expected="a larger map or a smaller footprint",
-    )  # fmt: skip
+        "the map has next to no free space for this robot",
+        path="map",
+        got=f"a radius of {task.robot.radius:g} m",
+        expected="a larger map or a smaller footprint",
+    )
 
 
 @kernel
@@ -149,9 +151,16 @@ def _step_all(
     scratch = make_state(scene, robots.observation.shape[1])
     for i in range(t.shape[0]):
         state = State(
-            robots.pose[i], robots.status[i], robots.run[i], scratch.predicates, robots.nexts[i],
-            robots.observation[i], scratch.values, scratch.stack, scratch.after,
-        )  # fmt: skip
+            robots.pose[i],
+            robots.status[i],
+            robots.run[i],
+            scratch.predicates,
+            robots.nexts[i],
+            robots.observation[i],
+            scratch.values,
+            scratch.stack,
+            scratch.after,
+        )
         over = t[i] >= scene.horizon
         if not over:
             t[i] += 1

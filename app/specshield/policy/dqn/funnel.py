@@ -76,9 +76,9 @@ def make_funnels(scene: Scene, lowest: Floats, highest: Floats, literal: bool) -
             top, span = CAP, reach + CAP
         gamma_0[k], rho_max[k] = span, top
         gamma_inf[k] = REST * min(span, top)
-        hold = rules.kind[k] == EVENTUALLY_ALWAYS
-        opens = rules.a[k] + (rules.c2[k] if hold else 0)
-        width = 0 if rules.kind[k] == ALWAYS else (rules.c1[k] if hold else rules.b[k]) - rules.a[k]
+        opens = rules.a[k] + rules.c2[k]
+        end = rules.c1[k] if rules.kind[k] == EVENTUALLY_ALWAYS else rules.b[k]
+        width = 0 if rules.kind[k] == ALWAYS else end - rules.a[k]
         clock[k] = 0 if literal else opens
         t_star = float(opens - clock[k]) + 0.5 * float(width)
         rate[k] = decay_rate(gamma_0[k], gamma_inf[k], rho_max[k], t_star)

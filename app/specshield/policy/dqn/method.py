@@ -18,9 +18,10 @@ class Settings:
     """What a caller may choose."""
 
     reward: str = option(
-        "progress", "The funnels' reward: as the paper has it, or for progress towards what is next.",
+        "progress",
+        "The funnels' reward: as the paper has it, or for progress towards what is next.",
         choices=("progress", "paper"),
-    )  # fmt: skip
+    )
     units: int = option(64, "Width of the network's two hidden layers.", low=4, high=128)
     updates: int = option(16_000, "Steps of learning.", low=1, high=1_000_000)
     robots: int = option(512, "Robots that are simulated side by side.", low=1, high=4096)
@@ -50,9 +51,11 @@ def _check(task: Task, options: Settings) -> None:
     make_rules(task)
     if task.horizon < 1:
         raise PolicyError(
-            "there is nothing to learn: the rule looks at the first state alone", path="spec.formula",
-            got=str(task.formula), expected="a horizon of at least 1; or method 'reachability'",
-        )  # fmt: skip
+            "there is nothing to learn: the rule looks at the first state alone",
+            path="spec.formula",
+            got=str(task.formula),
+            expected="a horizon of at least 1; or method 'reachability'",
+        )
 
 
 def _make(task: Task, options: Settings, run: Run) -> Made:

@@ -42,9 +42,11 @@ def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, output
     """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
     if sorted(weights) != sorted(NAMES):
         raise PolicyError(
-            "these are not the tensors of a Q-network", path="weights", got=sorted(weights),
+            "these are not the tensors of a Q-network",
+            path="weights",
+            got=sorted(weights),
             expected=str(sorted(NAMES)),
-        )  # fmt: skip
+        )
     before = inputs
     for layer in (1, 2, 3):
         after = outputs if layer == 3 else np.atleast_1d(weights[f"w{layer}"]).shape[-1]
@@ -53,10 +55,11 @@ def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, output
             usable = array.dtype == np.float32 and bool(np.isfinite(array).all())
             if not usable or array.shape != shape or after > MAX_UNITS:
                 raise PolicyError(
-                    "a tensor does not fit the task", path=f"weights.{name}",
+                    "a tensor does not fit the task",
+                    path=f"weights.{name}",
                     got=f"{array.dtype} {list(array.shape)}",
                     expected=f"finite float32 {list(shape)}, at most {MAX_UNITS} units",
-                )  # fmt: skip
+                )
         before = after
     return Network(*(np.ascontiguousarray(weights[name]) for name in NAMES))
 

@@ -62,10 +62,16 @@ def make_state(scene: Scene, inputs: int) -> State:
     """A state without content. inputs: the observation's size."""
     count = scene.rules.kind.shape[0]
     return State(
-        np.empty(3), np.empty(count, np.int8), np.empty(count, np.int64), np.empty(count),
-        np.empty((motion_count(scene.body), 3)), np.empty(inputs, np.float32),
-        np.empty(value_count(scene.rules)), np.empty(STACK), np.empty(count),
-    )  # fmt: skip
+        np.empty(3),
+        np.empty(count, np.int8),
+        np.empty(count, np.int64),
+        np.empty(count),
+        np.empty((motion_count(scene.body), 3)),
+        np.empty(inputs, np.float32),
+        np.empty(value_count(scene.rules)),
+        np.empty(STACK),
+        np.empty(count),
+    )
 
 
 @inlined
@@ -131,10 +137,9 @@ def observe(scene: Scene, t: int, state: State) -> None:
         gx = blend(field, *west) - blend(field, *east)
         gy = blend(field, *south) - blend(field, *north)
         norm = max(math.hypot(gx, gy), 1e-6)
-        opens = rules.a[k] + (rules.c2[k] if hold else 0)
         left = rules.last[k] - t
         out[at] = 1.0 if state.status[k] == SETTLED else 0.0
-        out[at + 1] = _clip((opens - t) / TIME_UNIT, 0.0, 2.0)
+        out[at + 1] = _clip((rules.a[k] + rules.c2[k] - t) / TIME_UNIT, 0.0, 2.0)
         out[at + 2] = _clip(left / TIME_UNIT, -0.2, 2.0)
         out[at + 3] = _clip(state.predicates[k], -1.0, 1.0)
         out[at + 4] = min(d / DISTANCE_UNIT, 2.0)

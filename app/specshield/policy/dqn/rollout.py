@@ -6,7 +6,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
-from specshield.policy.detour import copy_way, find_sibling, find_twins, join
+from specshield.policy.detour import copy_ways, find_sibling, find_twins, join
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
 from specshield.policy.dqn.observation import State, arrive, make_state, observe, outcome, place
 from specshield.policy.dqn.scene import Scene
@@ -116,9 +116,8 @@ def propose_all(
     history (t + 1, 3), signals (t + 1, S): scene.rules.signals is overwritten with the last row. past: the
     margin by which the history is judged. undoing (M, 2): the motions that undo each, -1 for none.
     """
-    t, count = history.shape[0] - 1, scene.rules.kind.shape[0]
-    status, run = np.empty(count, np.int8), np.empty(count, np.int64)
-    recall(scene.rules, past, history, signals, status, run)
+    t = history.shape[0] - 1
+    status, run = recall(scene.rules, past, history, signals)
     state, layers = make_state(scene, net.w1.shape[0]), make_layers(net)
     poses = np.empty((*motions.shape, 3))
     _begin(scene.rules, history[t], status, run, state)
@@ -157,9 +156,7 @@ def propose_all(
                 ways += 1
         if reached == SETTLED and base < 0:
             base = m
-    for m in range(motions.shape[0]):
-        if twin[m] != m:
-            copy_way(motions, poses, twin[m], m)
+    copy_ways(motions, poses, twin)
     return int(preferred)
 
 

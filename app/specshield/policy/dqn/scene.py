@@ -14,7 +14,16 @@ from scipy import ndimage
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
 from specshield.policy.geodesic import geodesic_distance
-from specshield.policy.progress import ALWAYS, PENDING, STACK, Rules, make_rules, read_predicates, value_count
+from specshield.policy.progress import (
+    ALWAYS,
+    PENDING,
+    STACK,
+    Rules,
+    goals_of,
+    make_rules,
+    read_predicates,
+    value_count,
+)
 from specshield.robot.dynamics import Body, longest_motions, make_body
 from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import VALUE
@@ -48,7 +57,7 @@ def make_scene(task: Task) -> Scene:
     poses = np.insert(grid.centres.reshape(-1, 2), 2, 0.0, axis=1)
     holds = predicates_at(rules, poses).reshape(grid.height, grid.width, -1) > rules.margin
     free = grid.clearance >= task.robot.radius - 0.5 * grid.resolution
-    goals = np.flatnonzero(rules.kind != ALWAYS)
+    goals = goals_of(rules)
     index = np.full(len(rules.kind), -1, dtype=np.int64)
     index[goals] = np.arange(len(goals))
     distance = np.zeros((len(goals), grid.height, grid.width))

@@ -244,10 +244,14 @@ class Run:
         parts |= {f"adam{i}": state for i, state in self.optimizer.state_dict()["state"].items()}
         tensors = {f"{part} {name}": tensor for part in parts for name, tensor in parts[part].items()}
         meta = {
-            "task": self.task.content_hash, "settings": options_to_json(self.settings), "update": self.update,
-            "elapsed": time.monotonic() - self.began, "latest": self.latest, "best_rate": self.best_rate,
+            "task": self.task.content_hash,
+            "settings": options_to_json(self.settings),
+            "update": self.update,
+            "elapsed": time.monotonic() - self.began,
+            "latest": self.latest,
+            "best_rate": self.best_rate,
             "random": self.random.bit_generator.state,
-        }  # fmt: skip
+        }
         save_file(tensors, folder / "state.tmp", metadata={"meta": json.dumps(meta)})
         os.replace(folder / "state.tmp", folder / "state.safetensors")
 

@@ -95,9 +95,17 @@ def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: i
 
 @leaf
 def descend_by_beam(
-    world: World, way: Way, k: int, f: int, n: int, stop: int, enough: float, shortest: int, longest: int,
+    world: World,
+    way: Way,
+    k: int,
+    f: int,
+    n: int,
+    stop: int,
+    enough: float,
+    shortest: int,
+    longest: int,
     need: Ints,
-) -> int:  # fmt: skip
+) -> int:
     """Goes on from motions[:n] by a beam down field f, to fewer steps to go than `enough` or to where literal
     k holds, after `shortest` to `longest` steps. The other arguments and the result are those of `descend`.
     """
@@ -144,9 +152,16 @@ def descend_by_beam(
 
 @leaf
 def _insert(
-    places: Floats, trail: Ints, kept: int, x: float, y: float, theta: float, ahead: float, parent: int,
+    places: Floats,
+    trail: Ints,
+    kept: int,
+    x: float,
+    y: float,
+    theta: float,
+    ahead: float,
+    parent: int,
     motion: int,
-) -> int:  # fmt: skip
+) -> int:
     """Puts a pose among the `kept` ones of a beam's step, those with the fewest steps to go first, unless it
     is among them; returns how many there are then. places [width, 4], trail [width, 2].
     """

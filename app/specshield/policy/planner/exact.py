@@ -9,18 +9,16 @@ count once, the one that is reached in the fewest steps.
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
-
 import numpy as np
 
-from specshield.arrays import Floats, Int32s, Ints
+from specshield.arrays import Ints
 from specshield.compiled import kernel, leaf
-from specshield.policy.heap import Heap, pop, push
+from specshield.policy.heap import pop, push
 from specshield.policy.planner.due_dates import NO_DATE, read_pose
 from specshield.policy.planner.fields import to_go_at
 from specshield.policy.planner.search import Nodes, guard, search
 from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, read_at
+from specshield.policy.tree import Tree, is_new, make_tree, put, trace
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.
@@ -34,33 +32,13 @@ DEEPER = 1e-3  # [steps] by which a pose farther on its way goes before one that
 LEGS = 8  # literals that one way may go to like this, one after the other
 
 
-class Tree(NamedTuple):
-    """Poses [N, 3], the motions made up to each [N], its parent and the motion that led to it [N]. heap: of
-    those to go on from; table: where poses are looked up.
-    """
-
-    pose: Floats
-    made: Int32s
-    parent: Int32s
-    motion: Int32s
-    heap: Heap
-    table: Int32s
-
-
 @kernel
 def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: int) -> bool:
     """As `search` from x_t, which has to have failed just before; goes on by it after each leg.
 
     most: the poses that the searches for all legs may make.
     """
-    slots = 4
-    while slots < 2 * most:
-        slots *= 2
-    tree = Tree(
-        np.empty((most, 3)), np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, np.int32),
-        Heap(np.empty(most, np.int32), np.empty(most)), np.empty(slots, np.int32),
-    )  # fmt: skip
-    n, left = 0, most
+    tree, n, left = make_tree(most, 0), 0, most
     for _ in range(LEGS):
         due, before = nodes.need[0, :, DUE].copy(), n
         for k in np.argsort(due):
@@ -98,16 +76,14 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
 @leaf
 def _reach(
     world: World, way: Way, k: int, f: int, n: int, stop: int, need: Ints, tree: Tree, most: int, grain: float
-) -> tuple[int, int]:  # fmt: skip
+) -> tuple[int, int]:
     """Goes on from motions[:n] to where literal k holds, by motions[:stop] and by field f, and keeps what has
     to hold on the way. grain [m]: poses that differ by less count once, but not near the literal. How many
     motions there are then, -1 where it is not found; how many poses were made.
     """
     body = world.body
     tree.table[:] = -1
-    for c in range(3):
-        tree.pose[0, c] = way.poses[n, c]
-    tree.made[0], tree.parent[0], tree.motion[0] = 0, -1, -1
+    put(tree, 0, way.poses[n, 0], way.poses[n, 1], way.poses[n, 2], 0, -1, -1)
     count, size = 1, push(tree.heap, 0, 0, 0.0)
     while size > 0 and count + motion_count(body) <= most:
         here = tree.heap.row[0]
@@ -124,51 +100,18 @@ def _reach(
             ahead = to_go_at(body, world.fields, f, x, y, theta)
             if n + made + ahead > stop + ASTRAY:
                 continue
-            tree.pose[count, 0], tree.pose[count, 1], tree.pose[count, 2] = x, y, theta
-            tree.made[count], tree.parent[count], tree.motion[count] = made, here, m
-            if not _is_new(tree, count, FINE if ahead < NEAR else grain):
+            put(tree, count, x, y, theta, made, here, m)
+            if not is_new(tree, count, FINE if ahead < NEAR else grain, True):
                 continue
             read_pose(world.literals, x, y, theta, way.values, way.stack, way.rho)
             if not keeps(world, k, way.t + n + made, need, way.rho):
                 continue
             if holds(world, k, way.rho):
-                _write(world, way, n, tree, count)
+                trace(tree, count, way.motions[n:])
+                read_at(world, way, n)
+                for i in range(n, n + made):
+                    move(world, way, i, way.motions[i])
                 return n + made, count
             size = push(tree.heap, size, count, made + OPTIMISM * ahead - DEEPER * made)
             count += 1
     return -1, count
-
-
-@leaf
-def _write(world: World, way: Way, n: int, tree: Tree, row: int) -> None:
-    """Writes the way to a row on from motions[:n]."""
-    stop = n + tree.made[row]
-    while tree.parent[row] >= 0:
-        way.motions[n + tree.made[row] - 1] = tree.motion[row]
-        row = tree.parent[row]
-    read_at(world, way, n)
-    for i in range(n, stop):
-        move(world, way, i, way.motions[i])
-
-
-@leaf
-def _is_new(tree: Tree, row: int, grain: float) -> bool:
-    """Whether nothing nearly the same as a row was reached in as few steps; the row is then remembered."""
-    x, y, h = _rounded(tree.pose, row, grain)
-    key = x * 73856093 ^ y * 19349663 ^ h * 83492791
-    slot = (key ^ key >> 15) & (tree.table.shape[0] - 1)
-    while tree.table[slot] >= 0:
-        other = tree.table[slot]
-        if _rounded(tree.pose, other, grain) == (x, y, h):
-            if tree.made[other] <= tree.made[row]:
-                return False
-            break
-        slot = (slot + 1) & (tree.table.shape[0] - 1)
-    tree.table[slot] = row
-    return True
-
-
-@leaf
-def _rounded(pose: Floats, row: int, grain: float) -> tuple[int, int, int]:
-    x, y, h = pose[row, 0] / grain, pose[row, 1] / grain, math.degrees(pose[row, 2])
-    return math.floor(x), math.floor(y), math.floor(h + 0.5)

@@ -9,25 +9,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Bools, Codes, Floats, Int32s, Singles
-from specshield.compiled import kernel, leaf
+from specshield.arrays import Bools, Codes, Floats, Int32s
+from specshield.compiled import leaf
 from specshield.policy.lattice import (
     INVALID,
     NO_TIME,
     STEP_CODES,
     Lattice,
+    beside,
     coordinates,
     coordinates_ahead,
+    corner,
     heading_after,
-    interpolate,
     leads_back,
-    pose_of,
 )
 from specshield.policy.reachability.latest import sweep
 from specshield.robot.dynamics import Body, displacement
-from specshield.rule.values import REGIONS, fill_place, fill_pose, fill_signals, region_count
-from specshield.stl.program import STACK_SIZE, Programs, evaluate_packed
-from specshield.world.regions import PackedRegions
 
 OUT_OF_REACH = 1000.0  # [steps] what is farther counts as out of reach
 MOST = int(STEP_CODES * OUT_OF_REACH)  # the code of OUT_OF_REACH
@@ -46,37 +43,6 @@ class Fields(NamedTuple):
     pitch: float
 
 
-@kernel
-def values_at(
-    body: Body, lattice: Lattice, areas: PackedRegions, programs: Programs, signals: Floats
-) -> Singles:
-    """Each predicate's robustness over the lattice, [P, ny, nx, H]; -inf where the pose is not valid.
-
-    The programs read x, y, theta, the regions, then `signals` (S,).
-    """
-    ny, nx, headings = lattice.valid.shape
-    count = programs.starts.shape[0] - 1
-    out = np.full((count, ny, nx, headings), -np.inf, np.float32)
-    values = np.empty(REGIONS + region_count(areas) + signals.shape[0])
-    turns_matter = np.any(areas.carried[:, :2] != 0.0)
-    stack = np.empty(STACK_SIZE)
-    fill_signals(areas, signals, values)
-    for j in range(ny):
-        for i in range(nx):
-            fresh = True
-            for h in range(headings):
-                if not lattice.valid[j, i, h]:
-                    continue
-                x, y, theta = pose_of(body, lattice.pitch, headings, j, i, h)
-                if fresh or turns_matter:  # most areas do not turn with the robot
-                    fill_place(areas, x, y, theta, values)
-                    fresh = False
-                fill_pose(x, y, theta, values)
-                for p in range(count):
-                    out[p, j, i, h] = evaluate_packed(p, programs, values, stack)
-    return out
-
-
 def steps_to(lattice: Lattice, goal: Bools, keeps: Bools) -> Codes:
     """The field of one goal as codes [ny, nx, H], over the free poses that `keeps` allows."""
     valid = np.ascontiguousarray(lattice.valid & keeps)
@@ -89,8 +55,26 @@ def steps_to(lattice: Lattice, goal: Bools, keeps: Bools) -> Codes:
 
 @leaf
 def to_go(fields: Fields, f: int, v: float, u: float, h: float) -> float:
-    """Steps to go at lattice coordinates; inf where no corner is valid."""
-    return interpolate(fields.cell, fields.code[f], 0.0, MOST, np.inf, v, u, h)
+    """Steps to go at lattice coordinates: linear in x, y and heading over the corners that are valid; inf
+    where none is.
+    """
+    (ny, nx), code = fields.cell.shape, fields.code[f]
+    low, high, share = beside(h, code.shape[1])
+    total, weights = 0.0, 0.0
+    for n in range(4):
+        j, i, across = corner(v, u, n)
+        if j < 0 or j >= ny or i < 0 or i >= nx or across == 0.0 or fields.cell[j, i] < 0:
+            continue
+        row = fields.cell[j, i]
+        w, found = across * (1.0 - share), code[row, low]
+        if w >= 1e-9 and found != INVALID:
+            total += w * min(int(found), MOST)
+            weights += w
+        w, found = across * share, code[row, high]
+        if w >= 1e-9 and found != INVALID:
+            total += w * min(int(found), MOST)
+            weights += w
+    return total / (STEP_CODES * weights) if weights > 1e-6 else np.inf
 
 
 @leaf

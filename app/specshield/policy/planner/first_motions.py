@@ -31,19 +31,30 @@ def make_way(world: World, t: int, steps: int, signals: Floats) -> Way:
     stack, held = np.empty(STACK_SIZE), np.empty(literals.leaf.shape[0])
     read_signals(literals, values, stack, held)
     return Way(
-        t, np.empty(steps, np.int64), np.empty((steps + 1, 3)), np.empty(size),
-        np.empty(literals.predicate.shape[0]), held, make_bounds(size), np.empty(size), values, stack,
-        np.empty(motion_count(world.body)), np.empty((BEAM_LENGTH + 1, BEAM_WIDTH, 4)),
-        np.empty((BEAM_LENGTH + 1, BEAM_WIDTH, 2), np.int64), np.zeros(1),
-    )  # fmt: skip
+        t,
+        np.empty(steps, np.int64),
+        np.empty((steps + 1, 3)),
+        np.empty(size),
+        np.empty(literals.predicate.shape[0]),
+        held,
+        make_bounds(size),
+        np.empty(size),
+        values,
+        stack,
+        np.empty(motion_count(world.body)),
+        np.empty((BEAM_LENGTH + 1, BEAM_WIDTH, 4)),
+        np.empty((BEAM_LENGTH + 1, BEAM_WIDTH, 2), np.int64),
+        np.zeros(1),
+    )
 
 
 @kernel
 def make_nodes(literals: int, motions: int) -> Nodes:
     return Nodes(
-        np.empty((MAX_DEPTH, 5), np.int64), np.empty((MAX_DEPTH, literals, 4), np.int64),
+        np.empty((MAX_DEPTH, 5), np.int64),
+        np.empty((MAX_DEPTH, literals, 4), np.int64),
         np.empty((MAX_DEPTH, 6 * literals + motions, 5), np.int64),
-    )  # fmt: skip
+    )
 
 
 @leaf
@@ -63,9 +74,15 @@ def _rejoin(world: World, way: Way, base: Ints) -> bool:
 
 @kernel
 def plan_all(
-    world: World, t: int, pose: Floats, signals: Floats, prefix: Floats, effort: float, most: int,
+    world: World,
+    t: int,
+    pose: Floats,
+    signals: Floats,
+    prefix: Floats,
+    effort: float,
+    most: int,
     motions: Ints,
-) -> tuple[int, bool]:  # fmt: skip
+) -> tuple[int, bool]:
     """A way after each first motion, into motions (M, T - t); returns the motion that the plan from x_t
     takes, and whether there is a plan.
 

@@ -32,10 +32,10 @@ from specshield.arrays import Bools, Codes, Floats, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch
-from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of
+from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of, values_at
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
-from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to, values_at
+from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to
 from specshield.policy.planner.first_motions import plan_all
 from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
 from specshield.policy.planner.method import Settings
@@ -258,16 +258,21 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
     pitch = settings.pitch if usual else _pitch(task, settings)
     ny, nx = side_of(task.grid, pitch)
     fits = (
-        cell.shape == (ny, nx) and 4 <= code.shape[2] <= MAX_HEADINGS and chosen.shape == (len(literals), 2)
-        and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < code.shape[1]
-        and chosen.min(initial=-1) >= -1 and chosen.max(initial=-1) < code.shape[0]
-    )  # fmt: skip
+        cell.shape == (ny, nx)
+        and 4 <= code.shape[2] <= MAX_HEADINGS
+        and chosen.shape == (len(literals), 2)
+        and cell.min(initial=-1) >= -1
+        and cell.max(initial=-1) < code.shape[1]
+        and chosen.min(initial=-1) >= -1
+        and chosen.max(initial=-1) < code.shape[0]
+    )
     if not fits:
         raise PolicyError(
-            "the fields do not fit the task", path="weights",
+            "the fields do not fit the task",
+            path="weights",
             got=[list(cell.shape), list(code.shape), list(chosen.shape)],
             expected=f"cell {[ny, nx]}, code [fields, cells, headings], chosen [{len(literals)}, 2]",
-        )  # fmt: skip
+        )
     return PlannerPolicy(task, card, settings, Fields(cell, code, pitch), chosen)
 
 
@@ -284,10 +289,11 @@ def _pitch(task: Task, settings: Settings) -> float:
     if pitch > COARSEST * settings.pitch:
         ny, nx, headings = lattice_shape(task, settings.pitch)
         raise PolicyError(
-            "the fields are too large", path="options.pitch",
+            "the fields are too large",
+            path="options.pitch",
             got=f"{fields} fields of {ny} x {nx} x {headings} poses",
             expected=f"options.pitch {pitch / COARSEST:.2f} or more, or fewer predicates",
-        )  # fmt: skip
+        )
     return pitch
 
 

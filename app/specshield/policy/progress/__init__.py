@@ -53,6 +53,11 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
     return Rules(kind, a, b, c1, c2, last, programs, regions_of(task), initial_signals(task), margin)
 
 
+def goals_of(rules: Rules) -> Ints:
+    """The obligations that are not an `always`, in their order."""
+    return np.flatnonzero(rules.kind != ALWAYS)
+
+
 @leaf
 def value_count(rules: Rules) -> int:
     return int(REGIONS + rules.regions.starts.shape[0] - 1 + rules.signals.shape[0])
@@ -100,15 +105,15 @@ def advance(rules: Rules, t: int, predicates: Floats, status: Int8s, run: Ints) 
 
 
 @kernel
-def replay(rules: Rules, past: float, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
-    """The progress after the states x_0..x_t, by the margin `past`. poses (t + 1, 3), signals (t + 1, S).
+def replay(rules: Rules, past: float, poses: Floats, signals: Floats) -> tuple[Int8s, Ints]:
+    """The progress, status and run (K,), after the states x_0..x_t, by the margin `past`. poses (t + 1, 3),
+    signals (t + 1, S).
 
-    Overwritten: status, run (K,), and rules.signals, which is left at the last row: the values that are held.
+    Overwritten: rules.signals, which is left at the last row: the values that are held.
     """
-    values, stack = np.empty(value_count(rules)), np.empty(STACK)
-    predicates = np.empty(rules.kind.shape[0])
-    status[:] = PENDING
-    run[:] = 0
+    count = rules.kind.shape[0]
+    status, run = np.full(count, PENDING, np.int8), np.zeros(count, np.int64)
+    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(count)
     for t in range(poses.shape[0]):
         copy_row(signals[t], rules.signals)
         read_predicates(rules, poses[t, 0], poses[t, 1], poses[t, 2], values, stack, predicates)
@@ -116,3 +121,4 @@ def replay(rules: Rules, past: float, poses: Floats, signals: Floats, status: In
             for k in range(predicates.shape[0]):
                 predicates[k] = np.inf if predicates[k] > past else -np.inf
         advance(rules, t, predicates, status, run)
+    return status, run

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-import numpy as np
-
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.progress import ALWAYS, BROKEN, PENDING, SETTLED, Rules, replay
@@ -16,20 +14,27 @@ from specshield.stl import Formula
 
 
 @kernel
-def recall(rules: Rules, past: float, poses: Floats, signals: Floats, status: Int8s, run: Ints) -> None:
+def recall(rules: Rules, past: float, poses: Floats, signals: Floats) -> tuple[Int8s, Ints]:
     """As `replay`, but the states x_0..x_t have to keep the margin `past` instead of the rules' own.
 
     J asks the rules' own margin of every step of a dwell. So of a dwell that has begun only the steps that
     keep that margin count. Where it is too late to begin the dwell anew, all steps that keep `past` count.
     """
-    replay(rules, past, poses, signals, status, run)
-    if past == rules.margin:
-        return
-    asked, whole = np.empty_like(status), np.empty_like(run)
-    replay(rules, rules.margin, poses, signals, asked, whole)
-    for k in range(status.shape[0]):
-        if status[k] == PENDING and asked[k] == PENDING:
-            run[k] = whole[k]
+    status, run = replay(rules, past, poses, signals)
+    if past != rules.margin:
+        asked, whole = replay(rules, rules.margin, poses, signals)
+        for k in range(status.shape[0]):
+            if status[k] == PENDING and asked[k] == PENDING:
+                run[k] = whole[k]
+    return status, run
+
+
+@kernel
+def resume(rules: Rules, past: float, poses: Floats, signals: Floats) -> tuple[Int8s, Ints]:
+    """As `recall`, with what broke by x_t forgiven."""
+    status, run = recall(rules, past, poses, signals)
+    forgive(rules, poses.shape[0] - 1, status)
+    return status, run
 
 
 def pasts(rules: Rules, poses: Floats, signals: Floats) -> tuple[float, ...]:
@@ -52,12 +57,10 @@ def _fall_short(rules: Rules, poses: Floats, signals: Floats) -> tuple[bool, boo
     """Two answers: whether the rules' margin cannot be had any more on the whole trajectory though the rule
     can, and whether x_0..x_t settled something by less than that margin.
     """
-    count = rules.kind.shape[0]
-    asked, status, run = np.empty(count, np.int8), np.empty(count, np.int8), np.empty(count, np.int64)
-    replay(rules, rules.margin, poses, signals, asked, run)
-    replay(rules, 0.0, poses, signals, status, run)
+    asked, _ = replay(rules, rules.margin, poses, signals)
+    status, _ = replay(rules, 0.0, poses, signals)
     lost = less = False
-    for k in range(count):
+    for k in range(status.shape[0]):
         lost = lost or (asked[k] == BROKEN and status[k] != BROKEN)
         less = less or asked[k] != status[k]
     return lost, less

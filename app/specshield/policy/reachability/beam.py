@@ -15,8 +15,9 @@ from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import reads_heading
 from specshield.policy.progress import advance
-from specshield.policy.reachability.guide import Guide, Scratch, copy_progress, read_due
-from specshield.policy.reachability.tables import SAFE, UNKNOWN, is_broken, score, slack_at
+from specshield.policy.reachability.guide import copy_progress, read_due
+from specshield.policy.reachability.tables import SAFE, UNKNOWN, Guide, Scratch, is_broken, score, slack_at
+from specshield.policy.tree import table_size
 from specshield.robot.dynamics import around, motion_count, step_from
 
 MAX_ROOTS = 62  # bits of a tag, which is an int64
@@ -59,11 +60,38 @@ class Heap(NamedTuple):
     slack: Floats
 
 
+class Beam(NamedTuple):
+    """What one beam works on.
+
+    here: the poses kept at a step; new: those that their motions lead to. begun [R, K]: the roots' status at
+    the beginning. table: where the poses of `new` are looked up; place [N]: the row that each has in `here`;
+    kept [R]: how many poses each root has there; heap: of the rows of `new`.
+    """
+
+    here: Poses
+    new: Poses
+    edges: Edges
+    begun: Int8s
+    table: Int32s
+    place: Ints
+    kept: Ints
+    heap: Heap
+
+
 @kernel
 def beam_search(
-    guide: Guide, t: int, pose: Floats, status: Int8s, run: Ints, share: int, band: float, target: float,
-    scratch: Scratch, motions: Ints, taken: Ints,
-) -> None:  # fmt: skip
+    guide: Guide,
+    t: int,
+    pose: Floats,
+    status: Int8s,
+    run: Ints,
+    share: int,
+    band: float,
+    target: float,
+    scratch: Scratch,
+    motions: Ints,
+    taken: Ints,
+) -> None:
     """Keeps the poses of most slack at every step, until each root has a way or no pose is left.
 
     pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. share: the poses kept for each root.
@@ -75,41 +103,42 @@ def beam_search(
     steps = motions.shape[1]
     width = max(min(share * roots, MAX_KEPT), share)
     room = width * motion_count(guide.body)
-    here, new = _poses(width, k_count), _poses(room, k_count)
     edges = Edges(
-        np.empty((steps, room), np.int32), np.empty((steps, room), np.int32),
-        np.empty((steps, room), np.int32), np.zeros(steps, np.int64), np.zeros((steps, width), np.int64),
-    )  # fmt: skip
-    slots = 4
-    while slots < 2 * room:
-        slots *= 2
-    table, place, kept = np.empty(slots, np.int32), np.empty(room, np.int64), np.empty(roots, np.int64)
-    heap = Heap(np.empty(room, np.int64), np.empty(room))
+        child=np.empty((steps, room), np.int32),
+        parent=np.empty((steps, room), np.int32),
+        motion=np.empty((steps, room), np.int32),
+        made=np.zeros(steps, np.int64),
+        tag=np.zeros((steps, width), np.int64),
+    )
+    beam = Beam(
+        here=_poses(width, k_count),
+        new=_poses(room, k_count),
+        edges=edges,
+        begun=status,
+        table=np.empty(table_size(room), np.int32),
+        place=np.empty(room, np.int64),
+        kept=np.empty(roots, np.int64),
+        heap=Heap(np.empty(room, np.int64), np.empty(room)),
+    )
     for r in range(roots):
-        _put(here, r, pose[r, 0], pose[r, 1], pose[r, 2], status[r], run[r])
-        here.tag[r] = 1 << r
+        _put(beam.here, r, pose[r, 0], pose[r, 1], pose[r, 2], status[r], run[r])
+        beam.here.tag[r] = 1 << r
     taken[:] = 0
     open_roots, count = (1 << roots) - 1, roots
     for n in range(steps):
-        table[:] = -1
-        found = _expand(guide, t, n, count, open_roots, band, here, new, edges, table, scratch)
-        open_roots = _finish(t, n, found, open_roots, target, status, new, edges, motions, taken)
+        found = _expand(guide, t, n, count, open_roots, band, beam, scratch)
+        open_roots = _finish(t, n, found, open_roots, target, beam, motions, taken)
         if open_roots == 0:
             return
-        count = _select(found, n, open_roots, width, share, band, kept, place, heap, here, new, edges)
+        count = _select(found, n, open_roots, width, share, band, beam)
         if count == 0:
             return
 
 
 @kernel
 def _poses(n: int, k: int) -> Poses:
-    return Poses(
-        np.empty((n, 3)),
-        np.empty((n, k), np.int8),
-        np.empty((n, k), np.int64),
-        np.empty(n),
-        np.empty(n, np.int64),
-    )
+    pose, slack, tag = np.empty((n, 3)), np.empty(n), np.empty(n, np.int64)
+    return Poses(pose, np.empty((n, k), np.int8), np.empty((n, k), np.int64), slack, tag)
 
 
 @inlined
@@ -120,21 +149,20 @@ def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Int8s, run
 
 @leaf
 def _expand(
-    guide: Guide, t: int, n: int, count: int, open_roots: int, band: float, here: Poses, new: Poses,
-    edges: Edges, table: Int32s, scratch: Scratch,
-) -> int:  # fmt: skip
+    guide: Guide, t: int, n: int, count: int, open_roots: int, band: float, beam: Beam, scratch: Scratch
+) -> int:
     """Makes every motion from the first `count` poses of `here`; each new pose is written once. How many."""
-    body, rules, tables, wait, _ = guide
-    found, joined, turns_matter = 0, 0, reads_heading(rules)
+    body, rules, tables, _, _ = guide
+    here, new, edges = beam.here, beam.new, beam.edges
+    found, joined, turns_matter = 0, 0, reads_heading(rules.programs, rules.regions)
+    beam.table[:] = -1
     for w in range(count):
         edges.tag[n, w] = here.tag[w]
         if here.tag[w] & open_roots == 0:
             continue
         before_x, before_y, before = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
-        known = score(
-            body, rules, tables, before_x, before_y, before, t + n, here.status[w], here.run[w], wait, -1,
-            scratch.scores, scratch.corners, scratch.ahead,
-        )  # fmt: skip
+        copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
+        corners = score(guide, before_x, before_y, before, t + n, -1, scratch)
         lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         cos, sin, room = around(body, before_x, before_y, before)
         read = False  # whether the scratch holds the predicates at the place that the motions begin at
@@ -150,12 +178,10 @@ def _expand(
                 read = stays and not turns_matter
             advance(rules, t + n + 1, scratch.predicates, scratch.status, scratch.run)
             _put(new, found, x, y, theta, scratch.status, scratch.run)
-            at = _place(new, found, table)
+            at = _place(new, found, beam.table)
             if at == found:
-                new.slack[at] = slack_at(
-                    body, rules, tables, x, y, theta, t + n + 1, new.status[at], new.run[at],
-                    scratch.corners if stays else scratch.ahead, known if stays else UNKNOWN,
-                )  # fmt: skip
+                about, known = (scratch.corners, corners) if stays else (scratch.ahead, UNKNOWN)
+                new.slack[at] = slack_at(guide, x, y, theta, t + n + 1, scratch, about, known)
                 new.tag[at] = 0
                 found += 1
             if new.slack[at] >= band and not is_broken(new.status[at]):
@@ -187,37 +213,35 @@ def _lowest(scores: Floats) -> float:
 
 @leaf
 def _finish(
-    t: int, n: int, found: int, open_roots: int, target: float, status: Int8s, new: Poses, edges: Edges,
-    motions: Ints, taken: Ints,
-) -> int:  # fmt: skip
+    t: int, n: int, found: int, open_roots: int, target: float, beam: Beam, motions: Ints, taken: Ints
+) -> int:
     """Writes the way of every root that has one now; returns the roots that are still open, as bits."""
+    new, begun = beam.new, beam.begun
     for c in range(found):
         arrived = new.tag[c] & open_roots
         ahead = new.slack[c]
         if arrived == 0 or ahead < min(EASY, target - (t + n + 1)):
             continue
-        for r in range(status.shape[0]):
+        for r in range(begun.shape[0]):
             if arrived >> r & 1 == 0:
                 continue
             gained = ahead == SAFE or ahead + (t + n + 1) > target
-            for k in range(status.shape[1]):
-                gained = gained or new.status[c, k] != status[r, k]
+            for k in range(begun.shape[1]):
+                gained = gained or new.status[c, k] != begun[r, k]
             if gained:
-                _trace(n, c, r, edges, motions[r])
+                _trace(n, c, r, beam.edges, motions[r])
                 taken[r] = n + 1
                 open_roots &= ~(1 << r)
     return open_roots
 
 
 @leaf
-def _select(
-    found: int, n: int, open_roots: int, width: int, share: int, band: float, kept: Ints, place: Ints,
-    heap: Heap, here: Poses, new: Poses, edges: Edges,
-) -> int:  # fmt: skip
+def _select(found: int, n: int, open_roots: int, width: int, share: int, band: float, beam: Beam) -> int:
     """Puts the poses to go on with into `here`, most slack first, until each root has its share. How many.
 
     found: how many poses of `new` count. The edges to poses that are not kept are taken out.
     """
+    here, new, edges, _, _, place, kept, heap = beam
     for r in range(kept.shape[0]):
         kept[r] = 0
     size = 0
@@ -291,8 +315,7 @@ def _place(new: Poses, found: int, table: Int32s) -> int:
     slot = (key ^ key >> 15) & (table.shape[0] - 1)
     while table[slot] >= 0:
         other = table[slot]
-        a, b, c = _rounded(new.pose, other)
-        same = a == x and b == y and c == theta
+        same = _rounded(new.pose, other) == (x, y, theta)
         for k in range(new.status.shape[1]):
             same = same and new.status[found, k] == new.status[other, k]
             same = same and new.run[found, k] == new.run[other, k]

@@ -1,18 +1,24 @@
-"""What climbs and beams share: what leads the robot, the scratch they work on, and how progress is kept."""
+"""What climbs and beams share: how progress is kept, and when deadlines come earlier."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
-from specshield.compiled import inlined, kernel
+from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.lattice import Corners
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, STACK, Rules, advance, value_count
+from specshield.policy.progress import (
+    ALWAYS,
+    EVENTUALLY,
+    EVENTUALLY_ALWAYS,
+    PENDING,
+    STACK,
+    Rules,
+    advance,
+    value_count,
+)
 from specshield.policy.progress.recall import recall
-from specshield.policy.reachability.tables import Tables, goals_settled, slack
-from specshield.robot.dynamics import Body
+from specshield.policy.reachability.tables import Guide, Scratch, Tables, goals_settled, slack
 from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
 from specshield.stl.program import VALUE, evaluate_packed
 
@@ -21,47 +27,21 @@ from specshield.stl.program import VALUE, evaluate_packed
 HURRIED = -1.0
 
 
-class Guide(NamedTuple):
-    """What leads a robot. wait: the motion that stands still, -1 where there is none. barred [n, 6]: motions
-    that led nowhere, and from where (robot/barred.py).
-    """
-
-    body: Body
-    rules: Rules
-    tables: Tables
-    wait: int
-    barred: Floats
-
-
-class Scratch(NamedTuple):
-    """The arrays that one decision works on, made once.
-
-    status, run (K,): the progress at the newest pose; high_status, high_run (K,): where the latest feasible
-    time was highest. predicates (K,): their robustness at the newest pose, where it was needed. scores (M,):
-    the latest feasible time after each motion. values, stack: of `evaluate_packed`. corners, ahead: of
-    `score` and `slack`.
-    """
-
-    values: Floats
-    stack: Floats
-    predicates: Floats
-    scores: Floats
-    status: Int8s
-    run: Ints
-    high_status: Int8s
-    high_run: Ints
-    corners: Corners
-    ahead: Corners
-
-
 @kernel
 def make_scratch(rules: Rules, motions: int) -> Scratch:
     k = rules.kind.shape[0]
     return Scratch(
-        np.empty(value_count(rules)), np.empty(STACK), np.empty(k), np.empty(motions), np.empty(k, np.int8),
-        np.empty(k, np.int64), np.empty(k, np.int8), np.empty(k, np.int64),
-        Corners(np.empty(4, np.int64), np.empty(4)), Corners(np.empty(4, np.int64), np.empty(4)),
-    )  # fmt: skip
+        values=np.empty(value_count(rules)),
+        stack=np.empty(STACK),
+        predicates=np.empty(k),
+        scores=np.empty(motions),
+        status=np.empty(k, np.int8),
+        run=np.empty(k, np.int64),
+        high_status=np.empty(k, np.int8),
+        high_run=np.empty(k, np.int64),
+        corners=Corners(np.empty(4, np.int64), np.empty(4)),
+        ahead=Corners(np.empty(4, np.int64), np.empty(4)),
+    )
 
 
 @inlined
@@ -86,6 +66,14 @@ def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, scratch
     return float(evaluate_packed(k, programs, values, scratch.stack))
 
 
+@leaf
+def due(rules: Rules, goal: int) -> int:
+    """The last step by which a robot can come to where a goal's predicate holds."""
+    if rules.kind[goal] == EVENTUALLY:
+        return int(rules.b[goal])
+    return int(rules.c1[goal] + rules.c2[goal])
+
+
 @inlined
 def update_progress(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> None:
     """Takes x_t into the scratch's progress."""
@@ -95,18 +83,9 @@ def update_progress(rules: Rules, t: int, x: float, y: float, theta: float, scra
 
 @inlined
 def read_due(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> None:
-    """Evaluates the predicates that `advance` needs at step t."""
+    """Evaluates the predicates that `advance` needs at step t, or up to it for a robot that waits."""
     for k in range(rules.kind.shape[0]):
-        opens = rules.a[k] + (rules.c2[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
-        if scratch.status[k] == PENDING and t >= opens:
-            scratch.predicates[k] = predicate_at(rules, k, x, y, theta, scratch)
-
-
-@inlined
-def read_pending(rules: Rules, x: float, y: float, theta: float, scratch: Scratch) -> None:
-    """Evaluates the predicates of everything that is pending, once for a robot that will wait here."""
-    for k in range(rules.kind.shape[0]):
-        if scratch.status[k] == PENDING:
+        if scratch.status[k] == PENDING and t >= rules.a[k] + rules.c2[k]:
             scratch.predicates[k] = predicate_at(rules, k, x, y, theta, scratch)
 
 
@@ -117,11 +96,12 @@ def is_over(rules: Rules, tables: Tables, t: int, status: Int8s) -> bool:
 
 
 @inlined
-def fill(n: int, wait: int, x: float, y: float, theta: float, motions: Ints, poses: Floats) -> None:
-    """Waits at a pose from the nth motion to the horizon."""
+def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
+    """Waits where motions[:n], n >= 1, led to, to the horizon."""
     for rest in range(n, motions.shape[0]):
         motions[rest] = wait
-        poses[rest, 0], poses[rest, 1], poses[rest, 2] = x, y, theta
+        for c in range(3):
+            poses[rest, c] = poses[n - 1, c]
 
 
 def hurried(guide: Guide, early: int, past: float, history: Floats, signals: Floats) -> tuple[Guide, bool]:
@@ -143,15 +123,13 @@ def _hasten(
     rules: Rules, early: int, past: float, history: Floats, signals: Floats, b: Ints, c1: Ints
 ) -> tuple[int, bool]:
     """Brings the ends b, c1 (K,) of `hurried` forward; by how much at least [steps], and whether one is."""
-    status, run = np.empty(rules.kind.shape[0], np.int8), np.empty(rules.kind.shape[0], np.int64)
-    recall(rules, past, history, signals, status, run)
+    status, _ = recall(rules, past, history, signals)
     least, met, moved = 0, False, False
     for k in range(rules.kind.shape[0]):
         dwells = rules.kind[k] == EVENTUALLY_ALWAYS
         end = rules.c1[k] if dwells else rules.b[k]
         sooner = end - min(early, (end - rules.a[k]) // 2)
-        dwell = rules.c2[k] if dwells else 0
-        if status[k] != PENDING or rules.kind[k] == ALWAYS or sooner + dwell < history.shape[0]:
+        if status[k] != PENDING or rules.kind[k] == ALWAYS or sooner + rules.c2[k] < history.shape[0]:
             continue
         if dwells:
             c1[k] = sooner
@@ -170,9 +148,5 @@ def share_with_slack(guide: Guide, poses: Floats) -> float:
         x, y, theta = poses[n, 0], poses[n, 1], poses[n, 2]
         scratch.status[:], scratch.run[:] = PENDING, 0
         update_progress(guide.rules, 0, x, y, theta, scratch)
-        left = slack(
-            guide.body, guide.rules, guide.tables, x, y, theta, 0, scratch.status, scratch.run,
-            scratch.corners,
-        )  # fmt: skip
-        found += left >= 0.0
+        found += slack(guide, x, y, theta, 0, scratch) >= 0.0
     return float(found / poses.shape[0])

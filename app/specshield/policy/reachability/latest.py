@@ -23,18 +23,19 @@ import numpy as np
 from specshield.arrays import Bytes, Codes, Int32s, Ints, Singles
 from specshield.compiled import kernel
 from specshield.policy.lattice import INVALID, NO_TIME, STEP_CODES, Lattice, bilinear, number_cells
-from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules
+from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules, goals_of
 from specshield.policy.reachability.tables import Tables
 
 SETTLED_CHANGE = 0.02  # [steps] a sweep that changes less than this has converged (chosen by hand)
 MAX_SWEEPS = 100_000  # far more than any map needs; it only bounds the loop
 
 
-def masks_of(rules: Rules, goals: Ints) -> list[int]:
-    """The sets of settled goals (bit g for goals[g]) that some trajectory can have, the fullest first.
+def masks_of(rules: Rules) -> list[int]:
+    """The sets of settled goals (bit g for the gth) that some trajectory can have, the fullest first.
 
     j cannot be settled before k where j's window begins after k's ends.
     """
+    goals = goals_of(rules)
     earliest = rules.a + np.where(rules.kind == EVENTUALLY_ALWAYS, rules.b, 0)
     possible = []
     for mask in range(1 << len(goals)):
@@ -68,12 +69,13 @@ def phases_of(rules: Rules, horizon: int) -> tuple[Phase, ...]:
 
 
 def latest_times(
-    lattice: Lattice, rules: Rules, holds: Bytes, goals: Ints, masks: list[int], phases: tuple[Phase, ...]
+    lattice: Lattice, rules: Rules, holds: Bytes, masks: list[int], phases: tuple[Phase, ...]
 ) -> tuple[Singles, Bytes]:
     """L for each phase and mask, [phases, masks, ny, nx, H], NO_TIME where the phase has none.
 
     Also where a pose is free and keeps the phase's `always`, [phases, ny, nx, H].
     """
+    goals = goals_of(rules)
     index = {mask: n for n, mask in enumerate(masks)}
     tables = np.full((len(phases), len(masks), *lattice.valid.shape), NO_TIME, np.float32)
     valid = np.stack([lattice.valid & np.all(holds[list(phase.always)], axis=0) for phase in phases])
@@ -216,12 +218,11 @@ def sweep(lattice: Lattice, valid: Bytes, start: float, table: Singles) -> None:
 
 
 def pack_times(
-    latest: Singles, valid: Bytes, masks: list[int], phases: tuple[Phase, ...],
-    goals: Ints, rules: Rules, pitch: float,
-) -> Tables:  # fmt: skip
+    latest: Singles, valid: Bytes, masks: list[int], phases: tuple[Phase, ...], rules: Rules, pitch: float
+) -> Tables:
     """The latest times of `latest_times` as tables."""
     used = np.any(valid, axis=(0, 3))
-    table = np.full((len(phases), 1 << len(goals)), -1, np.int32)
+    table = np.full((len(phases), 1 << len(goals_of(rules))), -1, np.int32)
     codes: list[Codes] = []
     for i in range(len(phases)):
         for n, mask in enumerate(masks):
@@ -234,15 +235,14 @@ def pack_times(
             table[i, mask] = len(codes)
             codes.append(code)
     code = np.array(codes, np.uint16).reshape(len(codes), int(used.sum()), valid.shape[3])
-    return time_tables(rules, goals, phases, number_cells(used), code, table, pitch)
+    return time_tables(rules, phases, number_cells(used), code, table, pitch)
 
 
 def time_tables(
-    rules: Rules, goals: Ints, phases: tuple[Phase, ...], cell: Int32s, code: Codes,
-    table: Int32s, pitch: float,
-) -> Tables:  # fmt: skip
+    rules: Rules, phases: tuple[Phase, ...], cell: Int32s, code: Codes, table: Int32s, pitch: float
+) -> Tables:
     """Tables of latest times from what a file holds of them."""
-    bit = np.zeros(len(rules.kind), np.int64)
+    bit, goals = np.zeros(len(rules.kind), np.int64), goals_of(rules)
     bit[goals] = 1 << np.arange(len(goals))
     ends = np.array([phase.end for phase in phases], np.int32)
     phase = np.searchsorted(ends, np.arange(ends[-1] + 1)).astype(np.int32)

@@ -20,11 +20,11 @@ from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
 from specshield.policy.options import options_to_json, read_options
-from specshield.policy.progress import ALWAYS, Rules, make_rules
+from specshield.policy.progress import Rules, make_rules
 from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
-from specshield.policy.reachability.guide import HURRIED, Guide, hurried, share_with_slack
+from specshield.policy.reachability.guide import HURRIED, hurried, share_with_slack
 from specshield.policy.reachability.latest import latest_times, masks_of, pack_times, phases_of
 from specshield.policy.reachability.method import Settings
 from specshield.policy.reachability.narrow import AFTER, FIRST, ON, continue_narrow
@@ -32,7 +32,7 @@ from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.sight import look_closely
 from specshield.policy.reachability.stepwise import MAX_BYTES, feasible_steps, state_count, step_tables
 from specshield.policy.reachability.stored import read_tables, stored
-from specshield.policy.reachability.tables import Tables
+from specshield.policy.reachability.tables import Guide, Tables
 from specshield.policy.shape import lattice_shape
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, make_body, simulate
@@ -180,7 +180,7 @@ class ReachabilityPolicy(Carded):
         As the tables say; where they hardly see what the rule asks for, as what is proposed does.
         """
         body, rules = self._body, self._rules
-        exact = bool(self.narrow.any()) or reads_heading(rules)
+        exact = bool(self.narrow.any()) or reads_heading(rules.programs, rules.regions)
         try:
             poses = free_poses(self.task, body, FEW if exact else MANY, np.random.default_rng(0))
         except MapError:  # next to no free space
@@ -214,7 +214,6 @@ def synthesise(
     began = time.perf_counter()
     settings = settings or Settings()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
-    goals = np.flatnonzero(rules.kind != ALWAYS)
     pitch, cells = _extent(task, body, rules, settings)
     lattice = make_lattice(body, pitch, cells)
     holds, narrow = look_closely(body, rules, lattice, holds_at(body, rules, lattice))
@@ -223,9 +222,9 @@ def synthesise(
         bits = feasible_steps(lattice, rules, holds, task.horizon, cell)
         tables = step_tables(rules, task.horizon, cell, bits, pitch)
     else:
-        masks, phases = masks_of(rules, goals), phases_of(rules, task.horizon)
-        latest, valid = latest_times(lattice, rules, holds, goals, masks, phases)
-        tables = pack_times(latest, valid, masks, phases, goals, rules, pitch)
+        masks, phases = masks_of(rules), phases_of(rules, task.horizon)
+        latest, valid = latest_times(lattice, rules, holds, masks, phases)
+        tables = pack_times(latest, valid, masks, phases, rules, pitch)
     policy = ReachabilityPolicy(task, {}, settings, tables, narrow)
     metrics = {
         "feasible_start": round(policy.feasible_start(), 4),
@@ -254,11 +253,10 @@ def _extent(task: Task, body: Body, rules: Rules, settings: Settings) -> tuple[f
 
     Raises PolicyError where the tables would be too large.
     """
-    goals = np.flatnonzero(rules.kind != ALWAYS)
     if task.robot.wait_motion < 0:
         entries, most = (task.horizon + 1) * -(-state_count(rules) // 8), MAX_BYTES
     else:
-        entries, most = len(masks_of(rules, goals)) * len(phases_of(rules, task.horizon)), MAX_ENTRIES
+        entries, most = len(masks_of(rules)) * len(phases_of(rules, task.horizon)), MAX_ENTRIES
     ny, nx, headings = lattice_shape(task, settings.pitch / 3.0)
     if ny * nx * headings * entries <= FINE_ENTRIES:
         return settings.pitch / 3.0, None
@@ -272,7 +270,8 @@ def _extent(task: Task, body: Body, rules: Rules, settings: Settings) -> tuple[f
     least = math.ceil(100.0 * pitch / COARSEST) / 100.0
     would = f"options.pitch {least:.2f} or more" if least <= 1.0 else "fewer windows that overlap"
     raise PolicyError(
-        "the tables are too large", path="options.pitch",
+        "the tables are too large",
+        path="options.pitch",
         got=f"{entries} entries for each pose at a pitch of {settings.pitch:g} m",
         expected=would,
-    )  # fmt: skip
+    )

@@ -15,18 +15,11 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
-from specshield.policy.detour import copy_way, find_sibling, find_twins
-from specshield.policy.progress.recall import forgive, recall
+from specshield.policy.detour import copy_ways, find_sibling, find_twins
+from specshield.policy.progress.recall import resume
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search
-from specshield.policy.reachability.guide import (
-    Guide,
-    Scratch,
-    copy_progress,
-    fill,
-    make_scratch,
-    update_progress,
-)
-from specshield.policy.reachability.tables import HOPELESS, SAFE, goals_settled, slack
+from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
+from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
 from specshield.robot.dynamics import displacement, simulate, step
@@ -46,25 +39,74 @@ SMALL_SHARE = 512  # poses that a beam keeps for each first motion on such a lat
 class Starts(NamedTuple):
     """What is known after each first motion [M].
 
-    status, run [M, K]: the progress. slack [steps]. turn, move: the motions that nearly undo it, NOT_NEEDED
-    where one is enough; the turn may be IMPOSSIBLE. settled: whether a way that settles every goal was found.
-    sibling (3,): scratch of `find_sibling`.
+    motions [M, T - t], poses [M, T - t, 3]: the way that begins with it, and where that leads. status, run
+    [M + 1, K]: the progress; in the last row that at x_t. slack [steps]. turn, move: the motions that nearly
+    undo it, NOT_NEEDED where one is enough; the turn may be IMPOSSIBLE. settled: whether a way that settles
+    every goal was found. twin: the first motion that ends in the same pose. order: the motions by falling
+    slack, the lowest index first on ties. wanted: whether a way is asked for. sibling (3,): scratch of
+    `find_sibling`.
     """
 
+    motions: Ints
+    poses: Floats
     status: Int8s
     run: Ints
     slack: Floats
     turn: Ints
     move: Ints
     settled: Bools
+    twin: Ints
+    order: Ints
+    wanted: Bools
     sibling: Ints
 
 
 @kernel
+def begin(
+    guide: Guide, past: float, history: Floats, signals: Floats, wanted: Bools, motions: Ints, poses: Floats
+) -> tuple[Starts, Scratch]:
+    """Makes every motion once from x_t. Twins are wanted together. The arguments are those of
+    `continue_all`.
+    """
+    body, rules, (count, _) = guide.body, guide.rules, motions.shape
+    t, pose, k_count = history.shape[0] - 1, history[-1], rules.kind.shape[0]
+    scratch = make_scratch(rules, count)
+    status, run = np.empty((count + 1, k_count), np.int8), np.empty((count + 1, k_count), np.int64)
+    now, ran = resume(rules, past, history, signals)
+    copy_progress(now, ran, status[count], run[count])
+    slacks, twin = np.empty(count), np.empty(count, np.int64)
+    turn, move = np.empty(count, np.int64), np.empty(count, np.int64)
+    for m in range(count):
+        x, y, theta = step(body, pose[0], pose[1], pose[2], m)
+        motions[m, 0] = m
+        poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
+        turn[m] = turn_by(body, -displacement(body, m)[1]) if theta != pose[2] else NOT_NEEDED
+        move[m] = move_back(body, m, math.hypot(x - pose[0], y - pose[1]))
+        copy_progress(status[count], run[count], scratch.status, scratch.run)
+        update_progress(rules, t + 1, x, y, theta, scratch)
+        copy_progress(scratch.status, scratch.run, status[m], run[m])
+        slacks[m] = slack(guide, x, y, theta, t + 1, scratch)
+    find_twins(poses, twin)
+    for m in range(count):
+        wanted[twin[m]] |= wanted[m]
+    order, settled = np.argsort(-slacks, kind="mergesort"), np.zeros(count, np.bool_)
+    sibling = np.empty(3, np.int64)
+    starts = Starts(motions, poses, status, run, slacks, turn, move, settled, twin, order, wanted, sibling)
+    return starts, scratch
+
+
+@kernel
 def continue_all(
-    guide: Guide, width: int, past: float, history: Floats, signals: Floats, wanted: Bools, lowest: float,
-    motions: Ints, poses: Floats,
-) -> int:  # fmt: skip
+    guide: Guide,
+    width: int,
+    past: float,
+    history: Floats,
+    signals: Floats,
+    wanted: Bools,
+    lowest: float,
+    motions: Ints,
+    poses: Floats,
+) -> int:
     """Writes a continuation after each `wanted` (M,) first motion into motions (M, T - t), and where it leads
     into poses (M, T - t, 3); returns the motion of most slack. -1, and nothing is written, where none that is
     wanted has a slack of at least `lowest` [steps]; no beam looks for a way after one that has less.
@@ -73,22 +115,11 @@ def continue_all(
     the margin that the history is judged by. The rules' signals are left at their last row. What is written
     of motions that are not wanted need not be a way.
     """
-    count, t, k_count = motions.shape[0], history.shape[0] - 1, guide.rules.kind.shape[0]
-    status, run = np.empty(k_count, np.int8), np.empty(k_count, np.int64)
-    recall(guide.rules, past, history, signals, status, run)
-    forgive(guide.rules, t, status)
-    scratch = make_scratch(guide.rules, count)
-    starts = Starts(
-        np.empty((count, k_count), np.int8), np.empty((count, k_count), np.int64), np.empty(count),
-        np.empty(count, np.int64), np.empty(count, np.int64), np.zeros(count, np.bool_),
-        np.empty(3, np.int64),
-    )  # fmt: skip
-    order, twin, walked = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
-    _first_steps(guide, t, history[t], status, run, motions, poses, starts, scratch)
-    _by_slack(starts.slack, order)
-    find_twins(poses, twin)
-    if not _some_in_time(wanted, twin, starts.slack, lowest):
+    starts, scratch = begin(guide, past, history, signals, wanted, motions, poses)
+    t, order, twin, settled = history.shape[0] - 1, starts.order, starts.twin, starts.settled
+    if not np.any(wanted & (starts.slack >= lowest)):
         return -1
+    walked = np.empty(order.shape[0], np.int64)
     waits, base, ways = guide.wait >= 0, -1, 0
     for m in order:
         if twin[m] != m or not (wanted[m] or base < 0):
@@ -96,23 +127,20 @@ def continue_all(
         if not waits:  # beams find all its ways: until one does, it repeats the motion
             motions[m, 1:] = m
             simulate(guide.body, poses[m, 0], motions[m, 1:], poses[m, 1:])
-            starts.settled[m] = starts.slack[m] == SAFE
+            settled[m] = starts.slack[m] == SAFE
             continue
-        turn, move, ahead = starts.turn[m], starts.move[m], starts.slack[m]
-        starts.settled[m] = _join(guide, t, walked[:ways], int(m), starts, motions, poses, scratch)
-        if base >= 0 and turn != IMPOSSIBLE and not starts.settled[m]:
-            copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
-            starts.settled[m] = rejoin(
-                guide, t, turn, move, motions[base], poses[base], 0, motions[m], poses[m], scratch
-            )
-        if not starts.settled[m] and (ahead >= 0.0 or base < 0 or turn == IMPOSSIBLE):
+        ahead = starts.slack[m]
+        settled[m] = join_sibling(guide, t, walked[:ways], int(m), starts, scratch)
+        if base >= 0 and not settled[m]:
+            settled[m] = go_back(guide, t, int(m), motions[base], poses[base], starts, scratch)
+        if not settled[m] and (ahead >= 0.0 or base < 0 or starts.turn[m] == IMPOSSIBLE):
             copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
             escapes = ahead >= (0.0 if base < 0 else EASY)
-            starts.settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], scratch)
-            if starts.settled[m]:
+            settled[m] = _follow(guide, width, t, 1, escapes, motions[m], poses[m], scratch)
+            if settled[m]:
                 walked[ways] = m
                 ways += 1
-        if starts.settled[m] and base < 0:
+        if settled[m] and base < 0:
             base = int(m)
     small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
     for attempt in range(3):
@@ -122,65 +150,18 @@ def continue_all(
         elif attempt == 2:
             share, band = SMALL_SHARE, 2.0 * HOPELESS
         if (attempt > 0 or not waits) and (attempt < 2 or small):
-            band = max(band, lowest)
-            _beam_out(guide, t, share, width, band, order, twin, wanted, starts, motions, poses, scratch)
-    for same in range(count):
-        if twin[same] != same:
-            copy_way(motions, poses, twin[same], same)
+            _beam_out(guide, t, share, width, max(band, lowest), starts, scratch)
+    copy_ways(motions, poses, twin)
     best = order[0]
     return int(guide.wait if waits and starts.slack[guide.wait] == starts.slack[best] else best)
 
 
 @leaf
-def _first_steps(
-    guide: Guide, t: int, pose: Floats, status: Int8s, run: Ints, motions: Ints, poses: Floats,
-    starts: Starts, scratch: Scratch,
-) -> None:  # fmt: skip
-    """Makes every motion once, from `pose` (3,), with the progress `status`, `run` (K,) there."""
-    body, rules, tables, _, _ = guide
-    for m in range(motions.shape[0]):
-        x, y, theta = step(body, pose[0], pose[1], pose[2], m)
-        motions[m, 0] = m
-        poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
-        starts.turn[m] = turn_by(body, -displacement(body, m)[1]) if theta != pose[2] else NOT_NEEDED
-        starts.move[m] = move_back(body, m, math.hypot(x - pose[0], y - pose[1]))
-        copy_progress(status, run, scratch.status, scratch.run)
-        update_progress(rules, t + 1, x, y, theta, scratch)
-        copy_progress(scratch.status, scratch.run, starts.status[m], starts.run[m])
-        starts.slack[m] = slack(
-            body, rules, tables, x, y, theta, t + 1, scratch.status, scratch.run, scratch.corners
-        )
-
-
-@leaf
-def _some_in_time(wanted: Bools, twin: Ints, slacks: Floats, lowest: float) -> bool:
-    """Wants twins together. Whether a motion that is wanted (M,) has a slack of `lowest` [steps] or more."""
-    some = False
-    for m in range(wanted.shape[0]):
-        wanted[twin[m]] |= wanted[m]
-        some = some or (wanted[m] and slacks[m] >= lowest)
-    return some
-
-
-@leaf
-def _by_slack(slacks: Floats, order: Ints) -> None:
-    """The motions by falling slack, the lowest index first on ties."""
-    for i in range(slacks.shape[0]):
-        j = i
-        while j > 0 and slacks[order[j - 1]] < slacks[i]:
-            order[j] = order[j - 1]
-            j -= 1
-        order[j] = i
-
-
-@leaf
-def _join(
-    guide: Guide, t: int, known: Ints, m: int, starts: Starts, motions: Ints, poses: Floats, scratch: Scratch
-) -> bool:
+def join_sibling(guide: Guide, t: int, known: Ints, m: int, starts: Starts, scratch: Scratch) -> bool:
     """Goes from motion m the way of one of the motions `known` that led to the same place. Whether every goal
     was settled.
     """
-    found = starts.sibling
+    motions, poses, found = starts.motions, starts.poses, starts.sibling
     find_sibling(guide.body, poses, known, m, True, found)
     if found[0] < 0:
         return False
@@ -189,6 +170,18 @@ def _join(
     return rejoin(
         guide, t, found[1], -1, motions[other], poses[other], found[2], motions[m], poses[m], scratch
     )
+
+
+@leaf
+def go_back(guide: Guide, t: int, m: int, base: Ints, led: Floats, starts: Starts, scratch: Scratch) -> bool:
+    """Undoes motion m to go by `base` (T - t,), a way from x_t that leads to the poses `led` (T - t, 3).
+    Whether every goal was settled; where no motion undoes it, nothing is written.
+    """
+    turn, move = starts.turn[m], starts.move[m]
+    if turn == IMPOSSIBLE:
+        return False
+    copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
+    return rejoin(guide, t, turn, move, base, led, 0, starts.motions[m], starts.poses[m], scratch)
 
 
 @kernel
@@ -204,29 +197,35 @@ def _follow(
             break
         status, run = scratch.high_status.copy(), scratch.high_run.copy()
         x, y, theta = poses[n - 1]
-        high = (
-            t
-            + n
-            + slack(guide.body, guide.rules, guide.tables, x, y, theta, t + n, status, run, scratch.corners)
-        )
+        copy_progress(status, run, scratch.status, scratch.run)
+        high = t + n + slack(guide, x, y, theta, t + n, scratch)
         way = np.empty((1, min(motions.shape[0] - n, ESCAPE_LENGTH)), np.int64)
         taken = np.empty(1, np.int64)
         beam_search(
-            guide, t + n, poses[n - 1 : n], status.reshape(1, -1), run.reshape(1, -1), width,
-            high - (t + n) - ESCAPE_LOSS, high + ESCAPE_GAIN, scratch, way, taken,
-        )  # fmt: skip
+            guide,
+            t + n,
+            poses[n - 1 : n],
+            status.reshape(1, -1),
+            run.reshape(1, -1),
+            width,
+            high - (t + n) - ESCAPE_LOSS,
+            high + ESCAPE_GAIN,
+            scratch,
+            way,
+            taken,
+        )
         if taken[0] == 0:
             break
         copy_progress(status, run, scratch.status, scratch.run)
-        n = _take(guide, t, n, way[0, : taken[0]], motions, poses, scratch)
+        n = take(guide, t, n, way[0, : taken[0]], motions, poses, scratch)
         outcome, n = climb(guide, t, n, motions, poses, scratch, True)
     if outcome == STUCK:
-        fill(n, guide.wait, poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2], motions, poses)
+        fill(n, guide.wait, motions, poses)
     return outcome == SETTLED_ALL
 
 
 @leaf
-def _take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, scratch: Scratch) -> int:
+def take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, scratch: Scratch) -> int:
     """Appends `way` to motions[:n], to which the scratch's progress belongs; how many there are then."""
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     for i in range(way.shape[0]):
@@ -240,14 +239,14 @@ def _take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats,
 
 @kernel
 def _beam_out(
-    guide: Guide, t: int, share: int, width: int, band: float, order: Ints, twin: Ints, wanted: Bools,
-    starts: Starts, motions: Ints, poses: Floats, scratch: Scratch,
-) -> None:  # fmt: skip
-    """Looks for a way after every `wanted` (M,) first motion that has none yet and a slack of at least `band`
+    guide: Guide, t: int, share: int, width: int, band: float, starts: Starts, scratch: Scratch
+) -> None:
+    """Looks for a way after every first motion that is wanted, has none yet and a slack of at least `band`
     [steps].
     """
-    steps, sought = motions.shape[1] - 1, wanted & ~starts.settled & (starts.slack >= band)
-    roots = np.array([m for m in order if twin[m] == m and sought[m]], dtype=np.int64)
+    motions, poses = starts.motions, starts.poses
+    steps, sought = motions.shape[1] - 1, starts.wanted & ~starts.settled & (starts.slack >= band)
+    roots = np.array([m for m in starts.order if starts.twin[m] == m and sought[m]], dtype=np.int64)
     if steps == 0:
         return
     few = ROOTS if guide.wait >= 0 else MAX_ROOTS
@@ -255,14 +254,23 @@ def _beam_out(
         some, rest = roots[:few], roots[few:]
         way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
         beam_search(
-            guide, t + 1, poses[some, 0], starts.status[some], starts.run[some], share, band, np.inf, scratch,
-            way, taken,
-        )  # fmt: skip
+            guide,
+            t + 1,
+            poses[some, 0],
+            starts.status[some],
+            starts.run[some],
+            share,
+            band,
+            np.inf,
+            scratch,
+            way,
+            taken,
+        )
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:
                 copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
-                n = _take(guide, t, 1, way[i, : taken[i]], motions[m], poses[m], scratch)
+                n = take(guide, t, 1, way[i, : taken[i]], motions[m], poses[m], scratch)
                 if guide.wait >= 0:
                     starts.settled[m] = _follow(guide, width, t, n, True, motions[m], poses[m], scratch)
                     continue
@@ -271,5 +279,5 @@ def _beam_out(
         if guide.wait >= 0:
             known = some[starts.settled[some]]
             for m in rest:
-                starts.settled[m] = _join(guide, t, known, m, starts, motions, poses, scratch)
+                starts.settled[m] = join_sibling(guide, t, known, m, starts, scratch)
         roots = rest[~starts.settled[rest]]

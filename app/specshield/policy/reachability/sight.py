@@ -53,7 +53,7 @@ def _views(body: Body, rules: Rules, lattice: Lattice, k: int) -> tuple[Bools, B
     Shape [ny, nx, H]; 1 in place of ny and nx where it does not read the place, in place of H where it does
     not read the heading.
     """
-    place, heading, turned = _reads(rules, k)
+    place, heading, turned = reads(rules, k)
     headings = lattice.headings
     unit = 2.0 * math.pi / headings
     samples = 2 * math.ceil(0.5 * unit / GRAIN) + 1 if heading else 1
@@ -61,11 +61,11 @@ def _views(body: Body, rules: Rules, lattice: Lattice, k: int) -> tuple[Bools, B
     free = np.any(lattice.valid, axis=2) if place else np.ones((1, 1), np.bool_)
     shape = (*free.shape, headings if heading or turned else 1)
     outer, inner = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-    _look(body, rules, k, lattice.pitch, headings, free, spread, BESIDE * lattice.pitch, outer, inner)
+    look(body, rules, k, lattice.pitch, headings, free, spread, BESIDE * lattice.pitch, outer, inner)
     return outer, inner
 
 
-def _reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
+def reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
     """Whether predicate k reads the place; its heading; areas that turn with the robot."""
     code = slice(int(rules.programs.starts[k]), int(rules.programs.starts[k + 1]))
     read = rules.programs.args[code][rules.programs.ops[code] == VALUE].astype(int)
@@ -75,10 +75,24 @@ def _reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
 
 
 @kernel
-def _look(
-    body: Body, rules: Rules, k: int, pitch: float, headings: int, free: Bools, spread: Floats, beside: float,
-    outer: Bools, inner: Bools,
-) -> None:  # fmt: skip
+def look(
+    body: Body,
+    rules: Rules,
+    k: int,
+    pitch: float,
+    headings: int,
+    free: Bools,
+    spread: Floats,
+    beside: float,
+    outer: Bools,
+    inner: Bools,
+) -> None:
+    """Writes, for each pose of a lattice over the cells `free` [ny, nx], whether predicate k holds somewhere
+    within `beside` [m] of it, and whether it holds by as much all about it, [ny, nx, H].
+
+    headings: of the whole lattice; spread: those that are looked at about each, as shares of the way to the
+    next.
+    """
     values, stack, out = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
     for j in range(outer.shape[0]):
         for i in range(outer.shape[1]):

@@ -13,7 +13,7 @@ from safetensors.numpy import save as save_tensors
 from specshield.arrays import Bools, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.extent import COARSEST
-from specshield.policy.progress import ALWAYS, make_rules
+from specshield.policy.progress import goals_of, make_rules
 from specshield.policy.reachability.latest import phases_of, time_tables
 from specshield.policy.reachability.stepwise import state_count, step_tables
 from specshield.policy.reachability.tables import Tables
@@ -36,7 +36,7 @@ def stored(tables: Tables, narrow: Bools, asked: float) -> bytes:
 def read_tables(weights: bytes | Path, task: Task, asked: float) -> tuple[Tables, Bools]:
     """What `stored` wrote, `asked` for the same pitch. Raises PolicyError where it does not fit the task."""
     rules = make_rules(task)
-    goals, tensors = np.flatnonzero(rules.kind != ALWAYS), read_tensors(weights)
+    sets, tensors = 1 << len(goals_of(rules)), read_tensors(weights)
     narrow = _narrow_of(tensors.pop("narrow", None), len(rules.kind))
     pitch = _pitch_of(tensors, task, asked)
     if task.robot.wait_motion < 0:
@@ -49,10 +49,10 @@ def read_tables(weights: bytes | Path, task: Task, asked: float) -> tuple[Tables
         tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
     )
     phases, headings = phases_of(rules, task.horizon), _checked_headings(code.shape[2])
-    fits = table.shape == (len(phases), 1 << len(goals)) and table.min() >= -1 and table.max() < code.shape[0]
-    wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {1 << len(goals)}]"
+    fits = table.shape == (len(phases), sets) and table.min() >= -1 and table.max() < code.shape[0]
+    wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {sets}]"
     _check_fit(cell, side_of(task.grid, pitch), code.shape[1], fits, wanted)
-    return time_tables(rules, goals, phases, cell, code, table, pitch), narrow
+    return time_tables(rules, phases, cell, code, table, pitch), narrow
 
 
 def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, asked: float) -> float:
@@ -62,9 +62,11 @@ def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, asked: float) -> flo
         found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
         if not asked <= found <= COARSEST * asked:
             raise PolicyError(
-                "the array 'pitch' is of another kind", path="weights.pitch", got=found,
+                "the array 'pitch' is of another kind",
+                path="weights.pitch",
+                got=found,
                 expected=f"float64, one number from {asked:g} to {COARSEST * asked:g}",
-            )  # fmt: skip
+            )
         return found
     fine = asked / 3.0
     return fine if cell is not None and cell.shape == side_of(task.grid, fine) else asked
@@ -73,9 +75,11 @@ def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, asked: float) -> flo
 def _checked_headings(headings: int) -> int:
     if not 4 <= headings <= MAX_HEADINGS:
         raise PolicyError(
-            "the tables do not fit the task", path="weights", got=f"{headings} headings",
+            "the tables do not fit the task",
+            path="weights",
+            got=f"{headings} headings",
             expected=f"4 to {MAX_HEADINGS} headings",
-        )  # fmt: skip
+        )
     return headings
 
 
@@ -85,9 +89,11 @@ def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
         return np.zeros(count, np.bool_)
     if tensor.dtype != np.uint8 or tensor.shape != (count,):
         raise PolicyError(
-            "the array 'narrow' is of another kind", path="weights.narrow",
-            got=f"{tensor.dtype} {list(tensor.shape)}", expected=f"uint8 [{count}]",
-        )  # fmt: skip
+            "the array 'narrow' is of another kind",
+            path="weights.narrow",
+            got=f"{tensor.dtype} {list(tensor.shape)}",
+            expected=f"uint8 [{count}]",
+        )
     narrow: Bools = tensor == 1
     return narrow
 
@@ -95,7 +101,8 @@ def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
 def _check_fit(cell: Int32s, shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
     if not fits or cell.shape != shape or cell.min(initial=-1) < -1 or cell.max(initial=-1) >= rows:
         raise PolicyError(
-            "the tables do not fit the task", path="weights",
+            "the tables do not fit the task",
+            path="weights",
             got=f"cell {list(cell.shape)} and tables of {rows} cells",
             expected=f"cell {list(shape)}, {wanted}",
-        )  # fmt: skip
+        )

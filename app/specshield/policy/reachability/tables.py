@@ -1,4 +1,4 @@
-"""The tables as decisions read them: the slack of a pose, and where it grows."""
+"""The tables as decisions read them: what leads a robot, the slack of a pose, and where it grows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from specshield.policy.lattice import (
     Corners,
     coordinates,
     coordinates_ahead,
-    corner,
     find_corners,
     heading_after,
     leads_back,
@@ -52,109 +51,150 @@ class Tables(NamedTuple):
     early: int
 
 
+class Guide(NamedTuple):
+    """What leads a robot. wait: the motion that stands still, -1 where there is none. barred [n, 6]: motions
+    that led nowhere, and from where (robot/barred.py).
+    """
+
+    body: Body
+    rules: Rules
+    tables: Tables
+    wait: int
+    barred: Floats
+
+
+class Scratch(NamedTuple):
+    """The arrays that one decision works on, made once.
+
+    status, run (K,): the progress at the newest pose; high_status, high_run (K,): where the latest feasible
+    time was highest. predicates (K,): their robustness at the newest pose, where it was needed. scores (M,):
+    the latest feasible time after each motion. values, stack: of `evaluate_packed`. corners, ahead: of
+    `score` and `slack`.
+    """
+
+    values: Floats
+    stack: Floats
+    predicates: Floats
+    scores: Floats
+    status: Int8s
+    run: Ints
+    high_status: Int8s
+    high_run: Ints
+    corners: Corners
+    ahead: Corners
+
+
 @inlined
 def latest_at(tables: Tables, table: int, corners: Corners, count: int, h: float) -> float:
     """L at the first `count` of the corners about a place, HOPELESS where none is valid."""
     return read_corners(corners, count, tables.code[table], HOPELESS, h)
 
 
+@inlined
+def settled_goals(tables: Tables, status: Int8s) -> int:
+    """The set of the goals that are settled, as bits."""
+    mask = 0
+    for k in range(status.shape[0]):
+        if status[k] == SETTLED:
+            mask |= tables.bit[k]
+    return mask
+
+
+@inlined
+def _nothing_left(tables: Tables, t: int, mask: int) -> bool:
+    """Whether the goals of `mask` are all that there are, and no `always` is still to begin at step t."""
+    return bool(mask == tables.table.shape[1] - 1 and tables.phase[t] == len(tables.end) - 1)
+
+
 @leaf
-def slack(
-    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
-    run: Ints, corners: Corners,
-) -> float:  # fmt: skip
-    """Steps to spare at (x_t, progress): L - t - early. SAFE once every goal is settled, HOPELESS where
-    something is broken. corners: scratch.
+def slack(guide: Guide, x: float, y: float, theta: float, t: int, scratch: Scratch) -> float:
+    """Steps to spare at x_t with the scratch's progress: L - t - early. SAFE once every goal is settled,
+    HOPELESS where something is broken.
     """
-    return slack_at(body, rules, tables, x, y, theta, t, status, run, corners, UNKNOWN)
+    return slack_at(guide, x, y, theta, t, scratch, scratch.corners, UNKNOWN)
 
 
 @inlined
 def slack_at(
-    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
-    run: Ints, corners: Corners, count: int,
-) -> float:  # fmt: skip
+    guide: Guide, x: float, y: float, theta: float, t: int, scratch: Scratch, corners: Corners, count: int
+) -> float:
     """`slack`, inlined. corners: those about (x, y) where `count` says how many, else scratch."""
+    tables = guide.tables
     if tables.bits.shape[0] > 0:
-        return _steps_ahead(body, rules, tables, x, y, theta, t, status, run)
-    mask, every = 0, 0
-    for k in range(status.shape[0]):
-        if status[k] == BROKEN:
-            return HOPELESS
-        every |= tables.bit[k]
-        if status[k] == SETTLED:
-            mask |= tables.bit[k]
-    if mask == every and tables.phase[t] == len(tables.end) - 1:
+        return _steps_ahead(guide, x, y, theta, t, scratch)
+    if is_broken(scratch.status):
+        return HOPELESS
+    mask = settled_goals(tables, scratch.status)
+    if _nothing_left(tables, t, mask):
         return SAFE
-    v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
+    v, u, h = coordinates(guide.body, tables.pitch, tables.code.shape[2], x, y, theta)
     if count == UNKNOWN:
         count = find_corners(tables.cell, v, u, corners)
-    best = HOPELESS
-    table = tables.table[tables.phase[t], mask]
-    if table >= 0:
-        best = latest_at(tables, table, corners, count, h) - (t + tables.early)
-    for k in range(status.shape[0]):  # a dwell under way: what is left of it, then the rest
-        if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
-            over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
-            if over < tables.phase.shape[0]:
-                best = max(best, _after_dwell(tables, mask | tables.bit[k], every, over, corners, count, h))
-    return best
+    at_once = _slack_with(tables, mask, t, corners, count, h)
+    return max(at_once, _after_dwells(guide, mask, t, corners, count, h, scratch))
 
 
 @leaf
-def _steps_ahead(
-    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
-    run: Ints,
-) -> float:  # fmt: skip
+def _steps_ahead(guide: Guide, x: float, y: float, theta: float, t: int, scratch: Scratch) -> float:
     """How feasible a pose is, step by step: from 0 to 1 now, and as much for each of some delays [steps]
     that it would stand. SAFE once nothing is pending, HOPELESS where it is not feasible at all.
     """
+    rules, tables, status = guide.rules, guide.tables, scratch.status
     progress, pending = 0, False
     for k in range(status.shape[0]):
         if status[k] == BROKEN:
             return HOPELESS
         pending = pending or status[k] == PENDING
         if rules.kind[k] != ALWAYS:
-            digit = min(run[k], tables.dwell[k]) if status[k] == PENDING else tables.dwell[k] + 1
+            settled = tables.dwell[k] + 1
+            digit = min(scratch.run[k], tables.dwell[k]) if status[k] == PENDING else settled
             progress += tables.stride[k] * digit
     if not pending:
         return SAFE
-    v, u, h = coordinates(body, tables.pitch, tables.code.shape[2], x, y, theta)
-    ahead = 0.0
+    v, u, h = coordinates(guide.body, tables.pitch, tables.code.shape[2], x, y, theta)
+    count, ahead = find_corners(tables.cell, v, u, scratch.corners), 0.0
     for delay in DELAYS:
         if t + delay >= tables.bits.shape[0]:
             break
-        ahead += _feasible_at(tables, t + delay, progress, v, u, h)
+        ahead += _feasible_at(tables, t + delay, progress, scratch.corners, count, h)
         if ahead == 0.0:
             return HOPELESS
     return ahead
 
 
 @leaf
-def _feasible_at(tables: Tables, t: int, progress: int, v: float, u: float, h: float) -> float:
-    """The share of the lattice's corners, by weight, from which the formula can be satisfied at step t."""
-    (ny, nx), headings, k = tables.cell.shape, tables.bits.shape[2], int(np.floor(h))
-    share = 0.0
-    for n in range(4):
-        j, i, w = corner(v, u, n)
-        if j < 0 or j >= ny or i < 0 or i >= nx or tables.cell[j, i] < 0:
-            continue
+def _feasible_at(tables: Tables, t: int, progress: int, corners: Corners, count: int, h: float) -> float:
+    """The share of the corners about a place, by weight, from which the rule can be kept at step t."""
+    headings, k, share = tables.bits.shape[2], int(np.floor(h)), 0.0
+    for n in range(count):
         for up in range(2):
-            bits = tables.bits[t, tables.cell[j, i], (k + up) % headings, progress >> 3]
+            bits = tables.bits[t, corners.row[n], (k + up) % headings, progress >> 3]
             if bits >> (progress & 7) & 1:
-                share += w * (h - k if up else 1.0 - h + k)
+                share += corners.weight[n] * (h - k if up else 1.0 - h + k)
     return share
 
 
 @inlined
-def _after_dwell(
-    tables: Tables, mask: int, every: int, t: int, corners: Corners, count: int, h: float
-) -> float:
-    """The slack once a dwell is over, at step t and where it was begun."""
-    if mask == every and tables.phase[t] == len(tables.end) - 1:
+def _slack_with(tables: Tables, mask: int, t: int, corners: Corners, count: int, h: float) -> float:
+    """The slack at step t at the corners about a place, with the goals of `mask` settled."""
+    if _nothing_left(tables, t, mask):
         return float(tables.end[-1] - (t + tables.early))
     table = tables.table[tables.phase[t], mask]
     return latest_at(tables, table, corners, count, h) - (t + tables.early) if table >= 0 else HOPELESS
+
+
+@inlined
+def _after_dwells(
+    guide: Guide, mask: int, t: int, corners: Corners, count: int, h: float, scratch: Scratch
+) -> float:
+    """The slack once a dwell that is under way at step t is over, where it was begun; -inf where none is."""
+    rules, tables, best = guide.rules, guide.tables, -np.inf
+    for k in range(scratch.status.shape[0]):
+        if rules.kind[k] == EVENTUALLY_ALWAYS and scratch.status[k] == PENDING and scratch.run[k] > 0:
+            over = t + rules.b[k] - rules.c2[k] + 1 - scratch.run[k]
+            if over < tables.phase.shape[0]:
+                best = max(best, _slack_with(tables, mask | tables.bit[k], over, corners, count, h))
+    return best
 
 
 @inlined
@@ -174,32 +214,23 @@ def is_broken(status: Int8s) -> bool:
 
 
 @inlined
-def score(
-    body: Body, rules: Rules, tables: Tables, x: float, y: float, theta: float, t: int, status: Int8s,
-    run: Ints, wait: int, last: int, scores: Floats, corners: Corners, ahead: Corners,
-) -> int:  # fmt: skip
-    """L after each motion (M,) from x_t, contact and the step's own progress left out: a cheap order to try
-    motions in.
+def score(guide: Guide, x: float, y: float, theta: float, t: int, last: int, scratch: Scratch) -> int:
+    """L after each motion from x_t into scratch.scores, contact and the step's own progress left out: a cheap
+    order to try motions in.
 
     last: the motion before, -1 for none. HOPELESS for what leads straight back: the tables err by a little.
-    Writes the corners about (x, y) and returns how many there are, UNKNOWN where they were not needed; ahead:
-    scratch.
+    Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN where they
+    were not needed.
     """
-    if tables.bits.shape[0] > 0:
-        scores[:] = SAFE
-        return UNKNOWN
-    mask, every = 0, 0
-    for k in range(status.shape[0]):
-        every |= tables.bit[k]
-        if status[k] == SETTLED:
-            mask |= tables.bit[k]
-    if mask == every and tables.phase[t + 1] == len(tables.end) - 1:
+    body, _, tables, wait, _ = guide
+    scores, mask = scratch.scores, settled_goals(tables, scratch.status)
+    if tables.bits.shape[0] > 0 or _nothing_left(tables, t + 1, mask):
         scores[:] = SAFE
         return UNKNOWN
     table = tables.table[tables.phase[t + 1], mask]
     headings = tables.code.shape[2]
     v, u, h, dv, du = coordinates_ahead(body, tables.pitch, headings, x, y, theta)
-    count = find_corners(tables.cell, v, u, corners)
+    count = find_corners(tables.cell, v, u, scratch.corners)
     for m in range(scores.shape[0]):
         if table < 0 or leads_back(body, last, m):
             scores[m] = HOPELESS
@@ -207,14 +238,10 @@ def score(
         d, angle = displacement(body, m)
         w = heading_after(headings, h, angle)
         if d == 0.0:
-            scores[m] = latest_at(tables, table, corners, count, w)
+            scores[m] = latest_at(tables, table, scratch.corners, count, w)
         else:
-            there = find_corners(tables.cell, v + d * dv, u + d * du, ahead)
-            scores[m] = latest_at(tables, table, ahead, there, w)
-    for k in range(status.shape[0]):
-        if rules.kind[k] == EVENTUALLY_ALWAYS and status[k] == PENDING and run[k] > 0:
-            over = t + rules.b[k] - rules.c2[k] + 1 - run[k]
-            if over < tables.phase.shape[0]:
-                spare = _after_dwell(tables, mask | tables.bit[k], every, over, corners, count, h)
-                scores[wait] = max(scores[wait], spare + (t + tables.early) + 1.0)
+            there = find_corners(tables.cell, v + d * dv, u + d * du, scratch.ahead)
+            scores[m] = latest_at(tables, table, scratch.ahead, there, w)
+    spare = _after_dwells(guide, mask, t, scratch.corners, count, h, scratch)
+    scores[wait] = max(scores[wait], spare + (t + tables.early) + 1.0)
     return count

@@ -14,16 +14,22 @@ from specshield.policy.detour import join
 from specshield.policy.lattice import SHORTEST_MOVE
 from specshield.policy.progress import ALWAYS, EVENTUALLY, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules, advance
 from specshield.policy.reachability.guide import (
-    Guide,
-    Scratch,
     copy_progress,
     fill,
     is_over,
     predicate_at,
-    read_pending,
+    read_due,
     update_progress,
 )
-from specshield.policy.reachability.tables import HOPELESS, goals_settled, is_broken, score, slack
+from specshield.policy.reachability.tables import (
+    HOPELESS,
+    Guide,
+    Scratch,
+    goals_settled,
+    is_broken,
+    score,
+    slack,
+)
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import step
 
@@ -57,11 +63,7 @@ def climb(
     x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
     high, high_n = -np.inf, n
     while n < steps and not is_over(rules, tables, t + n, status):
-        last = motions[n - 1]
-        score(
-            body, rules, tables, x, y, theta, t + n, status, run, wait, last, scores, scratch.corners,
-            scratch.ahead,
-        )  # fmt: skip
+        score(guide, x, y, theta, t + n, motions[n - 1], scratch)
         gained = n == high_n or scores[wait] > high + CLIMB_GAIN
         for k in range(k_count):
             gained = gained or status[k] != scratch.high_status[k]
@@ -100,7 +102,7 @@ def climb(
             poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
             n += 1
             if goal >= 0:  # it is settled; where there is time, the robot goes deeper into it
-                spare = slack(body, rules, tables, x, y, theta, t + n, status, run, scratch.corners) - SPARE
+                spare = slack(guide, x, y, theta, t + n, scratch) - SPARE
                 n = _deepen(guide, t, n, goal, min(rules.b[goal], t + n + spare), motions, poses, scratch)
                 x, y, theta = poses[n - 1, 0], poses[n - 1, 1], poses[n - 1, 2]
             continue
@@ -114,7 +116,7 @@ def climb(
             return STUCK, high_n
         # Waiting stays best until it changes the progress, or the phase ends.
         pending = _pending(status)
-        read_pending(rules, x, y, theta, scratch)
+        read_due(rules, t + steps, x, y, theta, scratch)
         while n < steps:
             advance(rules, t + n + 1, scratch.predicates, status, run)
             motions[n] = wait
@@ -125,7 +127,7 @@ def climb(
         if is_broken(status):
             break
         high_n = n  # a robot that waits is not stuck
-    fill(n, wait, x, y, theta, motions, poses)
+    fill(n, wait, motions, poses)
     return (SETTLED_ALL if goals_settled(rules, status) else FAILED), n
 
 
@@ -142,8 +144,7 @@ def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scra
     """Whether a pose at step t breaks nothing. Leaves its predicates in the scratch, and the progress."""
     for k in range(rules.kind.shape[0]):
         kind = rules.kind[k]
-        opens = rules.a[k] + (rules.c2[k] if kind == EVENTUALLY_ALWAYS else 0)
-        if scratch.status[k] != PENDING or t < opens:
+        if scratch.status[k] != PENDING or t < rules.a[k] + rules.c2[k]:
             continue
         scratch.predicates[k] = predicate_at(rules, k, x, y, theta, scratch)
         if scratch.predicates[k] > rules.margin:
@@ -213,9 +214,17 @@ def _deepen(
 
 @leaf
 def rejoin(
-    guide: Guide, t: int, turn: int, move: int, base: Ints, led: Floats, at: int, motions: Ints,
-    poses: Floats, scratch: Scratch,
-) -> bool:  # fmt: skip
+    guide: Guide,
+    t: int,
+    turn: int,
+    move: int,
+    base: Ints,
+    led: Floats,
+    at: int,
+    motions: Ints,
+    poses: Floats,
+    scratch: Scratch,
+) -> bool:
     """Goes on from motions[:1] by `turn` and `move`, then by `base`, a way to every goal: see `join`.
 
     led (T - t, 3): the poses of `base`, which are taken over from where the robot is at the very same pose.
@@ -244,10 +253,10 @@ def rejoin(
             looked = False
         else:
             if not looked:
-                read_pending(rules, x, y, theta, scratch)
+                read_due(rules, t + motions.shape[0], x, y, theta, scratch)
             looked = True
             advance(rules, t + n + 1, scratch.predicates, scratch.status, scratch.run)
         poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
         n += 1
-    fill(n, wait, x, y, theta, motions, poses)
+    fill(n, wait, motions, poses)
     return goals_settled(rules, scratch.status)

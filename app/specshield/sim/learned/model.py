@@ -65,9 +65,11 @@ def target_of(instruction: str) -> str:
     named = [kind for kind in KINDS if kind in re.findall(r"\w+", instruction.lower())]
     if len(named) != 1:
         raise NotFound(
-            f"the learned model does not know what to find: {instruction!r}", path="instruction",
-            got=instruction, expected=f"a sentence with one of {', '.join(KINDS)}",
-        )  # fmt: skip
+            f"the learned model does not know what to find: {instruction!r}",
+            path="instruction",
+            got=instruction,
+            expected=f"a sentence with one of {', '.join(KINDS)}",
+        )
     return named[0]
 
 

@@ -100,16 +100,20 @@ def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Singles]:
     """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
     if sorted(weights) != sorted(SHAPES):
         raise PolicyError(
-            "not the tensors of a foundation model", path="weights", got=sorted(weights),
+            "not the tensors of a foundation model",
+            path="weights",
+            got=sorted(weights),
             expected=str(sorted(SHAPES)),
-        )  # fmt: skip
+        )
     for name, shape in SHAPES.items():
         array = weights[name]
         if array.dtype != np.float32 or array.shape != shape or not np.isfinite(array).all():
             raise PolicyError(
-                "a tensor is not finite float32 of the right shape", path=f"weights.{name}",
-                got=f"{array.dtype} {list(array.shape)}", expected=f"float32 {list(shape)}",
-            )  # fmt: skip
+                "a tensor is not finite float32 of the right shape",
+                path=f"weights.{name}",
+                got=f"{array.dtype} {list(array.shape)}",
+                expected=f"float32 {list(shape)}",
+            )
     return {name: np.ascontiguousarray(weights[name], np.float32) for name in SHAPES}
 
 

@@ -13,10 +13,11 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from specshield.arrays import Bools, Floats, Int8s
-from specshield.compiled import kernel, leaf
+from specshield.compiled import inlined, kernel
 from specshield.policy.geodesic import geodesic_distance
-from specshield.policy.progress import ALWAYS, EVENTUALLY, PENDING, Rules
-from specshield.policy.reachability.guide import make_scratch, predicate_at
+from specshield.policy.progress import ALWAYS, PENDING, Rules
+from specshield.policy.reachability.guide import due, make_scratch, predicate_at
+from specshield.policy.reachability.tables import Guide
 from specshield.robot.body import Body, centre
 
 COARSE = 2  # cells of the map to a side of a field's, at least: 10 cm where the map has 5. By hand.
@@ -67,15 +68,14 @@ def distances(body: Body, goals: Bools) -> Floats:
     return found
 
 
-@leaf
+@inlined
 def spare_on(
-    body: Body, rules: Rules, fields: Floats, stride: float, x: float, y: float, theta: float, t: int,
-    status: Int8s,
-) -> float:  # fmt: skip
+    guide: Guide, fields: Floats, stride: float, x: float, y: float, theta: float, t: int, status: Int8s
+) -> float:
     """The steps that moves of `stride` [m] straight to any one pending goal leave, at the least; inf where
     no distance is known. fields [K, ny, nx]: as `distances` gives them.
     """
-    least = math.inf
+    body, rules, least = guide.body, guide.rules, math.inf
     if fields.shape[0] == 0 or stride == 0.0:
         return least
     u, v = centre(body, x, y, theta)
@@ -87,11 +87,3 @@ def spare_on(
         if rules.kind[k] != ALWAYS and status[k] == PENDING and fields[k, j, i] < math.inf:
             least = min(least, due(rules, k) - t - fields[k, j, i] / stride)
     return least
-
-
-@leaf
-def due(rules: Rules, goal: int) -> int:
-    """The last step by which a robot can come to where a goal's predicate holds."""
-    if rules.kind[goal] == EVENTUALLY:
-        return int(rules.b[goal])
-    return int(rules.c1[goal] + rules.c2[goal])

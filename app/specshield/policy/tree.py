@@ -1,0 +1,107 @@
+"""The poses that a search over exact motions has come to, and how it came to each."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from specshield.arrays import Floats, Int8s, Int32s, Ints
+from specshield.compiled import inlined, kernel, leaf
+from specshield.policy.heap import Heap
+
+
+class Tree(NamedTuple):
+    """N poses [N, 3], the root first, each with its progress, status and run [N, K]; the motions made up to
+    it, its parent and the motion that led to it, [N].
+
+    heap: the rows to go on from. table: where poses are looked up, at most half full; -1 where no row is.
+    """
+
+    pose: Floats
+    status: Int8s
+    run: Ints
+    made: Int32s
+    parent: Int32s
+    motion: Int32s
+    heap: Heap
+    table: Int32s
+
+
+@inlined
+def table_size(rows: int) -> int:
+    """The size of a table that so many rows leave half empty at least: a power of two."""
+    size = 4
+    while size < 2 * rows:
+        size *= 2
+    return size
+
+
+@kernel
+def make_tree(most: int, obligations: int) -> Tree:
+    """Room for `most` poses with the progress of so many obligations."""
+    return Tree(
+        pose=np.empty((most, 3)),
+        status=np.empty((most, obligations), np.int8),
+        run=np.empty((most, obligations), np.int64),
+        made=np.empty(most, np.int32),
+        parent=np.empty(most, np.int32),
+        motion=np.empty(most, np.int32),
+        heap=Heap(np.empty(most, np.int32), np.empty(most)),
+        table=np.full(table_size(most), -1, np.int32),
+    )
+
+
+@inlined
+def put(tree: Tree, row: int, x: float, y: float, theta: float, made: int, parent: int, motion: int) -> None:
+    """Writes a pose and how it was come to; the progress there is left as it is."""
+    tree.pose[row, 0], tree.pose[row, 1], tree.pose[row, 2] = x, y, theta
+    tree.made[row], tree.parent[row], tree.motion[row] = made, parent, motion
+
+
+@inlined
+def first_slot(tree: Tree, key: int) -> int:
+    """Where in the table to look first for what has this key."""
+    return int((key ^ key >> 15) & (tree.table.shape[0] - 1))
+
+
+@leaf
+def is_new(tree: Tree, row: int, grain: float, sooner: bool) -> bool:
+    """Whether no row that is remembered has nearly the same pose and the same progress; where `sooner`, none
+    that was reached in as few motions. The row is then remembered.
+
+    grain: poses that differ by less [m], and by less than a degree, are nearly the same. Only rows of one
+    grain are compared.
+    """
+    x, y, h = _rounded(tree.pose, row, grain)
+    key = x * 73856093 ^ y * 19349663 ^ h * 83492791
+    for k in range(tree.status.shape[1]):
+        key = key * 31 + tree.status[row, k]
+    slot = first_slot(tree, key)
+    while tree.table[slot] >= 0:
+        other = tree.table[slot]
+        same = _rounded(tree.pose, other, grain) == (x, y, h)
+        for k in range(tree.status.shape[1]):
+            same = same and tree.status[row, k] == tree.status[other, k]
+        if same and not (sooner and tree.made[row] < tree.made[other]):
+            return False
+        if same:
+            break
+        slot = (slot + 1) & (tree.table.shape[0] - 1)
+    tree.table[slot] = row
+    return True
+
+
+@leaf
+def _rounded(pose: Floats, row: int, grain: float) -> tuple[int, int, int]:
+    x, y, h = pose[row, 0] / grain, pose[row, 1] / grain, math.degrees(pose[row, 2])
+    return math.floor(x), math.floor(y), math.floor(h + 0.5)
+
+
+@leaf
+def trace(tree: Tree, row: int, motions: Ints) -> None:
+    """Writes the motions from the root to a row into the first of `motions`."""
+    while tree.parent[row] >= 0:
+        motions[tree.made[row] - 1] = tree.motion[row]
+        row = tree.parent[row]
