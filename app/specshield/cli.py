@@ -122,13 +122,19 @@ def serve(
         url = embedded.url if embedded is not None else str(settings.redis_url)
         check_files(url, settings.files_at, settings.store_timeout)
     options: dict[str, Any] = {
-        "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
-        "ws_max_size": settings.max_body_bytes, "ws_max_queue": 8, "ws_per_message_deflate": False,
+        "host": host,
+        "port": port,
+        "workers": workers,
+        "access_log": False,
+        "server_header": False,
+        "ws_max_size": settings.max_body_bytes,
+        "ws_max_queue": 8,
+        "ws_per_message_deflate": False,
         "timeout_graceful_shutdown": GRACE,
         "log_config": logs.config(settings.log_format, settings.log_level),
         "http": "specshield.service.bounds.protocol:BoundedProtocol",
         "timeout_keep_alive": settings.keep_alive_timeout,
-    }  # fmt: skip
+    }
     # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if workers == 1:

@@ -37,9 +37,10 @@ def check_installed() -> None:
         import websockets  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"stream=True needs the package {error.name}, which is not installed", path="stream",
+            f"stream=True needs the package {error.name}, which is not installed",
+            path="stream",
             expected="pip install 'specshield[stream]', or stream=False",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def packed(request: Request) -> bytes | None:
@@ -66,9 +67,12 @@ class Streams:
     def _options(self, seconds: float) -> dict[str, Any]:
         key = self._http.headers.get("Authorization")
         return {
-            "additional_headers": {} if key is None else {"Authorization": key}, "compression": None,
-            "ping_interval": None, "open_timeout": seconds, "max_size": LONGEST,
-        }  # fmt: skip
+            "additional_headers": {} if key is None else {"Authorization": key},
+            "compression": None,
+            "ping_interval": None,
+            "open_timeout": seconds,
+            "max_size": LONGEST,
+        }
 
     def _read(self, exchange: Exchange, message: bytes | str) -> Reply | None:
         """None for what is no answer, or one about another step."""

@@ -96,9 +96,10 @@ def _parts(parts: Sequence[str]) -> Iterator[Finding]:
         yield Finding("ok", f"torch {version('torch')}: policies can learn here")
         return
     yield Finding(
-        "note", "torch is not installed: policies are computed, and none learns (method `dqn`)",
+        "note",
+        "torch is not installed: policies are computed, and none learns (method `dqn`)",
         "pip install 'specshield[train]' where that is wanted",
-    )  # fmt: skip
+    )
 
 
 def _kernels() -> Iterator[Finding]:
@@ -108,16 +109,18 @@ def _kernels() -> Iterator[Finding]:
     mark = mark_of_kernels()
     if mark is None:
         yield Finding(
-            "note", f"no compiled kernel can be kept in {compiled.BASE}: every start compiles them all",
+            "note",
+            f"no compiled kernel can be kept in {compiled.BASE}: every start compiles them all",
             "set NUMBA_CACHE_DIR to a folder that can be written to",
-        )  # fmt: skip
+        )
     elif mark.exists():
         yield Finding("ok", f"the kernels are compiled ({compiled.BASE})")
     else:
         yield Finding(
-            "note", f"the first start will compile the kernels, for about {TAKES} s on two cores",
+            "note",
+            f"the first start will compile the kernels, for about {TAKES} s on two cores",
             "python -m specshield.service.startup does so now",
-        )  # fmt: skip
+        )
 
 
 def _disk(settings: Settings) -> Iterator[Finding]:
@@ -133,9 +136,10 @@ def _disk(settings: Settings) -> Iterator[Finding]:
     free = shutil.disk_usage(near).free
     if free < settings.disk_reserve_bytes:
         yield Finding(
-            "wrong", f"{free >> 20} MiB are free for the data folder {there}",
+            "wrong",
+            f"{free >> 20} MiB are free for the data folder {there}",
             f"at least {settings.disk_reserve_bytes >> 20} MiB, or no session begins",
-        )  # fmt: skip
+        )
     else:
         yield Finding("ok", f"data folder {there.absolute()}, {free >> 30} GiB free")
 
@@ -179,10 +183,11 @@ def _port(port: int) -> Iterator[Finding]:
         socket.create_server(("127.0.0.1", port)).close()
     except OSError as error:
         yield Finding(
-            "note", f"port {port} is taken: {error.strerror}",
+            "note",
+            f"port {port} is taken: {error.strerror}",
             f"a server may run there already: specshield doctor --url http://127.0.0.1:{port}; "
             "or serve elsewhere, by --port",
-        )  # fmt: skip
+        )
     else:
         yield Finding("ok", f"port {port} is free")
 
@@ -214,9 +219,10 @@ def _server(url: str) -> Iterator[Finding]:
     theirs = _object(told).get("info", {}).get("version")
     if theirs not in (None, __version__):
         yield Finding(
-            "note", f"the server is specshield {theirs}, this is {__version__}",
+            "note",
+            f"the server is specshield {theirs}, this is {__version__}",
             "the same version on both sides",
-        )  # fmt: skip
+        )
     date = ready.headers.get("date")
     if date is not None:
         apart = email.utils.parsedate_to_datetime(date).timestamp() - began

@@ -79,8 +79,10 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
         if not image.is_file():
             raise InputError(
                 f"{path} names the image {metadata.get('image')!r}, which is not beside it",
-                path="--map", got=str(image), expected="the map's PGM or PNG beside its YAML",
-            )  # fmt: skip
+                path="--map",
+                got=str(image),
+                expected="the map's PGM or PNG beside its YAML",
+            )
         return client.maps.upload(path, image)
     content = _mapping(_read(path, "--map"), path, "--map")
     if "rooms" in content:
@@ -89,9 +91,11 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
     if "info" in content:
         return client.maps.occupancy_grid(content["info"], content.get("data", []))
     raise InputError(
-        f"{path} is no map of a known form", path="--map", got=sorted(content)[:8],
+        f"{path} is no map of a known form",
+        path="--map",
+        got=sorted(content)[:8],
         expected="a ROS map's YAML beside its image, a ProcTHOR house, or a nav_msgs/OccupancyGrid as JSON",
-    )  # fmt: skip
+    )
 
 
 def _robot(robot: str) -> str | Mapping[str, Any]:

@@ -123,14 +123,30 @@ def _again(
         raise InputError(f"the pose sent at step {t} is not the one stored", t=t)
     logits, points = kept.logits_sent(), (kept.points_sent("occupied"), kept.points_sent("free"))
     decision = episode.decide(
-        shield, rows[:, :3], logits, kept.main_task_done, columns(rows, names), carry, kept.all_witnesses,
-        *points, explanations if kept.explain else None,
-    )  # fmt: skip
+        shield,
+        rows[:, :3],
+        logits,
+        kept.main_task_done,
+        columns(rows, names),
+        carry,
+        kept.all_witnesses,
+        *points,
+        explanations if kept.explain else None,
+    )
     made = record.make(
-        replace(decision, t=t), rows[-1], kept.before, kept.pose_sent(rows[-1]).tolist(), logits,
-        kept.main_task_done, kept.signals_sent(rows[-1], names), names, kept.all_witnesses, *points,
-        kept.explain, kept.tables,
-    )  # fmt: skip
+        replace(decision, t=t),
+        rows[-1],
+        kept.before,
+        kept.pose_sent(rows[-1]).tolist(),
+        logits,
+        kept.main_task_done,
+        kept.signals_sent(rows[-1], names),
+        names,
+        kept.all_witnesses,
+        *points,
+        kept.explain,
+        kept.tables,
+    )
     return made, pack_carry(decision.carry).unpacked()
 
 

@@ -134,9 +134,11 @@ class Keys:
         record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
             raise InputError(
-                "there is a key of this name", path="name", got=name,
+                "there is a key of this name",
+                path="name",
+                got=name,
                 expected="another; or revoke that one first",
-            )  # fmt: skip
+            )
         await _reached(self._store.hincrby(KEYS, "", 1))
         return secret
 

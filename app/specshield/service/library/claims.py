@@ -87,9 +87,11 @@ class Claims:
         """
         if files.HASH.fullmatch(name) or (id in shipped.values() and shipped.get(name) != id):
             raise InputError(
-                "this cannot be named so", path="name", got=name,
+                "this cannot be named so",
+                path="name",
+                got=name,
                 expected="a name that does not look like an id, for what did not come with the server",
-            )  # fmt: skip
+            )
         bearer = shipped.get(name) or self.named(kind, name, owner)
         if bearer not in (None, id):
             raise taken(name, str(bearer))
@@ -124,8 +126,9 @@ class Claims:
             whose, limit = ("this key's", most) if said == "owner" else ("the server's", limits[3])
             raise InsufficientStorage(
                 f"{whose} maps and policies may take {limit} bytes, and {size} more do not fit",
-                expected="room for it: delete a map or a policy", limit=limit,
-            )  # fmt: skip
+                expected="room for it: delete a map or a policy",
+                limit=limit,
+            )
         if said == "no map":
             raise NotFound("the map was deleted", path="map_id", got=map_id, expected="an id from /v1/maps")
         try:

@@ -67,9 +67,11 @@ def check_writable(folder: Path, name: str) -> None:
             pass
     except OSError as error:
         raise InputError(
-            f"{name} cannot be used: {error.strerror}", path=name, got=str(folder),
+            f"{name} cannot be used: {error.strerror}",
+            path=name,
+            got=str(folder),
             expected="a folder to write to",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def read_json(path: Path) -> Any:

@@ -122,9 +122,10 @@ class Maps(Claimed):
             return found
         if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
             raise MapError(
-                "the outlines of the rooms are too large", path="rooms",
+                "the outlines of the rooms are too large",
+                path="rooms",
                 expected=f"at most {self._max_rooms} bytes as JSON: simpler outlines",
-            )  # fmt: skip
+            )
         made, folder = Map(id, grid, rooms), self._folder / id
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
         content = {"map.yaml": dump_map(grid)[0].encode(), "map.png": made.png(), "map.json": meta}
@@ -142,15 +143,20 @@ class Maps(Claimed):
         if found is not None:
             raise InUse(
                 f"map {found.name!r} came with the server and cannot be deleted",
-                path="map_id", got=key, expected="a map that was sent here",
-            )  # fmt: skip
+                path="map_id",
+                got=key,
+                expected="a map that was sent here",
+            )
         key, token = self._id_of(key, owner), secrets.token_hex(8)
         user = self._claims.mark("maps", key, owner, token)
         if user is not None:
             raise InUse(
-                f"policy {user!r} is for this map", path="map_id", got=key,
-                expected="a map that no policy is for: delete the policy first", policy_id=user,
-            )  # fmt: skip
+                f"policy {user!r} is for this map",
+                path="map_id",
+                got=key,
+                expected="a map that no policy is for: delete the policy first",
+                policy_id=user,
+            )
         try:
             if self._claims.free("maps", key, owner, token):
                 self._recent.drop(key)
@@ -161,9 +167,11 @@ class Maps(Claimed):
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
         """One page of an owner's maps and those of all, as JSON, had without reading the cells."""
         keys, following = files.page(
-            [*self._named, *self._own(owner)], after, limit,
+            [*self._named, *self._own(owner)],
+            after,
+            limit,
             lambda key: files.size(self._folder / key / "map.json"),
-        )  # fmt: skip
+        )
         names, shown = self._claims.names("maps", owner), []
         for key in keys:
             with suppress(NotFound):  # deleted at this moment

@@ -116,9 +116,11 @@ class Policies(Claimed):
     def _load(self, record: Record) -> Proposer:
         if record.card is None:
             raise PolicyError(
-                f"policy {record.id} is not ready", path="policy_id", got=record.id,
+                f"policy {record.id} is not ready",
+                path="policy_id",
+                got=record.id,
                 expected="a policy whose status is `ready`",
-            )  # fmt: skip
+            )
         folder = self._models / record.name if record.name else self._folder / record.id
         return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
 
@@ -137,9 +139,11 @@ class Policies(Claimed):
         size = len(files.to_json(spec))
         if size > self._max_spec:
             raise InputError(
-                "the spec is too large", path="spec", got=f"{size} bytes as JSON",
+                "the spec is too large",
+                path="spec",
+                got=f"{size} bytes as JSON",
                 expected=f"at most {self._max_spec}, regions that the formula does not name left out",
-            )  # fmt: skip
+            )
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)
 
@@ -252,9 +256,11 @@ class Policies(Claimed):
         """One page of an owner's policies and those of all."""
         own = (id for id in self._claims.ids("policies", owner) if (self._folder / id).is_dir())
         keys, following = files.page(
-            [*self._named, *own], after, limit,
+            [*self._named, *own],
+            after,
+            limit,
             lambda key: sum(files.size(self._folder / key / name) for name in ("policy.json", "card.json")),
-        )  # fmt: skip
+        )
         found = [self.made_here(key) for key in keys]  # None: deleted at this moment
         return [record for record in found if record is not None], following
 

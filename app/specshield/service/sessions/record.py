@@ -134,11 +134,20 @@ def link(last: bytes, rows: Floats) -> bytes:
 
 
 def make(
-    decision: Decision, row: Floats, before: bytes, pose: Sequence[float], logits: Floats | None,
-    main_task_done: bool, signals: Mapping[str, float], names: Sequence[str], all_witnesses: bool,
-    occupied: Floats | None = None, free: Floats | None = None, explain: bool = False,
+    decision: Decision,
+    row: Floats,
+    before: bytes,
+    pose: Sequence[float],
+    logits: Floats | None,
+    main_task_done: bool,
+    signals: Mapping[str, float],
+    names: Sequence[str],
+    all_witnesses: bool,
+    occupied: Floats | None = None,
+    free: Floats | None = None,
+    explain: bool = False,
     tables: bytes | None = None,
-) -> StepRecord:  # fmt: skip
+) -> StepRecord:
     """The record of `decision`, made at step t and its stored `row` for a caller who sent what follows.
 
     logits [A], -inf for null. names: of the rows' signals, by column.
@@ -150,32 +159,56 @@ def make(
     actions[:, 2:] = decision.next_poses
     rows, table, pool = _pack_table(actions, row)
     return StepRecord(
-        format=FORMAT, before=before, t=decision.t, pose=None if sent == row[:3].tobytes() else sent,
-        logits=None if logits is None else _sparse(logits, -math.inf, True), main_task_done=main_task_done,
-        signals=sum(1 << i for i, name in enumerate(names) if name in signals), all_witnesses=all_witnesses,
-        mode=decision.mode, distribution=_sparse(decision.distribution, 0.0, False), rows=rows, table=table,
-        pool=pool, action=decision.action, completion_action=decision.completion_action,
-        spec_status=decision.spec_status, feasible_mass=decision.feasible_mass, kl=decision.kl,
-        reason=decision.reason, finished=decision.finished, residual=decision.residual,
+        format=FORMAT,
+        before=before,
+        t=decision.t,
+        pose=None if sent == row[:3].tobytes() else sent,
+        logits=None if logits is None else _sparse(logits, -math.inf, True),
+        main_task_done=main_task_done,
+        signals=sum(1 << i for i, name in enumerate(names) if name in signals),
+        all_witnesses=all_witnesses,
+        mode=decision.mode,
+        distribution=_sparse(decision.distribution, 0.0, False),
+        rows=rows,
+        table=table,
+        pool=pool,
+        action=decision.action,
+        completion_action=decision.completion_action,
+        spec_status=decision.spec_status,
+        feasible_mass=decision.feasible_mass,
+        kl=decision.kl,
+        reason=decision.reason,
+        finished=decision.finished,
+        residual=decision.residual,
         in_collision=decision.in_collision,
         witness=None if decision.witness is None else bytes(decision.witness),
         witnesses=tuple(None if w is None else bytes(w) for w in decision.witnesses),
-        warnings=decision.warnings, margin=decision.margin, slack=decision.slack,
-        threshold_left=decision.threshold_left, map_revision=decision.map_revision,
+        warnings=decision.warnings,
+        margin=decision.margin,
+        slack=decision.slack,
+        threshold_left=decision.threshold_left,
+        map_revision=decision.map_revision,
         occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
-        free=None if free is None else free.astype("<f8").tobytes(), explain=explain,
-        explanations=_explained(decision), tables=tables, any_signal=decision.any_signal,
-    )  # fmt: skip
+        free=None if free is None else free.astype("<f8").tobytes(),
+        explain=explain,
+        explanations=_explained(decision),
+        tables=tables,
+        any_signal=decision.any_signal,
+    )
 
 
 def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
     """What the caller is answered: to the byte as `answer` has it of the record, in a third of the time."""
     return _answer(
-        decision, action_name=decision.action_name, distribution=decision.distribution,
-        j_values=list(decision.j_values), robustness=list(decision.robustness),
-        next_poses=decision.next_poses, explanations=_explained(decision) if explain else None,
+        decision,
+        action_name=decision.action_name,
+        distribution=decision.distribution,
+        j_values=list(decision.j_values),
+        robustness=list(decision.robustness),
+        next_poses=decision.next_poses,
+        explanations=_explained(decision) if explain else None,
         all_witnesses=all_witnesses,
-    )  # fmt: skip
+    )
 
 
 def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
@@ -190,19 +223,27 @@ def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
     table = _unpack_table(record, row)
     distribution = _full(record.distribution, len(record.rows), 0.0, False)
     return _answer(
-        record, action_name=names[record.action], distribution=distribution,
+        record,
+        action_name=names[record.action],
+        distribution=distribution,
         j_values=[None if value != value else value for value in table[:, 0].tolist()],
         robustness=[None if value != value else value for value in table[:, 1].tolist()],
-        next_poses=table[:, 2:], explanations=record.explanations if record.explain else None,
+        next_poses=table[:, 2:],
+        explanations=record.explanations if record.explain else None,
         all_witnesses=record.all_witnesses,
-    )  # fmt: skip
+    )
 
 
 def _answer(
-    made: Decision | StepRecord, action_name: str, distribution: Floats, j_values: list[float | None],
-    robustness: list[float | None], next_poses: Floats, explanations: tuple[Explanation | None, ...] | None,
+    made: Decision | StepRecord,
+    action_name: str,
+    distribution: Floats,
+    j_values: list[float | None],
+    robustness: list[float | None],
+    next_poses: Floats,
+    explanations: tuple[Explanation | None, ...] | None,
     all_witnesses: bool,
-) -> StepAnswer:  # fmt: skip
+) -> StepAnswer:
     """Of a decision or its record; what follows `made` are the members that the two hold in different forms.
 
     distribution [A], next_poses [A, 3]; explanations: None where they were not asked for.
@@ -213,15 +254,30 @@ def _answer(
     if all_witnesses:
         asked["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
     return StepAnswer(
-        t=made.t, mode=made.mode, distribution=distribution.tolist(), j_values=j_values,
-        robustness=robustness, action=made.action, action_name=action_name,
-        completion_action=made.completion_action, spec_status=made.spec_status,
-        feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason, finished=made.finished,
-        next_poses=next_poses.tolist(), residual=None if made.residual is None else Residual(*made.residual),
-        in_collision=made.in_collision, witness=None if made.witness is None else list(made.witness),
-        warnings=made.warnings, margin=made.margin, slack=made.slack, threshold_left=made.threshold_left,
-        map_revision=made.map_revision, **asked,
-    )  # fmt: skip
+        t=made.t,
+        mode=made.mode,
+        distribution=distribution.tolist(),
+        j_values=j_values,
+        robustness=robustness,
+        action=made.action,
+        action_name=action_name,
+        completion_action=made.completion_action,
+        spec_status=made.spec_status,
+        feasible_mass=made.feasible_mass,
+        kl=made.kl,
+        reason=made.reason,
+        finished=made.finished,
+        next_poses=next_poses.tolist(),
+        residual=None if made.residual is None else Residual(*made.residual),
+        in_collision=made.in_collision,
+        witness=None if made.witness is None else list(made.witness),
+        warnings=made.warnings,
+        margin=made.margin,
+        slack=made.slack,
+        threshold_left=made.threshold_left,
+        map_revision=made.map_revision,
+        **asked,
+    )
 
 
 def _finite(value: float) -> float | None:

@@ -137,14 +137,19 @@ def check_step(session: Session, request: StepBody) -> None:
     check_last(t, session.config["max_steps"])
     if t < state.next_t:
         raise StepConflict(
-            f"step {t} was passed over and can no longer be decided", path="t", got=t,
-            expected=f"{state.next_t} or later", expected_t=state.next_t,
-        )  # fmt: skip
+            f"step {t} was passed over and can no longer be decided",
+            path="t",
+            got=t,
+            expected=f"{state.next_t} or later",
+            expected_t=state.next_t,
+        )
     if state.main_task_done and not request.main_task_done:
         raise StepConflict(
             "an earlier step said that the main task is done, which cannot be taken back",
-            path="main_task_done", got=False, expected="true",
-        )  # fmt: skip
+            path="main_task_done",
+            got=False,
+            expected="true",
+        )
 
 
 def check_last(t: int, last: int) -> None:
@@ -219,9 +224,11 @@ def pack(rows: Floats) -> bytes:
 
 def over(session: Session, t: int) -> SessionFinished:
     return SessionFinished(
-        f"session {session.id!r} is over: no further step is decided", path="t", got=t,
+        f"session {session.id!r} is over: no further step is decided",
+        path="t",
+        got=t,
         expected="a step already decided, to read it again",
-    )  # fmt: skip
+    )
 
 
 def there(found: F | None, key: str) -> F:
@@ -234,9 +241,11 @@ def there(found: F | None, key: str) -> F:
 def missing(key: str) -> NotFound:
     id = shown(key)
     return NotFound(
-        f"there is no session {id!r}; it may have expired", path="id", got=id,
+        f"there is no session {id!r}; it may have expired",
+        path="id",
+        got=id,
         expected="an id from /v1/sessions",
-    )  # fmt: skip
+    )
 
 
 def contended(key: str) -> Conflict:

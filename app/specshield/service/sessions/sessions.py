@@ -96,9 +96,15 @@ class Sessions:
         feasible, withstands = begun
         carry = handover.begun(rules.way(config))
         state = State(
-            1, 0, feasible, status, self._expiry(), record.digest(content),
-            carry=None if carry is None else pack_carry(carry), any_signal=withstands,
-        )  # fmt: skip
+            1,
+            0,
+            feasible,
+            status,
+            self._expiry(),
+            record.digest(content),
+            carry=None if carry is None else pack_carry(carry),
+            any_signal=withstands,
+        )
         stored_as = scoped(key.name, config["id"])
         await self._store.create(stored_as, content, Change(state.packed(), pack(rows)))
         try:  # whoever deletes a policy sees this session now, or has marked the policy before
@@ -162,18 +168,24 @@ class Sessions:
                 last = session.config["max_steps"] + 1  # where the last step led
                 if request.t > last:
                     raise InputError(
-                        f"step {request.t} is past the session's last", path="t", got=request.t,
+                        f"step {request.t} is past the session's last",
+                        path="t",
+                        got=request.t,
                         expected=f"at most {last}",
-                    )  # fmt: skip
+                    )
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
                     raise over(session, request.t)
             session, status, bounds = await self._run(self._closed, session)
             if not state.closed:
                 state = msgspec.structs.replace(
-                    session.state, length=len(session.rows), spec_status=status, finished=True, closed=True,
+                    session.state,
+                    length=len(session.rows),
+                    spec_status=status,
+                    finished=True,
+                    closed=True,
                     expires_at=self._expiry(),
-                )  # fmt: skip
+                )
                 change = Change(state.packed(), *session.added())
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue

@@ -57,16 +57,32 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
         # Writable: kernels were compiled for that.
         poses = np.frombuffer(self.next_poses, "<f8").reshape(-1, 3).copy()
         return Carry(
-            self.t, poses, self.witnesses, self.memory, self.residuals, self.threshold_left, self.learned,
-            self.action, self.way, self.stuck,
-        )  # fmt: skip
+            self.t,
+            poses,
+            self.witnesses,
+            self.memory,
+            self.residuals,
+            self.threshold_left,
+            self.learned,
+            self.action,
+            self.way,
+            self.stuck,
+        )
 
 
 def pack_carry(carry: Carry) -> PackedCarry:
     return PackedCarry(
-        carry.t, carry.next_poses.astype("<f8", copy=False).tobytes(), carry.witnesses, carry.memory,
-        carry.residuals, carry.threshold_left, carry.learned, carry.action, carry.way, carry.stuck,
-    )  # fmt: skip
+        carry.t,
+        carry.next_poses.astype("<f8", copy=False).tobytes(),
+        carry.witnesses,
+        carry.memory,
+        carry.residuals,
+        carry.threshold_left,
+        carry.learned,
+        carry.action,
+        carry.way,
+        carry.stuck,
+    )
 
 
 _encoder = msgspec.msgpack.Encoder()

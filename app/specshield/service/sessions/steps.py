@@ -178,11 +178,16 @@ class Steps:
     def _change(self, decided: Decided, request: StepBody) -> tuple[Change, State]:
         session, decision, content = decided.session, decided.decision, record.encode(decided.record)
         state = msgspec.structs.replace(
-            session.state, length=len(session.rows), next_t=len(session.rows),
-            spec_status=decision.spec_status, expires_at=time.time() + self._ttl,
-            head=record.digest(content), main_task_done=request.main_task_done, finished=decision.finished,
+            session.state,
+            length=len(session.rows),
+            next_t=len(session.rows),
+            spec_status=decision.spec_status,
+            expires_at=time.time() + self._ttl,
+            head=record.digest(content),
+            main_task_done=request.main_task_done,
+            finished=decision.finished,
             carry=pack_carry(decision.carry),
-        )  # fmt: skip
+        )
         return Change(state.packed(), *session.added(), request.t, content), state
 
     async def _decide(self, session: Session, request: StepBody, timing: dict[str, float]) -> Decided:
@@ -235,16 +240,34 @@ def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Sess
         shield, tables = shields.tables.of(session.config["nonce"], shield, known)
     since = session.since
     decision = episode.decide(
-        shield, since[:, :3], logits, request.main_task_done, columns(since, session.signal_names), carry,
-        request.witnesses, occupied, free, explanations if request.explain else None,
-    )  # fmt: skip
+        shield,
+        since[:, :3],
+        logits,
+        request.main_task_done,
+        columns(since, session.signal_names),
+        carry,
+        request.witnesses,
+        occupied,
+        free,
+        explanations if request.explain else None,
+    )
     if len(since) < len(session.rows):  # the rule's clock began after the session
         decision = replace(decision, t=request.t)
     made = record.make(
-        decision, session.rows[-1], record.link(state.head, session.rows[state.next_t :]), request.poses[-1],
-        logits, request.main_task_done, signals, session.signal_names, request.witnesses, occupied, free,
-        request.explain, tables,
-    )  # fmt: skip
+        decision,
+        session.rows[-1],
+        record.link(state.head, session.rows[state.next_t :]),
+        request.poses[-1],
+        logits,
+        request.main_task_done,
+        signals,
+        session.signal_names,
+        request.witnesses,
+        occupied,
+        free,
+        request.explain,
+        tables,
+    )
     return session, decision, made
 
 

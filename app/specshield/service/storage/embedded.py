@@ -32,9 +32,11 @@ class EmbeddedStore:
         self.socket = self.folder / "socket"
         if len(os.fsencode(self.socket)) > 100:
             raise StoreError(
-                "the data folder's path is too long for a unix socket", path="SPECSHIELD_DATA_DIR",
-                got=str(data_dir), expected="a path of at most 87 bytes, or REDIS_URL set",
-            )  # fmt: skip
+                "the data folder's path is too long for a unix socket",
+                path="SPECSHIELD_DATA_DIR",
+                got=str(data_dir),
+                expected="a path of at most 87 bytes, or REDIS_URL set",
+            )
         self._use: int | None = None
         self._keeper: subprocess.Popen[bytes] | None = None
 

@@ -50,9 +50,11 @@ class TrainingWorker:
             # It ends when this process does: its standard input is a pipe from here.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "worker", "--until-eof"],
-                env=self._settings.environment(), stdin=subprocess.PIPE, pass_fds=[lock],
+                env=self._settings.environment(),
+                stdin=subprocess.PIPE,
+                pass_fds=[lock],
                 start_new_session=True,
-            )  # fmt: skip
+            )
             self._methods = available()
         except BlockingIOError:
             pass
