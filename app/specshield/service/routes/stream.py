@@ -12,6 +12,7 @@ import logging
 import re
 import secrets
 import time
+from collections import defaultdict
 from typing import Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -103,7 +104,7 @@ class _Stream:
             api_key = await self._server.keys.check(self._authorization)  # it may have been revoked
             self._scope["state"]["rates"].take(api_key, True)
             request = read_step(content, packed)
-            answer = await self._server.sessions.steps.decide(self._key, request, {})
+            answer = await self._server.sessions.steps.decide(self._key, request, defaultdict(float))
             return 200, write_answer(answer, packed)
         except SpecshieldError as known:
             error = known

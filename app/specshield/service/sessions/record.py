@@ -17,7 +17,7 @@ import hashlib
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -30,6 +30,19 @@ from specshield.shield.decision import Decision
 FORMAT = 2
 MOST_SIGNALS = 64  # columns of a session: MessagePack's integers have 64 bits
 COLUMNS = 5  # of an action's row in the table: J, rho, x, y, theta
+
+
+class Asked(NamedTuple):
+    """What a caller sent with a step. pose: x_t. logits [A], -inf for null; occupied, free [n, 2]: points."""
+
+    pose: Sequence[float]
+    logits: Floats | None
+    main_task_done: bool
+    signals: Mapping[str, float] = {}
+    all_witnesses: bool = False
+    occupied: Floats | None = None
+    free: Floats | None = None
+    explain: bool = False
 
 
 class StepRecord(msgspec.Struct, frozen=True, array_like=True):
@@ -86,26 +99,26 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     tables: bytes | None = None
     any_signal: bool | None = None
 
-    def points_sent(self, kind: str) -> Floats | None:
-        """[n, 2]: the `occupied` or `free` points that were sent; None where none were."""
-        content = getattr(self, kind)
-        return None if content is None else np.frombuffer(content, "<f8").reshape(-1, 2)
+    def asked(self, row: Floats, names: Sequence[str]) -> Asked:
+        """What was sent with the step. row: the stored one; names: of its signals, by column."""
+        pose = (row[:3] if self.pose is None else np.frombuffer(self.pose, "<f8")).tolist()
+        signals = {name: float(row[3 + i]) for i, name in enumerate(names) if self.signals >> i & 1}
+        logits, occupied, free = self.logits_sent(), _points(self.occupied), _points(self.free)
+        return Asked(
+            pose, logits, self.main_task_done, signals, self.all_witnesses, occupied, free, self.explain
+        )
 
     def logits_sent(self) -> Floats | None:
         """[A], -inf where the logit was null; None where none were sent."""
         return None if self.logits is None else _full(self.logits, len(self.rows), -math.inf, True)
 
-    def pose_sent(self, row: Floats) -> Floats:
-        """x_t [3] as the caller sent it; row: the stored one of this step."""
-        return row[:3] if self.pose is None else np.frombuffer(self.pose, "<f8")
 
-    def signals_sent(self, row: Floats, names: Sequence[str]) -> dict[str, float]:
-        """names: of the row's signals, by column."""
-        return {name: float(row[3 + i]) for i, name in enumerate(names) if self.signals >> i & 1}
+def _points(sent: bytes | None) -> Floats | None:
+    return None if sent is None else np.frombuffer(sent, "<f8").reshape(-1, 2)
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(StepRecord)
+decode = msgspec.msgpack.Decoder(StepRecord).decode
 
 
 def logits_json(record: StepRecord) -> list[float | None] | None:
@@ -117,10 +130,6 @@ def logits_json(record: StepRecord) -> list[float | None] | None:
 def encode(record: StepRecord) -> bytes:
     bare = record.any_signal is None  # then to the byte as before there was `any_signal`
     return _encoder.encode(msgspec.structs.astuple(record)[:-1] if bare else record)
-
-
-def decode(content: bytes) -> StepRecord:
-    return _decoder.decode(content)
 
 
 def digest(content: bytes) -> bytes:
@@ -135,23 +144,16 @@ def link(last: bytes, rows: Floats) -> bytes:
 
 def make(
     decision: Decision,
+    asked: Asked,
     row: Floats,
-    before: bytes,
-    pose: Sequence[float],
-    logits: Floats | None,
-    main_task_done: bool,
-    signals: Mapping[str, float],
     names: Sequence[str],
-    all_witnesses: bool,
-    occupied: Floats | None = None,
-    free: Floats | None = None,
-    explain: bool = False,
+    before: bytes,
     tables: bytes | None = None,
 ) -> StepRecord:
-    """The record of `decision`, made at step t and its stored `row` for a caller who sent what follows.
-
-    logits [A], -inf for null. names: of the rows' signals, by column.
+    """The record of a decision. row: the stored one of its step; names: of its signals, by column. before,
+    tables: as the record has them.
     """
+    pose, logits, main_task_done, signals, all_witnesses, occupied, free, explain = asked
     sent = struct.pack("<3d", *pose)
     actions = np.empty((len(decision.distribution), COLUMNS))
     for column, values in enumerate((decision.j_values, decision.robustness)):
@@ -159,42 +161,24 @@ def make(
     actions[:, 2:] = decision.next_poses
     rows, table, pool = _pack_table(actions, row)
     return StepRecord(
-        format=FORMAT,
-        before=before,
-        t=decision.t,
+        format=FORMAT, before=before, t=decision.t,
         pose=None if sent == row[:3].tobytes() else sent,
-        logits=None if logits is None else _sparse(logits, -math.inf, True),
-        main_task_done=main_task_done,
-        signals=sum(1 << i for i, name in enumerate(names) if name in signals),
-        all_witnesses=all_witnesses,
-        mode=decision.mode,
-        distribution=_sparse(decision.distribution, 0.0, False),
-        rows=rows,
-        table=table,
-        pool=pool,
-        action=decision.action,
-        completion_action=decision.completion_action,
-        spec_status=decision.spec_status,
-        feasible_mass=decision.feasible_mass,
-        kl=decision.kl,
-        reason=decision.reason,
-        finished=decision.finished,
-        residual=decision.residual,
-        in_collision=decision.in_collision,
+        logits=None if logits is None else _sparse(logits, -math.inf, True), main_task_done=main_task_done,
+        signals=sum(1 << i for i, name in enumerate(names) if name in signals), all_witnesses=all_witnesses,
+        mode=decision.mode, distribution=_sparse(decision.distribution, 0.0, False),
+        rows=rows, table=table, pool=pool,
+        action=decision.action, completion_action=decision.completion_action,
+        spec_status=decision.spec_status, feasible_mass=decision.feasible_mass, kl=decision.kl,
+        reason=decision.reason, finished=decision.finished,
+        residual=decision.residual, in_collision=decision.in_collision,
         witness=None if decision.witness is None else bytes(decision.witness),
         witnesses=tuple(None if w is None else bytes(w) for w in decision.witnesses),
-        warnings=decision.warnings,
-        margin=decision.margin,
-        slack=decision.slack,
-        threshold_left=decision.threshold_left,
-        map_revision=decision.map_revision,
+        warnings=decision.warnings, margin=decision.margin, slack=decision.slack,
+        threshold_left=decision.threshold_left, map_revision=decision.map_revision,
         occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
         free=None if free is None else free.astype("<f8").tobytes(),
-        explain=explain,
-        explanations=_explained(decision),
-        tables=tables,
-        any_signal=decision.any_signal,
-    )
+        explain=explain, explanations=_explained(decision), tables=tables, any_signal=decision.any_signal,
+    )  # fmt: skip
 
 
 def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
@@ -216,6 +200,10 @@ def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
         None if why is None else Explanation(why.conjunct, _finite(why.robustness), why.late_by, why.detail)
         for why in decision.explanations
     )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
@@ -254,34 +242,15 @@ def _answer(
     if all_witnesses:
         asked["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
     return StepAnswer(
-        t=made.t,
-        mode=made.mode,
-        distribution=distribution.tolist(),
-        j_values=j_values,
-        robustness=robustness,
-        action=made.action,
-        action_name=action_name,
-        completion_action=made.completion_action,
-        spec_status=made.spec_status,
-        feasible_mass=made.feasible_mass,
-        kl=made.kl,
-        reason=made.reason,
-        finished=made.finished,
-        next_poses=next_poses.tolist(),
-        residual=None if made.residual is None else Residual(*made.residual),
-        in_collision=made.in_collision,
-        witness=None if made.witness is None else list(made.witness),
-        warnings=made.warnings,
-        margin=made.margin,
-        slack=made.slack,
-        threshold_left=made.threshold_left,
-        map_revision=made.map_revision,
-        **asked,
-    )
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+        t=made.t, mode=made.mode, distribution=distribution.tolist(), j_values=j_values,
+        robustness=robustness, action=made.action, action_name=action_name,
+        completion_action=made.completion_action, spec_status=made.spec_status,
+        feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason, finished=made.finished,
+        next_poses=next_poses.tolist(), residual=None if made.residual is None else Residual(*made.residual),
+        in_collision=made.in_collision, witness=None if made.witness is None else list(made.witness),
+        warnings=made.warnings, margin=made.margin, slack=made.slack, threshold_left=made.threshold_left,
+        map_revision=made.map_revision, **asked,
+    )  # fmt: skip
 
 
 def _known(row: Floats) -> Floats:
