@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import logging
 import secrets
 from collections.abc import Iterator, Mapping
@@ -65,7 +66,7 @@ class Maps(Claimed):
         super().__init__("maps", claims, settings)
         self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
-        self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
+        self._named: Mapping[str, Map] = {str(found.name): found for found in _shipped(settings.maps_dir)}
 
     def get(self, key: str) -> Map:
         """By id, or one that came with the server, whoever asks. Raises NotFound."""
@@ -116,8 +117,7 @@ class Maps(Claimed):
         id = _id(grid, rooms)
         found = self.shipped(id)
         if name is not None:
-            shipped = {each: known.id for each, known in self._named.items()}
-            self._claims.check_name("maps", name, id if found is None else found.id, key.name, shipped)
+            self.check_name(name, id if found is None else found.id, key.name)
         if found is not None:
             return found
         if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
@@ -129,7 +129,7 @@ class Maps(Claimed):
         made, folder = Map(id, grid, rooms), self._folder / id
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
         content = {"map.yaml": dump_map(grid)[0].encode(), "map.png": made.png(), "map.json": meta}
-        with self._claims.adding("maps", id, key, files.weight(content)):
+        with self._claims.adding("maps", id, key, sum(map(len, content.values()))):
             if not files.there(folder):
                 files.write_folder(folder, content)
         if name is not None:
@@ -215,7 +215,7 @@ def _shipped(folder: Path) -> Iterator[Map]:
             )
             grid = load_map(path.read_text(), image.read_bytes())
             named = path.with_suffix(".regions.json")
-            areas = files.read_json(named) if named.is_file() else {}
+            areas = json.loads(named.read_bytes()) if named.is_file() else {}
             rooms = parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})
         except (SpecshieldError, StopIteration, ValueError) as error:
             log.warning("map %s is left out: %s", path, error or "no image beside it")

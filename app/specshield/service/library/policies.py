@@ -62,7 +62,7 @@ class Policies(Claimed):
         self._maps, self._models = maps, settings.models_dir
         self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
-        self._named = {str(record.name): record for record in self._shipped()}
+        self._named: Mapping[str, Record] = {str(record.name): record for record in self._shipped()}
 
     def record(self, key: str) -> Record:
         """By id, or one that came with the server, whoever asks. Raises NotFound."""
@@ -147,11 +147,6 @@ class Policies(Claimed):
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)
 
-    def check_name(self, record: Record, owner: str, name: str) -> None:
-        """Raises NameTaken, and InputError for a name that this policy cannot have."""
-        shipped = {each: known.id for each, known in self._named.items()}
-        self._claims.check_name("policies", name, record.id, owner, shipped)
-
     def name(self, record: Record, owner: str, name: str) -> None:
         """Names an owner's policy. Raises NameTaken."""
         if record.name is None:
@@ -166,12 +161,6 @@ class Policies(Claimed):
             return self.record(id)
         except NotFound:
             return None
-
-    def add(self, record: Record, key: Key) -> Record:
-        """Notes a policy that is still to be made, unless there is one already. Raises LimitReached,
-        InsufficientStorage.
-        """
-        return self._add(record, {}, key)
 
     def add_card(
         self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key, name: str | None = None
@@ -194,20 +183,25 @@ class Policies(Claimed):
         _check_options(about)
         record = replace(record, id=id, card=card)
         if name is not None:
-            self.check_name(record, key.name, name)
-        added = self._add(record, {"policy.safetensors": weights, "card.json": files.to_json(card)}, key)
+            self.check_name(name, record.id, key.name)
+        added = self.add(record, key, {"policy.safetensors": weights, "card.json": files.to_json(card)})
         if name is not None:
             self.name(added, key.name, name)
         return added
 
-    def _add(self, record: Record, trained: Mapping[str, bytes], key: Key) -> Record:
+    def add(self, record: Record, key: Key, trained: Mapping[str, bytes] | None = None) -> Record:
+        """Notes a policy, unless there is one already. trained: its files, where it is not still to be made.
+        Raises LimitReached, InsufficientStorage.
+        """
         if record.id in (found.id for found in self._named.values()):
             return self.record(record.id)
         record = replace(record, created_at=files.now())
         stored = asdict(replace(record, card=None))
         del stored["card"]
-        content, folder = {"policy.json": files.to_json(stored), **trained}, self._folder / record.id
-        size = max(files.weight(content), files.weight_of(folder))  # all of it, if it is trained already
+        content, folder = {"policy.json": files.to_json(stored), **(trained or {})}, self._folder / record.id
+        size = max(
+            sum(map(len, content.values())), files.weight_of(folder)
+        )  # all of it, if it is trained already
         with self._claims.adding("policies", record.id, key, size, self._own_map(record.about)):
             if not folder.is_dir():
                 files.write_folder(folder, content)
@@ -270,7 +264,7 @@ class Policies(Claimed):
     def _shipped(self) -> Iterator[Record]:
         for path in sorted(self._models.glob("*/card.json")):
             try:
-                card = files.read_json(path)
+                card = json.loads(path.read_bytes())
                 about = describe(card)
                 about = replace(about, map_id=self._maps.get(about.map_id).id)
                 record = Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -16,13 +17,8 @@ from specshield.service.routes.messages import MSGPACK, accepts, read_step, writ
 from specshield.service.state import Server
 
 PATH = re.compile(r"/v1/sessions/([A-Za-z0-9][A-Za-z0-9_.-]{0,63})/steps")
+ROUTE = SimpleNamespace(path="/v1/sessions/{session_id}/steps")  # what the metrics call it
 PACKED, JSON = MSGPACK.encode(), b"application/json"
-
-
-class _Route:
-    """What the metrics call it."""
-
-    path = "/v1/sessions/{session_id}/steps"
 
 
 class StepRoute:
@@ -38,7 +34,7 @@ class StepRoute:
         if found is None:
             await self.app(scope, receive, send)
             return
-        scope["route"], scope["path_params"] = _Route, {"session_id": found[1]}
+        scope["route"], scope["path_params"] = ROUTE, {"session_id": found[1]}
         headers = dict(scope["headers"])
         message = await receive()  # bounds/bodies.py gives the body in one piece
         if message["type"] != "http.request":  # the caller has gone

@@ -92,17 +92,18 @@ class EmbeddedStore:
         return () if self._use is None else (self._use,)
 
     def leave(self) -> None:
-        if self._use is not None:
-            os.close(self._use)
-            self._use = None
+        self._let_go()
         if self._keeper is not None:  # the last user waits, so that what it leaves behind is whole
             with contextlib.suppress(subprocess.TimeoutExpired):  # others still use it
                 self._keeper.wait(0.2)
 
-    def _open(self) -> None:
+    def _let_go(self) -> None:
         if self._use is not None:
             os.close(self._use)
             self._use = None
+
+    def _open(self) -> None:
+        self._let_go()
         users = self.folder / "users"
         if not users.exists():
             os.mkfifo(users, 0o600)
