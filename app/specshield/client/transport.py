@@ -48,11 +48,6 @@ def headers(api_key: str | None) -> dict[str, str]:
     return plain if api_key is None else {**plain, "Authorization": f"Bearer {api_key}"}
 
 
-def allowed(request: Request, timeout: float) -> float:
-    """Seconds this request may take: `timeout`, and at least 30 s where the server prepares something."""
-    return max(timeout, PREPARING) if request.slow else timeout
-
-
 class Exchange:
     """One try: what httpx is to send, and what is made of that which comes back, in the time there is.
 
@@ -61,7 +56,7 @@ class Exchange:
 
     def __init__(self, request: Request, base_url: httpx.URL, timeout: float, ends: float) -> None:
         self.request, self.began, self._ends, self._base_url = request, time.monotonic(), ends, base_url
-        self._allowed = allowed(request, timeout)
+        self._allowed = max(timeout, PREPARING) if request.slow else timeout
         self.seconds = min(self._allowed, ends - self.began)  # what this try has; none if not above 0
         self.ends = self.began + self.seconds
         self._most = MOST_PREPARED if request.slow else MOST

@@ -35,7 +35,7 @@ def policy(
     """
     check_writable(out, "--out")
     status = StatusLine()
-    places = {} if regions is None else _mapping(_read(regions, "--regions"), regions, "--regions")
+    places = {} if regions is None else _read(regions, "--regions")
     machine = _robot(robot)
     with client_of(url, status, worker=True) as client:
         world = _map(client, map, assets)
@@ -74,7 +74,7 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
     if not path.suffix:
         return client.maps.get(map)
     if path.suffix in (".yaml", ".yml"):
-        metadata = _mapping(_read(path, "--map"), path, "--map")
+        metadata = _read(path, "--map")
         image = path.parent / Path(str(metadata.get("image", ""))).name
         if not image.is_file():
             raise InputError(
@@ -84,9 +84,9 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
                 expected="the map's PGM or PNG beside its YAML",
             )
         return client.maps.upload(path, image)
-    content = _mapping(_read(path, "--map"), path, "--map")
+    content = _read(path, "--map")
     if "rooms" in content:
-        sizes = {} if assets is None else _mapping(_read(assets, "--assets"), assets, "--assets")
+        sizes = {} if assets is None else _read(assets, "--assets")
         return client.maps.procthor(content, sizes)
     if "info" in content:
         return client.maps.occupancy_grid(content["info"], content.get("data", []))
@@ -101,11 +101,11 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
 def _robot(robot: str) -> str | Mapping[str, Any]:
     """A preset's name, or a robot of one's own from a file."""
     path = Path(robot)
-    return _mapping(_read(path, "--robot"), path, "--robot") if path.suffix else robot
+    return _read(path, "--robot") if path.suffix else robot
 
 
-def _read(path: Path, option: str) -> Any:
-    """JSON or YAML. Raises InputError where the file cannot be read or is neither."""
+def _read(path: Path, option: str) -> dict[str, Any]:
+    """An object in JSON or YAML. Raises InputError where the file cannot be read or holds none."""
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"{path} is too large", path=option, expected=f"at most {LARGEST >> 20} MiB")
@@ -114,12 +114,9 @@ def _read(path: Path, option: str) -> Any:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise InputError(f"{path} cannot be read: {reason}", path=option, got=str(path)) from None
     try:
-        return json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        value = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
-
-
-def _mapping(value: Any, path: Path, option: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise InputError(
             f"{path} holds no object", path=option, got=type(value).__name__, expected="an object"

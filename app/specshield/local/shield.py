@@ -26,7 +26,6 @@ from specshield.reasons import refusal
 from specshield.robot import Robot, robot_from_json
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
-from specshield.shield.proposal import Proposer
 from specshield.shield.signals import any_signal
 from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task, parse_regions
@@ -114,7 +113,7 @@ class LocalShield:
             rooms,
             spec.get("signals"),
         )
-        return _prepared(load_policy(weights, card, task), card, weights)
+        return LocalShield(make_shield([load_policy(weights, card, task)]), card, weights)
 
     @staticmethod
     def make(
@@ -148,7 +147,7 @@ class LocalShield:
         card = {**made.card, "warnings": list(notices(policy)) if check else []}
         for notice in card["warnings"]:
             log.warning("%s", notice)
-        return _prepared(policy, card, weights)
+        return LocalShield(make_shield([policy]), card, weights)
 
     def save(self, folder: str | Path) -> None:
         """Write what `load` reads, which is also what a server takes in its folder of policies."""
@@ -213,10 +212,6 @@ class LocalShield:
         grid = self.task.grid
         row, column = np.unravel_index(int(np.argmax(grid.clearance)), grid.clearance.shape)
         return prepare(name, self.task, self.shield.proposers, [*grid.centres[row, column], 0.0])
-
-
-def _prepared(policy: Proposer, card: Mapping[str, Any], weights: bytes) -> LocalShield:
-    return LocalShield(make_shield([policy]), card, weights)
 
 
 def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:

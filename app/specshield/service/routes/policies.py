@@ -77,12 +77,10 @@ async def create(request: Request, server: ServerState, caller: Caller) -> Any:
 
 
 def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict[str, Any]:
-    record = server.policies.made_here(asked.id)
-    if record is not None and _training(server, record).status != "failed":
-        return _called(server, caller, server.policies.add(asked, caller), called)
-    name = asked.about.method
+    made, name = server.policies.made_here(asked.id), asked.about.method
+    queued = made is None or _training(server, made).status == "failed"
     own = [] if server.worker is None else server.worker.methods
-    if name not in own and not server.jobs.worker_there(name):
+    if queued and name not in own and not server.jobs.worker_there(name):
         needs = METHODS.get(name).needs
         installed = f" where {' and '.join(needs)} is installed" if needs else ""
         raise TrainingUnavailable(
@@ -92,11 +90,8 @@ def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict
             expected=f"a worker: start one with `specshield worker`{installed}, then ask again",
         )
     record = server.policies.add(asked, caller)
-    server.jobs.start(record.id, name)
-    return _called(server, caller, record, called)
-
-
-def _called(server: Server, caller: Key, record: Record, called: str | None) -> dict[str, Any]:
+    if queued:
+        server.jobs.start(record.id, name)
     if called is not None:
         server.policies.name(record, caller.name, called)
     return _show(server, record, caller.name)
