@@ -9,12 +9,14 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
 
 from specshield import __version__
 from specshield.errors import SpecshieldError
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 
     from specshield.service.settings import Settings
 
+SERVER_PARTS = (
+    "fastapi", "fastapi_offline", "uvicorn", "numba", "pydantic", "pydantic_settings", "redis", "rq",
+)  # fmt: skip
 CLOCK = 2.0  # [s] by which this machine and a server may differ before it is said
 State = Literal["ok", "note", "wrong"]
 
@@ -37,16 +42,19 @@ class Finding:
     remedy: str = ""
 
 
-def doctor(url: str | None, port: int, parts: Sequence[str]) -> int:
-    """Prints what is found. parts: the modules of a server. The exit status is 1 where something is wrong."""
-    wrong = sum(_shown(check) for check in _checks(url, port, parts))
+def doctor(
+    url: Annotated[str | None, typer.Option(help="A server to look at as well.")] = None,
+    port: Annotated[int, typer.Option(help="The port to serve on.", min=1, max=65535)] = 8000,
+) -> None:
+    """Say what of this installation works, what does not, and what to do about it."""
+    wrong = sum(_shown(check) for check in _checks(url, port))
     print("all is well" if not wrong else f"{wrong} of these keep specshield from working")
-    return 1 if wrong else 0
+    raise typer.Exit(1 if wrong else 0)
 
 
-def _checks(url: str | None, port: int, parts: Sequence[str]) -> Iterator[Callable[[], Iterator[Finding]]]:
+def _checks(url: str | None, port: int) -> Iterator[Callable[[], Iterator[Finding]]]:
     """Each imports its part of a server when it is due. A setting that is not valid is told once."""
-    yield from (_python, partial(_parts, parts), _kernels)
+    yield from (_python, _parts, _kernels)
     from specshield.service.settings import read_settings
 
     try:
@@ -84,8 +92,8 @@ def _python() -> Iterator[Finding]:
         yield Finding("ok", f"Python {found}, specshield {__version__}")
 
 
-def _parts(parts: Sequence[str]) -> Iterator[Finding]:
-    missing = [name for name in parts if find_spec(name) is None]
+def _parts() -> Iterator[Finding]:
+    missing = [name for name in SERVER_PARTS if find_spec(name) is None]
     if missing:
         yield Finding(
             "wrong", f"missing for a server: {', '.join(missing)}", "pip install 'specshield[server]'"
