@@ -185,13 +185,13 @@ def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
     """What the caller is answered: to the byte as `answer` has it of the record, in a third of the time."""
     return _answer(
         decision,
+        all_witnesses,
+        _explained(decision) if explain else None,
         action_name=decision.action_name,
-        distribution=decision.distribution,
+        distribution=decision.distribution.tolist(),
         j_values=list(decision.j_values),
         robustness=list(decision.robustness),
-        next_poses=decision.next_poses,
-        explanations=_explained(decision) if explain else None,
-        all_witnesses=all_witnesses,
+        next_poses=decision.next_poses.tolist(),
     )
 
 
@@ -209,47 +209,40 @@ def _finite(value: float) -> float | None:
 def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
     """What the caller was answered. row: the stored one of this step; names: of the actions."""
     table = _unpack_table(record, row)
-    distribution = _full(record.distribution, len(record.rows), 0.0, False)
     return _answer(
         record,
+        record.all_witnesses,
+        record.explanations if record.explain else None,
         action_name=names[record.action],
-        distribution=distribution,
+        distribution=_full(record.distribution, len(record.rows), 0.0, False).tolist(),
         j_values=[None if value != value else value for value in table[:, 0].tolist()],
         robustness=[None if value != value else value for value in table[:, 1].tolist()],
-        next_poses=table[:, 2:],
-        explanations=record.explanations if record.explain else None,
-        all_witnesses=record.all_witnesses,
+        next_poses=table[:, 2:].tolist(),
     )
 
 
 def _answer(
     made: Decision | StepRecord,
-    action_name: str,
-    distribution: Floats,
-    j_values: list[float | None],
-    robustness: list[float | None],
-    next_poses: Floats,
-    explanations: tuple[Explanation | None, ...] | None,
     all_witnesses: bool,
+    explanations: tuple[Explanation | None, ...] | None,
+    **own: Any,
 ) -> StepAnswer:
-    """Of a decision or its record; what follows `made` are the members that the two hold in different forms.
-
-    distribution [A], next_poses [A, 3]; explanations: None where they were not asked for.
+    """Of a decision or its record; own: the members that the two hold in different forms. explanations: None
+    where they were not asked for.
     """
-    asked: dict[str, Any] = {} if made.any_signal is None else {"any_signal": made.any_signal}
+    if made.any_signal is not None:
+        own["any_signal"] = made.any_signal
     if explanations is not None:
-        asked["explanations"] = explanations
+        own["explanations"] = explanations
     if all_witnesses:
-        asked["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
+        own["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
     return StepAnswer(
-        t=made.t, mode=made.mode, distribution=distribution.tolist(), j_values=j_values,
-        robustness=robustness, action=made.action, action_name=action_name,
-        completion_action=made.completion_action, spec_status=made.spec_status,
-        feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason, finished=made.finished,
-        next_poses=next_poses.tolist(), residual=None if made.residual is None else Residual(*made.residual),
+        t=made.t, mode=made.mode, action=made.action, completion_action=made.completion_action,
+        spec_status=made.spec_status, feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason,
+        finished=made.finished, residual=None if made.residual is None else Residual(*made.residual),
         in_collision=made.in_collision, witness=None if made.witness is None else list(made.witness),
         warnings=made.warnings, margin=made.margin, slack=made.slack, threshold_left=made.threshold_left,
-        map_revision=made.map_revision, **asked,
+        map_revision=made.map_revision, **own,
     )  # fmt: skip
 
 
