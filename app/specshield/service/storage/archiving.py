@@ -94,6 +94,7 @@ class ArchivingStore(Store):
         return found if found is not None else await self.in_thread(self._archived, id)
 
     async def delete(self, id: str) -> bool:
+        """Erases all of it. False where there was nothing."""
         async with self._reaching():
             found = await self._erase(keys=_keys(id), args=["", FENCE])
             await self.redis.zrem(INDEX, id)

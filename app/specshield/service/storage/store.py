@@ -192,13 +192,6 @@ class Store:
             (config, state, version), found, left = await pipe.execute()
         return None if config is None or found is None else Dump(config, state, version, found, left)
 
-    async def delete(self, id: str) -> bool:
-        """Erase all of it. False where there was nothing."""
-        async with self._reaching():
-            found = await self.redis.unlink(*keys(id))
-            await self.redis.zrem(INDEX, id)
-        return bool(found)
-
     async def count(self, owner: str | None) -> int:
         """How many sessions an owner has, or with None all of them; some may have expired."""
         low, high = _range(owner)
