@@ -53,9 +53,8 @@ def episodes(count: int, seed: int) -> list[Dump]:
         done = state.logits is None
         decision = episode.decide(shield, state.history, state.logits, done, carry=state.carry)
         row, last = state.history[-1], steps[-1] if steps else b""
-        made = record.make(
-            decision, row, record.digest(last), row.tolist(), state.logits, done, {}, [], False
-        )
+        asked = record.Asked(row.tolist(), state.logits, done)
+        made = record.make(decision, asked, row, [], record.digest(last))
         steps += [b""] * (state.t - len(steps)) + [record.encode(made)]
         ended = State(
             len(state.history), state.t + 1, True, decision.spec_status, time.time() + TTL,

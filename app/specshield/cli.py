@@ -30,12 +30,9 @@ NEEDS_SERVER = """\
 This command needs the server's parts: pip install 'specshield[server]'
 What is installed here is the client, for Python: from specshield.client import ShieldClient"""
 
-URL_HELP = "A server that runs already; without it, one of its own on SPECSHIELD_DATA_DIR."
+# [s] after which a worker that says nothing is replaced: on a busy machine its imports take long
+STARTS_WITHIN = 60
 NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
-
-SERVER_PARTS = (
-    "fastapi", "fastapi_offline", "uvicorn", "numba", "pydantic", "pydantic_settings", "redis", "rq",
-)  # fmt: skip
 
 
 def main() -> None:
@@ -71,6 +68,8 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
         missing = (error.name or "").split(".")[0]
         if missing == "torch":
             sys.exit(NEEDS_TORCH)
+        from specshield.commands.doctor import SERVER_PARTS
+
         if missing in SERVER_PARTS:
             sys.exit(NEEDS_SERVER)
         raise
@@ -79,7 +78,10 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
 def _commands() -> Iterator[Callable[..., None]]:
     """The commands below, and those that other packages register as entry points."""
     from specshield.commands.check_drive import check_drive
+    from specshield.commands.doctor import doctor
     from specshield.commands.export import export
+    from specshield.commands.policy import policy
+    from specshield.commands.run import run_policy
     from specshield.commands.watch import watch
 
     yield from (serve, demo, policy, run_policy, watch, doctor, train, worker, verify, openapi)
@@ -122,13 +124,19 @@ def serve(
         url = embedded.url if embedded is not None else str(settings.redis_url)
         check_files(url, settings.files_at, settings.store_timeout)
     options: dict[str, Any] = {
-        "host": host, "port": port, "workers": workers, "access_log": False, "server_header": False,
-        "ws_max_size": settings.max_body_bytes, "ws_max_queue": 8, "ws_per_message_deflate": False,
+        "host": host,
+        "port": port,
+        "workers": workers,
+        "access_log": False,
+        "server_header": False,
+        "ws_max_size": settings.max_body_bytes,
+        "ws_max_queue": 8,
+        "ws_per_message_deflate": False,
         "timeout_graceful_shutdown": GRACE,
         "log_config": logs.config(settings.log_format, settings.log_level),
         "http": "specshield.service.bounds.protocol:BoundedProtocol",
         "timeout_keep_alive": settings.keep_alive_timeout,
-    }  # fmt: skip
+    }
     # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if workers == 1:
@@ -215,47 +223,6 @@ def train(
     from specshield.sim import training
 
     raise typer.Exit(training.train(case, method, seed, updates, option or [], out, resume))
-
-
-def policy(
-    map: Annotated[str, typer.Option(help="A map's YAML, a house's JSON, or the name of one on the server.")],
-    rule: Annotated[
-        str, typer.Option(help="What has to be kept, as 'F[0,60] Kitchen and G[0,60] not Hall'.")
-    ],
-    regions: Annotated[Path | None, typer.Option(help="Places of your own by name, JSON or YAML.")] = None,
-    robot: Annotated[str, typer.Option(help="A preset, or your robot's JSON or YAML.")] = "stretch",
-    assets: Annotated[Path | None, typer.Option(help="Sizes of a house's furniture, JSON.")] = None,
-    method: Annotated[str, typer.Option(help="How the policy is made.")] = "reachability",
-    name: Annotated[str | None, typer.Option(help="What to call the policy.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
-    url: Annotated[str | None, typer.Option(help=URL_HELP)] = None,
-) -> None:
-    """Make a policy for a map, a rule and a robot of your own, and draw from where the rule can be kept."""
-    from specshield.commands.policy import policy as make
-
-    raise typer.Exit(make(map, rule, regions, robot, assets, method, name, out, url))
-
-
-def run_policy(
-    policy: Annotated[str, typer.Argument(help="Id or name of a policy in SPECSHIELD_DATA_DIR.")],
-    target: Annotated[str | None, typer.Option(help="Where the model goes, as 2.5,1.0 [m].")] = None,
-    seed: Annotated[int, typer.Option(help="Decides start, target and model.", min=0)] = 0,
-    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
-) -> None:
-    """Drive a simulated robot through an episode, with and without the shield, and draw both."""
-    from specshield.commands.run import run as drive
-
-    raise typer.Exit(drive(policy, target, seed, out))
-
-
-def doctor(
-    url: Annotated[str | None, typer.Option(help="A server to look at as well.")] = None,
-    port: Annotated[int, typer.Option(help="The port to serve on.", min=1, max=65535)] = 8000,
-) -> None:
-    """Say what of this installation works, what does not, and what to do about it."""
-    from specshield.commands.doctor import doctor as examine
-
-    raise typer.Exit(examine(url, port, SERVER_PARTS))
 
 
 def _check_address(host: str, port: int) -> None:

@@ -85,9 +85,11 @@ def decisions(draw):
         logits = np.where(random.random(count) < 0.2, -math.inf, logits)
     pose = row[:3].tolist() if draw(st.booleans()) else [draw(number) for _ in range(3)]
     signals = {"battery": 7.0} if draw(st.booleans()) else {}
-    asked = (pose, logits, draw(st.booleans()), signals, ["battery", "fuel"], every)
-    points = [draw(st.none() | st.just(random.normal(size=(n, 2)))) for n in (0, 3)]
-    return decision, row, asked, (*points, explain)
+    done, points = (
+        draw(st.booleans()),
+        [draw(st.none() | st.just(random.normal(size=(n, 2)))) for n in (0, 3)],
+    )
+    return decision, row, record.Asked(pose, logits, done, signals, every, *points, explain)
 
 
 def expected(decision, every, explain):
@@ -115,11 +117,10 @@ def expected(decision, every, explain):
 @settings(deadline=None)
 @given(decisions())
 def test_a_record_reads_back_to_the_last_bit_and_answers_in_the_same_bytes(made):
-    decision, row, (pose, logits, done, signals, declared, every), (occupied, free, explain) = made
-    names = [f"a{i}" for i in range(len(decision.distribution))]
-    kept = record.make(
-        decision, row, b"before", pose, logits, done, signals, declared, every, occupied, free, explain
-    )
+    decision, row, asked = made
+    pose, logits, done, signals, every, occupied, free, explain = asked
+    names, declared = [f"a{i}" for i in range(len(decision.distribution))], ["battery", "fuel"]
+    kept = record.make(decision, asked, row, declared, b"before")
     content = record.encode(kept)
     again = record.decode(content)
     assert record.encode(again) == content
@@ -131,15 +132,15 @@ def test_a_record_reads_back_to_the_last_bit_and_answers_in_the_same_bytes(made)
     )  # every value, in the order of the contract
     assert to_json(first) == whole
     assert msgspec.json.encode(msgspec.msgpack.decode(to_msgpack(first))) == whole
-    assert again.pose_sent(row).tobytes() == np.array(pose).tobytes()
-    assert (again.logits_sent() is None) == (logits is None)
-    assert logits is None or again.logits_sent().tobytes() == logits.tobytes()
-    assert again.signals_sent(row, declared) == signals
-    for kind, points in (("occupied", occupied), ("free", free)):
-        kept_points = again.points_sent(kind)
+    sent = again.asked(row, declared)
+    assert np.array(sent.pose).tobytes() == np.array(pose).tobytes()
+    assert (sent.logits is None) == (logits is None)
+    assert logits is None or sent.logits.tobytes() == logits.tobytes()
+    assert sent.signals == signals
+    for kept_points, points in ((sent.occupied, occupied), (sent.free, free)):
         assert (kept_points is None) == (points is None)
         assert points is None or kept_points.tolist() == points.tolist()
-    assert (again.main_task_done, again.all_witnesses, again.before) == (done, every, b"before")
+    assert (sent.main_task_done, sent.all_witnesses, again.before) == (done, every, b"before")
 
 
 @pytest.mark.parametrize("name", ["case1", "case2"])

@@ -16,7 +16,7 @@ import redis
 from specshield.errors import StoreError
 from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.service.storage.store import Change, Record, Store
+from specshield.service.storage.store import Change, Record, Store, keys
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
 from tests.serving import serving, wait_for
 
@@ -247,14 +247,14 @@ def test_an_answer_that_is_late_is_not_written_into_the_next_session_of_its_name
         seen = await store.load("a", 0)
         assert isinstance(await store.append("a", seen.version, change), bytes)
         assert isinstance(await store.append("a", seen.version, change), Record)
-        await store.delete("a")
+        await store.redis.unlink(*keys("a"))
         await store.create("a", b"the second", change)
         there = await store.append("a", seen.version, Change(b"late", bytes(24)))
         assert (there.config, there.state) == (b"the second", b"state")
         new = await store.load("a", 0)
         assert (new.config, new.state) == (b"the second", b"state")
         assert isinstance(await store.append("a", new.version, change), bytes)
-        await store.delete("a")
+        await store.redis.unlink(*keys("a"))
         assert await store.append("a", new.version, change) is None
         await store.aclose()
 

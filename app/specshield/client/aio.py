@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, 
 import httpx
 
 from specshield.client import bounded, calls
-from specshield.client.core import D, Feed, Flow, More, P, T, Wait, looks_like, page_of
+from specshield.client.core import D, Feed, Flow, More, P, Resource, T, Wait, looks_like, page_of
 from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.stream import AsyncStreams, packed
@@ -143,18 +143,11 @@ async def hang_up(response: httpx.Response) -> None:
         await response.extensions["network_stream"].aclose()
 
 
-class Resource:
-    """Some of the calls, bound to a client."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-
-def awaiting(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource, P], Coroutine[Any, Any, T]]:
+def awaiting(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource[Run], P], Coroutine[Any, Any, T]]:
     """The method of a resource that makes this call."""
 
     @looks_like(flow)
-    async def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    async def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> T:
         return await self._run(flow(*args, **kwargs))
 
     return method
@@ -181,11 +174,11 @@ def deciding(
 
 def opening(
     flow: Callable[P, Flow[SessionInfo]],
-) -> Callable[Concatenate[Resource, P], Coroutine[Any, Any, AsyncSession]]:
+) -> Callable[Concatenate[Resource[Run], P], Coroutine[Any, Any, AsyncSession]]:
     """The method that makes this call and gives the session that it tells of."""
 
     @looks_like(flow)
-    async def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> AsyncSession:
+    async def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> AsyncSession:
         info = await self._run(flow(*args, **kwargs))
         given = cast(dict[str, Any], kwargs)
         begun = AsyncSession[Any](
@@ -197,10 +190,10 @@ def opening(
     return method
 
 
-def pages(cls: type[T], resource: str) -> Callable[[Resource], AsyncIterator[T]]:
+def pages(cls: type[T], resource: str) -> Callable[[Resource[Run]], AsyncIterator[T]]:
     """The method that lists all there are."""
 
-    async def method(self: Resource) -> AsyncIterator[T]:
+    async def method(self: Resource[Run]) -> AsyncIterator[T]:
         """All of them, in the order of the server's pages."""
         page = await self._run(page_of(cls, resource, None))
         while True:
@@ -246,11 +239,11 @@ class AsyncSession(SessionState, Generic[D]):
                 await events.feed.close()
 
 
-class AsyncSpecs(Resource):
+class AsyncSpecs(Resource[Run]):
     validate = awaiting(calls.validate)
 
 
-class AsyncMaps(Resource):
+class AsyncMaps(Resource[Run]):
     create = awaiting(calls.create_map)
     upload = awaiting(calls.upload_map)
     procthor = awaiting(calls.procthor_map)
@@ -261,7 +254,7 @@ class AsyncMaps(Resource):
     list = pages(Map, "maps")
 
 
-class AsyncPolicies(Resource):
+class AsyncPolicies(Resource[Run]):
     create = awaiting(calls.create_policy)
     upload = awaiting(calls.upload_policy)
     get = awaiting(calls.get_policy)
@@ -271,7 +264,7 @@ class AsyncPolicies(Resource):
     list = pages(Policy, "policies")
 
 
-class AsyncSessions(Resource):
+class AsyncSessions(Resource[Run]):
     if TYPE_CHECKING:
 
         @overload

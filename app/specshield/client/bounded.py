@@ -13,16 +13,18 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, wait
 from contextvars import ContextVar
 from functools import cache
 from ipaddress import ip_address
-from typing import Any
+from typing import Any, TypeVar
 from urllib.request import getproxies, proxy_bypass
 
 import httpcore
 import httpx
 
+T = TypeVar("T")
 ENDS: ContextVar[float] = ContextVar("ENDS", default=float("inf"))  # when this try ends, time.monotonic() [s]
 PARSING = 6e-6  # s a byte: h11 takes 1.3 to 3 us a byte of endless "100 Continue" (benchmarks/deadline.py)
 LEAST = 512  # bytes to read at once
@@ -110,22 +112,30 @@ def look_up(host: str, port: int, by: float) -> list[str]:
     """The addresses of a host. Nothing can limit the resolver's time, so a name is asked for in a thread."""
     with contextlib.suppress(ValueError):
         return [str(ip_address(host))]
-    found: list[Any] = []
-
-    def ask() -> None:
-        try:
-            found.append(socket.getaddrinfo(host, port, type=socket.SOCK_STREAM))
-        except (OSError, UnicodeError) as error:  # UnicodeError: no name can be written like this
-            found.append(error)
-
-    asking = threading.Thread(target=ask, daemon=True, name="specshield-look-up")
-    asking.start()
-    asking.join(max(by - time.monotonic(), 0.0))
-    if not found:
+    asked = in_thread(lambda: socket.getaddrinfo(host, port, type=socket.SOCK_STREAM), by)
+    if not asked.done():
         raise httpcore.ConnectTimeout(f"the address of {host} could not be looked up in time")
-    if isinstance(found[0], Exception):
-        raise httpcore.ConnectError(str(found[0])) from found[0]
-    return list(dict.fromkeys(str(entry[4][0]) for entry in found[0]))
+    try:
+        return list(dict.fromkeys(str(entry[4][0]) for entry in asked.result()))
+    except (OSError, UnicodeError) as error:  # UnicodeError: no name can be written like this
+        raise httpcore.ConnectError(str(error)) from error
+
+
+def in_thread(function: Callable[[], T], by: float) -> Future[T]:
+    """What the function gives, for which nothing can limit the time; not done where it is not there by then.
+    The interpreter does not wait for the thread, as it would for an executor's.
+    """
+    given = Future[T]()
+
+    def run() -> None:
+        try:
+            given.set_result(function())
+        except BaseException as error:
+            given.set_exception(error)
+
+    threading.Thread(target=run, daemon=True, name="specshield-client").start()
+    wait([given], max(by - time.monotonic(), 0.0))
+    return given
 
 
 class AsyncStream(httpcore.AsyncNetworkStream):

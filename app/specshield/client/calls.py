@@ -134,10 +134,14 @@ def create_policy(
     server's /docs lists the methods that it has and the options of each.
     """
     body = {
-        "map_id": map_id, "robot": robot,
-        "spec": {"formula": formula, "regions": regions or {}, "signals": signals or {}}, "method": method,
-        "seed": seed, "options": options or {}, **_named(name),
-    }  # fmt: skip
+        "map_id": map_id,
+        "robot": robot,
+        "spec": {"formula": formula, "regions": regions or {}, "signals": signals or {}},
+        "method": method,
+        "seed": seed,
+        "options": options or {},
+        **_named(name),
+    }
     return build(Policy, (yield from call(wire.post("policies", body=body, slow=True))))
 
 
@@ -251,12 +255,21 @@ def create_session(
     asked = policies_asked(policy_id, policy_ids)
     key = str(uuid.uuid4()) if id is None else id
     body: dict[str, Any] = {
-        "id": key, "initial_pose": wire.pose_values(initial_pose, "initial_pose"), "seed": seed,
-        "threshold": threshold, "margin": margin, "slack": slack, "evaluation": evaluation,
-        "shaping": shaping, "allow_infeasible": allow_infeasible,
+        "id": key,
+        "initial_pose": wire.pose_values(initial_pose, "initial_pose"),
+        "seed": seed,
+        "threshold": threshold,
+        "margin": margin,
+        "slack": slack,
+        "evaluation": evaluation,
+        "shaping": shaping,
+        "allow_infeasible": allow_infeasible,
         "uncertainty": uncertainty if isinstance(uncertainty, str) else dict(uncertainty),
-        "learn_map": learn_map, "map_memory": map_memory, "threshold_over": threshold_over, **asked,
-    }  # fmt: skip
+        "learn_map": learn_map,
+        "map_memory": map_memory,
+        "threshold_over": threshold_over,
+        **asked,
+    }
     body.update({} if max_steps is None else {"max_steps": max_steps})
     delivery = yield from deliver(wire.post("sessions", body=body, slow=True))
     try:

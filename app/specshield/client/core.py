@@ -18,7 +18,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
 
 from specshield.client.models import Page, build
 from specshield.client.wire import Failure, Reply, Request, check, error_of, get, json_object
@@ -34,10 +34,19 @@ else:
     D = TypeVar("D")
 
 P = ParamSpec("P")
+R = TypeVar("R")
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 BACKOFF = 0.05  # s before the second try, doubled for each that follows
 PATIENCE = 4  # timeouts after which no further try starts
+
+
+class Resource(Generic[R]):
+    """Some of the calls, bound to a client."""
+
+    def __init__(self, run: R) -> None:
+        """run: performs a call, as the shell does."""
+        self._run = run
 
 
 @dataclass(frozen=True)

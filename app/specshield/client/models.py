@@ -210,9 +210,11 @@ class Decision:
         if not isinstance(i, int) or not 0 <= i < count:
             names = ", ".join(self.action_names)
             raise InputError(
-                "there is no such action", path="action", got=action,
+                "there is no such action",
+                path="action",
+                got=action,
                 expected=f"an index from 0 to {count - 1}, or one of {names}",
-            )  # fmt: skip
+            )
         name = self.action_names[i] if self.action_names else f"action {i}"
         if self.explanations is None:
             return f"{name}: the step was not asked to explain (explain=True)"

@@ -290,10 +290,14 @@ class SessionState:
         poses, start, gaps, joined = dict(poses), min(self._stored, t), 0, -1
         while True:
             request = wire.post(
-                "sessions", self.id, action,
-                body={"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body}, slow=slow,
-                tries=tries, t=t if action == "steps" else None,
-            )  # fmt: skip
+                "sessions",
+                self.id,
+                action,
+                body={"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body},
+                slow=slow,
+                tries=tries,
+                t=t if action == "steps" else None,
+            )
             reply = (yield from deliver(request)).reply
             try:
                 wire.check(reply)

@@ -11,12 +11,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-import threading
 import time
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
 import httpx
 
+from specshield.client.bounded import in_thread
 from specshield.client.transport import STALE, Exchange
 from specshield.client.wire import Failure, Reply, Request
 from specshield.errors import InputError
@@ -37,9 +38,10 @@ def check_installed() -> None:
         import websockets  # noqa: F401
     except ImportError as error:
         raise InputError(
-            f"stream=True needs the package {error.name}, which is not installed", path="stream",
+            f"stream=True needs the package {error.name}, which is not installed",
+            path="stream",
             expected="pip install 'specshield[stream]', or stream=False",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def packed(request: Request) -> bytes | None:
@@ -66,9 +68,12 @@ class Streams:
     def _options(self, seconds: float) -> dict[str, Any]:
         key = self._http.headers.get("Authorization")
         return {
-            "additional_headers": {} if key is None else {"Authorization": key}, "compression": None,
-            "ping_interval": None, "open_timeout": seconds, "max_size": LONGEST,
-        }  # fmt: skip
+            "additional_headers": {} if key is None else {"Authorization": key},
+            "compression": None,
+            "ping_interval": None,
+            "open_timeout": seconds,
+            "max_size": LONGEST,
+        }
 
     def _read(self, exchange: Exchange, message: bytes | str) -> Reply | None:
         """None for what is no answer, or one about another step."""
@@ -123,32 +128,21 @@ class SyncStreams(Streams):
         """In a thread, since nothing can limit the time in which a name is looked up."""
         from websockets.sync.client import connect
 
-        made: list[Any] = []
-        over = threading.Event()
-
-        def make() -> None:
-            try:
-                options = self._options(exchange.seconds)
-                made.append(connect(self._address(exchange.request), **options).__enter__())
-            except BaseException as error:
-                made.append(error)
-            if over.is_set():
-                leave(made[0])
-
-        making = threading.Thread(target=make, daemon=True, name="specshield-connect")
-        making.start()
-        making.join(max(exchange.ends - time.monotonic(), 0.0))
-        if not made:
-            over.set()
+        address, options = self._address(exchange.request), self._options(exchange.seconds)
+        made: Future[Socket] = in_thread(lambda: connect(address, **options).__enter__(), exchange.ends)
+        if not made.done():
+            made.add_done_callback(_leave_late)
             raise TimeoutError
-        if isinstance(made[0], BaseException):
-            raise made[0]
-        connection: Socket = made[0]
-        return connection
+        return made.result()
 
     def close(self) -> None:
         while self._open:
             leave(self._open.popitem()[1])
+
+
+def _leave_late(made: Future[Socket]) -> None:
+    if made.exception() is None:
+        leave(made.result())
 
 
 def leave(connection: Any) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, 
 import httpx
 
 from specshield.client import bounded, calls
-from specshield.client.core import D, Feed, Flow, More, P, T, Wait, looks_like, page_of
+from specshield.client.core import D, Feed, Flow, More, P, Resource, T, Wait, looks_like, page_of
 from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
@@ -146,18 +146,11 @@ def hang_up(response: httpx.Response) -> None:
         response.extensions["network_stream"].close()
 
 
-class Resource:
-    """Some of the calls, bound to a client."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-
-def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource, P], T]:
+def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource[Run], P], T]:
     """The method of a resource that makes this call."""
 
     @looks_like(flow)
-    def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> T:
         return self._run(flow(*args, **kwargs))
 
     return method
@@ -182,11 +175,11 @@ def deciding(
     return blocking_step(flow)
 
 
-def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resource, P], Session]:
+def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resource[Run], P], Session]:
     """The method that makes this call and gives the session that it tells of."""
 
     @looks_like(flow)
-    def method(self: Resource, /, *args: P.args, **kwargs: P.kwargs) -> Session:
+    def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> Session:
         info, given = self._run(flow(*args, **kwargs)), cast(dict[str, Any], kwargs)
         begun = Session[Any](self._run, info, given.get("initial_pose"), given.get("on_failure", "raise"))
         self._run(begun._recall())
@@ -195,10 +188,10 @@ def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resour
     return method
 
 
-def pages(cls: type[T], resource: str) -> Callable[[Resource], Iterator[T]]:
+def pages(cls: type[T], resource: str) -> Callable[[Resource[Run]], Iterator[T]]:
     """The method that lists all there are."""
 
-    def method(self: Resource) -> Iterator[T]:
+    def method(self: Resource[Run]) -> Iterator[T]:
         """All of them, in the order of the server's pages."""
         page = self._run(page_of(cls, resource, None))
         while True:
@@ -250,11 +243,11 @@ class Session(SessionState, Generic[D]):
                 events.feed.close()
 
 
-class Specs(Resource):
+class Specs(Resource[Run]):
     validate = blocking(calls.validate)
 
 
-class Maps(Resource):
+class Maps(Resource[Run]):
     create = blocking(calls.create_map)
     upload = blocking(calls.upload_map)
     procthor = blocking(calls.procthor_map)
@@ -265,7 +258,7 @@ class Maps(Resource):
     list = pages(Map, "maps")
 
 
-class Policies(Resource):
+class Policies(Resource[Run]):
     create = blocking(calls.create_policy)
     upload = blocking(calls.upload_policy)
     get = blocking(calls.get_policy)
@@ -275,7 +268,7 @@ class Policies(Resource):
     list = pages(Policy, "policies")
 
 
-class Sessions(Resource):
+class Sessions(Resource[Run]):
     if TYPE_CHECKING:
 
         @overload

@@ -28,9 +28,11 @@ def address(base_url: str) -> httpx.URL:
         url = httpx.URL("")
     if url.scheme not in ("http", "https") or not url.host:
         raise InputError(
-            "this is not the address of a server", path="base_url", got=base_url,
+            "this is not the address of a server",
+            path="base_url",
+            got=base_url,
             expected="http://host:port or https://host:port",
-        )  # fmt: skip
+        )
     return url
 
 
@@ -38,16 +40,12 @@ def headers(api_key: str | None) -> dict[str, str]:
     """InputError for a key that no header can carry."""
     if api_key is not None and not re.fullmatch(r"[!-~]([ -~]*[!-~])?", api_key):
         raise InputError(
-            "the API key cannot be sent in a header", path="api_key",
+            "the API key cannot be sent in a header",
+            path="api_key",
             expected="ASCII without control characters",
-        )  # fmt: skip
+        )
     plain = {"Accept-Encoding": "identity"}  # what is compressed could be larger than it looks
     return plain if api_key is None else {**plain, "Authorization": f"Bearer {api_key}"}
-
-
-def allowed(request: Request, timeout: float) -> float:
-    """Seconds this request may take: `timeout`, and at least 30 s where the server prepares something."""
-    return max(timeout, PREPARING) if request.slow else timeout
 
 
 class Exchange:
@@ -58,7 +56,7 @@ class Exchange:
 
     def __init__(self, request: Request, base_url: httpx.URL, timeout: float, ends: float) -> None:
         self.request, self.began, self._ends, self._base_url = request, time.monotonic(), ends, base_url
-        self._allowed = allowed(request, timeout)
+        self._allowed = max(timeout, PREPARING) if request.slow else timeout
         self.seconds = min(self._allowed, ends - self.began)  # what this try has; none if not above 0
         self.ends = self.began + self.seconds
         self._most = MOST_PREPARED if request.slow else MOST
@@ -72,10 +70,14 @@ class Exchange:
         if request.body is not None:
             headers["Content-Type"] = "application/json"
         return {
-            "method": request.method, "url": request.path, "params": request.params, "content": request.body,
-            "files": request.files, "headers": headers,
+            "method": request.method,
+            "url": request.path,
+            "params": request.params,
+            "content": request.body,
+            "files": request.files,
+            "headers": headers,
             "timeout": httpx.Timeout(self.seconds, connect=min(timeout, self.seconds)),
-        }  # fmt: skip
+        }
 
     def begin(self, response: httpx.Response) -> None:
         """Raises httpx.DecodingError for a compressed body, which nobody asked for and may be a bomb."""

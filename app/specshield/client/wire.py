@@ -115,9 +115,11 @@ def path(*segments: str) -> str:
     for segment in segments:
         if not isinstance(segment, str) or segment in ("", ".", ".."):
             raise InputError(
-                "this cannot be an id or a name", path="id", got=segment,
+                "this cannot be an id or a name",
+                path="id",
+                got=segment,
                 expected="an id or a name that the server gave",
-            )  # fmt: skip
+            )
     return "/v1/" + "/".join(quote(segment, safe="", errors="replace") for segment in segments)
 
 
@@ -128,9 +130,10 @@ def encode(body: Mapping[str, Any]) -> bytes:
     except (TypeError, ValueError, RecursionError) as error:
         name = next((name for name, value in body.items() if not _is_json(value)), "body")
         raise InputError(
-            f"{name}: cannot be sent as JSON: {error}", path=name,
+            f"{name}: cannot be sent as JSON: {error}",
+            path=name,
             expected="finite numbers, texts, lists and objects of them",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def _json(value: Any) -> bytes:
@@ -158,9 +161,11 @@ def content(source: Content, where: str) -> bytes:
             return Path(source).read_bytes()
         except OSError as error:
             raise InputError(
-                f"{where} cannot be read: {error.strerror}", path=where, got=str(source),
+                f"{where} cannot be read: {error.strerror}",
+                path=where,
+                got=str(source),
                 expected="a file that can be read",
-            ) from error  # fmt: skip
+            ) from error
     return source.encode() if isinstance(source, str) else source
 
 
@@ -193,9 +198,11 @@ def logit_values(logits: Logits) -> list[float | None]:
     for i, value in enumerate(values):
         if math.isnan(value) or value == math.inf:
             raise LogitsError(
-                f"logit {i} is {value}", path=f"logits[{i}]", got=str(value),
+                f"logit {i} is {value}",
+                path=f"logits[{i}]",
+                got=str(value),
                 expected="a finite number, -inf or None",
-            )  # fmt: skip
+            )
     return [None if value == -math.inf else value for value in values]
 
 
@@ -269,8 +276,10 @@ def error_of(reply: Reply) -> SpecshieldError:
     cls = _BY_TYPE.get(str(document.get("type")), default)
     error = cls(
         str(document.get("detail") or document.get("title") or f"status {reply.status}"),
-        path=document.get("path"), got=document.get("got"), expected=document.get("expected"),
-    )  # fmt: skip
+        path=document.get("path"),
+        got=document.get("got"),
+        expected=document.get("expected"),
+    )
     told = {"title", "detail", "path", "got", "expected"} | (
         {"type"} if cls.type == document.get("type") else set()
     )

@@ -9,12 +9,14 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
 
 from specshield import __version__
 from specshield.errors import SpecshieldError
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 
     from specshield.service.settings import Settings
 
+SERVER_PARTS = (
+    "fastapi", "fastapi_offline", "uvicorn", "numba", "pydantic", "pydantic_settings", "redis", "rq",
+)  # fmt: skip
 CLOCK = 2.0  # [s] by which this machine and a server may differ before it is said
 State = Literal["ok", "note", "wrong"]
 
@@ -37,16 +42,19 @@ class Finding:
     remedy: str = ""
 
 
-def doctor(url: str | None, port: int, parts: Sequence[str]) -> int:
-    """Prints what is found. parts: the modules of a server. The exit status is 1 where something is wrong."""
-    wrong = sum(_shown(check) for check in _checks(url, port, parts))
+def doctor(
+    url: Annotated[str | None, typer.Option(help="A server to look at as well.")] = None,
+    port: Annotated[int, typer.Option(help="The port to serve on.", min=1, max=65535)] = 8000,
+) -> None:
+    """Say what of this installation works, what does not, and what to do about it."""
+    wrong = sum(_shown(check) for check in _checks(url, port))
     print("all is well" if not wrong else f"{wrong} of these keep specshield from working")
-    return 1 if wrong else 0
+    raise typer.Exit(1 if wrong else 0)
 
 
-def _checks(url: str | None, port: int, parts: Sequence[str]) -> Iterator[Callable[[], Iterator[Finding]]]:
+def _checks(url: str | None, port: int) -> Iterator[Callable[[], Iterator[Finding]]]:
     """Each imports its part of a server when it is due. A setting that is not valid is told once."""
-    yield from (_python, partial(_parts, parts), _kernels)
+    yield from (_python, _parts, _kernels)
     from specshield.service.settings import read_settings
 
     try:
@@ -84,8 +92,8 @@ def _python() -> Iterator[Finding]:
         yield Finding("ok", f"Python {found}, specshield {__version__}")
 
 
-def _parts(parts: Sequence[str]) -> Iterator[Finding]:
-    missing = [name for name in parts if find_spec(name) is None]
+def _parts() -> Iterator[Finding]:
+    missing = [name for name in SERVER_PARTS if find_spec(name) is None]
     if missing:
         yield Finding(
             "wrong", f"missing for a server: {', '.join(missing)}", "pip install 'specshield[server]'"
@@ -96,9 +104,10 @@ def _parts(parts: Sequence[str]) -> Iterator[Finding]:
         yield Finding("ok", f"torch {version('torch')}: policies can learn here")
         return
     yield Finding(
-        "note", "torch is not installed: policies are computed, and none learns (method `dqn`)",
+        "note",
+        "torch is not installed: policies are computed, and none learns (method `dqn`)",
         "pip install 'specshield[train]' where that is wanted",
-    )  # fmt: skip
+    )
 
 
 def _kernels() -> Iterator[Finding]:
@@ -108,16 +117,18 @@ def _kernels() -> Iterator[Finding]:
     mark = mark_of_kernels()
     if mark is None:
         yield Finding(
-            "note", f"no compiled kernel can be kept in {compiled.BASE}: every start compiles them all",
+            "note",
+            f"no compiled kernel can be kept in {compiled.BASE}: every start compiles them all",
             "set NUMBA_CACHE_DIR to a folder that can be written to",
-        )  # fmt: skip
+        )
     elif mark.exists():
         yield Finding("ok", f"the kernels are compiled ({compiled.BASE})")
     else:
         yield Finding(
-            "note", f"the first start will compile the kernels, for about {TAKES} s on two cores",
+            "note",
+            f"the first start will compile the kernels, for about {TAKES} s on two cores",
             "python -m specshield.service.startup does so now",
-        )  # fmt: skip
+        )
 
 
 def _disk(settings: Settings) -> Iterator[Finding]:
@@ -133,9 +144,10 @@ def _disk(settings: Settings) -> Iterator[Finding]:
     free = shutil.disk_usage(near).free
     if free < settings.disk_reserve_bytes:
         yield Finding(
-            "wrong", f"{free >> 20} MiB are free for the data folder {there}",
+            "wrong",
+            f"{free >> 20} MiB are free for the data folder {there}",
             f"at least {settings.disk_reserve_bytes >> 20} MiB, or no session begins",
-        )  # fmt: skip
+        )
     else:
         yield Finding("ok", f"data folder {there.absolute()}, {free >> 30} GiB free")
 
@@ -179,10 +191,11 @@ def _port(port: int) -> Iterator[Finding]:
         socket.create_server(("127.0.0.1", port)).close()
     except OSError as error:
         yield Finding(
-            "note", f"port {port} is taken: {error.strerror}",
+            "note",
+            f"port {port} is taken: {error.strerror}",
             f"a server may run there already: specshield doctor --url http://127.0.0.1:{port}; "
             "or serve elsewhere, by --port",
-        )  # fmt: skip
+        )
     else:
         yield Finding("ok", f"port {port} is free")
 
@@ -214,9 +227,10 @@ def _server(url: str) -> Iterator[Finding]:
     theirs = _object(told).get("info", {}).get("version")
     if theirs not in (None, __version__):
         yield Finding(
-            "note", f"the server is specshield {theirs}, this is {__version__}",
+            "note",
+            f"the server is specshield {theirs}, this is {__version__}",
             "the same version on both sides",
-        )  # fmt: skip
+        )
     date = ready.headers.get("date")
     if date is not None:
         apart = email.utils.parsedate_to_datetime(date).timestamp() - began

@@ -60,12 +60,16 @@ def export(
         getattr(import_module(f"specshield.recordings.{WRITERS[to]}"), f"write_{to}")(recording, path)
     except OSError as error:
         raise InputError(
-            f"{path} cannot be written: {error.strerror or error}", path="--out", got=str(path),
+            f"{path} cannot be written: {error.strerror or error}",
+            path="--out",
+            got=str(path),
             expected="a file in a folder that is there",
-        ) from None  # fmt: skip
+        ) from None
     except ModuleNotFoundError as error:
         raise InputError(
-            f"{to} needs {error.name}, which is not installed", path="--to", got=to,
+            f"{to} needs {error.name}, which is not installed",
+            path="--to",
+            got=to,
             expected="pip install 'specshield[recordings]'",
-        ) from None  # fmt: skip
+        ) from None
     typer.echo(f"{path}: {len(recording.items)} steps")

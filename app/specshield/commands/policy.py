@@ -5,37 +5,41 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import yaml
+import typer
 
-from specshield.client import Map, Policy, ShieldClient
-from specshield.commands.serving import client_of
 from specshield.errors import InputError, PolicyError
-from specshield.service.library.files import check_writable
-from specshield.sim.progress import StatusLine, duration
 
+if TYPE_CHECKING:  # every command line reads this module
+    from specshield.client import Map, Policy, ShieldClient
+    from specshield.sim.progress import StatusLine
+
+URL_HELP = "A server that runs already; without it, one of its own on SPECSHIELD_DATA_DIR."
 LARGEST = 64 << 20  # [bytes] of a file; a server's own limit for a map
 
 
 def policy(
-    map: str,
-    rule: str,
-    regions: Path | None,
-    robot: str,
-    assets: Path | None,
-    method: str,
-    name: str | None,
-    out: Path,
-    url: str | None,
-) -> int:
-    """Sends the map, has the policy made, and writes a picture of from where the rule can be kept.
+    map: Annotated[str, typer.Option(help="A map's YAML, a house's JSON, or the name of one on the server.")],
+    rule: Annotated[
+        str, typer.Option(help="What has to be kept, as 'F[0,60] Kitchen and G[0,60] not Hall'.")
+    ],
+    regions: Annotated[Path | None, typer.Option(help="Places of your own by name, JSON or YAML.")] = None,
+    robot: Annotated[str, typer.Option(help="A preset, or your robot's JSON or YAML.")] = "stretch",
+    assets: Annotated[Path | None, typer.Option(help="Sizes of a house's furniture, JSON.")] = None,
+    method: Annotated[str, typer.Option(help="How the policy is made.")] = "reachability",
+    name: Annotated[str | None, typer.Option(help="What to call the policy.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
+    url: Annotated[str | None, typer.Option(help=URL_HELP)] = None,
+) -> None:
+    """Make a policy for a map, a rule and a robot of your own, and draw from where the rule can be kept."""
+    from specshield.commands.serving import client_of
+    from specshield.service.library.files import check_writable
+    from specshield.sim.progress import StatusLine
 
-    Returns the exit status: 1 where the policy is ready but can keep the rule from nowhere.
-    """
     check_writable(out, "--out")
     status = StatusLine()
-    places = {} if regions is None else _mapping(_read(regions, "--regions"), regions, "--regions")
+    places = {} if regions is None else _read(regions, "--regions")
     machine = _robot(robot)
     with client_of(url, status, worker=True) as client:
         world = _map(client, map, assets)
@@ -60,10 +64,12 @@ def policy(
         picture.write_bytes(client.policies.image(made.id))
     print(f"picture {picture}")
     print(f"next    specshield run {called}")
-    return 1 if made.metrics.get("feasible_start") == 0.0 else 0
+    raise typer.Exit(1 if made.metrics.get("feasible_start") == 0.0 else 0)  # 1: it can keep it from nowhere
 
 
 def _show(status: StatusLine, found: Policy) -> None:
+    from specshield.sim.progress import duration
+
     left = "" if found.eta_s is None else f", about {duration(found.eta_s)} left"
     status.say(f"{found.status}: {found.progress:4.0%}{left}")
 
@@ -74,34 +80,40 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
     if not path.suffix:
         return client.maps.get(map)
     if path.suffix in (".yaml", ".yml"):
-        metadata = _mapping(_read(path, "--map"), path, "--map")
+        metadata = _read(path, "--map")
         image = path.parent / Path(str(metadata.get("image", ""))).name
         if not image.is_file():
             raise InputError(
                 f"{path} names the image {metadata.get('image')!r}, which is not beside it",
-                path="--map", got=str(image), expected="the map's PGM or PNG beside its YAML",
-            )  # fmt: skip
+                path="--map",
+                got=str(image),
+                expected="the map's PGM or PNG beside its YAML",
+            )
         return client.maps.upload(path, image)
-    content = _mapping(_read(path, "--map"), path, "--map")
+    content = _read(path, "--map")
     if "rooms" in content:
-        sizes = {} if assets is None else _mapping(_read(assets, "--assets"), assets, "--assets")
+        sizes = {} if assets is None else _read(assets, "--assets")
         return client.maps.procthor(content, sizes)
     if "info" in content:
         return client.maps.occupancy_grid(content["info"], content.get("data", []))
     raise InputError(
-        f"{path} is no map of a known form", path="--map", got=sorted(content)[:8],
+        f"{path} is no map of a known form",
+        path="--map",
+        got=sorted(content)[:8],
         expected="a ROS map's YAML beside its image, a ProcTHOR house, or a nav_msgs/OccupancyGrid as JSON",
-    )  # fmt: skip
+    )
 
 
 def _robot(robot: str) -> str | Mapping[str, Any]:
     """A preset's name, or a robot of one's own from a file."""
     path = Path(robot)
-    return _mapping(_read(path, "--robot"), path, "--robot") if path.suffix else robot
+    return _read(path, "--robot") if path.suffix else robot
 
 
-def _read(path: Path, option: str) -> Any:
-    """JSON or YAML. Raises InputError where the file cannot be read or is neither."""
+def _read(path: Path, option: str) -> dict[str, Any]:
+    """An object in JSON or YAML. Raises InputError where the file cannot be read or holds none."""
+    import yaml
+
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"{path} is too large", path=option, expected=f"at most {LARGEST >> 20} MiB")
@@ -110,12 +122,9 @@ def _read(path: Path, option: str) -> Any:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise InputError(f"{path} cannot be read: {reason}", path=option, got=str(path)) from None
     try:
-        return json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        value = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
-
-
-def _mapping(value: Any, path: Path, option: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise InputError(
             f"{path} holds no object", path=option, got=type(value).__name__, expected="an object"

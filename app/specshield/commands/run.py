@@ -5,26 +5,30 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+import typer
 
-from specshield.commands.serving import client_of
 from specshield.errors import InputError
-from specshield.policy.dqn.environment import free_poses
-from specshield.robot.dynamics import make_body
-from specshield.sim import picture
-from specshield.sim.campaign import begin
-from specshield.sim.cases import Case
-from specshield.sim.episodes import with_shield, without_shield
-from specshield.sim.model import GoalSeeker
-from specshield.sim.progress import StatusLine
+
+if TYPE_CHECKING:  # every command line reads this module
+    from specshield.sim.cases import Case
 
 
-def run(policy: str, target: str | None, seed: int, out: Path) -> int:
-    """One episode with the shield and one without, from one start. Returns 1 where the shield broke its rule.
+def run_policy(
+    policy: Annotated[str, typer.Argument(help="Id or name of a policy in SPECSHIELD_DATA_DIR.")],
+    target: Annotated[str | None, typer.Option(help="Where the model goes, as 2.5,1.0 [m].")] = None,
+    seed: Annotated[int, typer.Option(help="Decides start, target and model.", min=0)] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
+) -> None:
+    """Drive a simulated robot through an episode, with and without the shield, and draw both."""
+    from specshield.commands.serving import client_of
+    from specshield.sim import picture
+    from specshield.sim.campaign import begin
+    from specshield.sim.episodes import with_shield, without_shield
+    from specshield.sim.model import GoalSeeker
+    from specshield.sim.progress import StatusLine
 
-    target: "x,y" [m]; without it a place drawn by `seed`.
-    """
     status = StatusLine()
     with client_of(None, status) as client:
         found = client.policies.get(policy)
@@ -43,14 +47,21 @@ def run(policy: str, target: str | None, seed: int, out: Path) -> int:
         ended = "never" if episode.ended_at is None else f"at step {episode.ended_at}"
         print(f"{title:8} rule {episode.spec_status}, main task ended {ended}, {len(episode.poses)} states")
     print(f"picture  {path}")
-    return 0 if shielded.spec_status == "satisfied" else 1
+    raise typer.Exit(0 if shielded.spec_status == "satisfied" else 1)
 
 
 def _case(id: str, name: str, target: str | None, seed: int) -> Case:
-    """The policy's task as the simulation takes it, from the data folder."""
+    """The policy's task as the simulation takes it, from the data folder. target: "x,y" [m]; without it a
+    place drawn by `seed`.
+    """
+    import numpy as np
+
+    from specshield.policy.dqn.environment import free_poses
+    from specshield.robot.dynamics import make_body
     from specshield.service.library.maps import Maps
     from specshield.service.library.policies import Policies
     from specshield.service.settings import read_settings
+    from specshield.sim.cases import Case
 
     settings = read_settings()
     maps = Maps(settings)

@@ -55,9 +55,14 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         **settings: Any,
     ) -> None:
         gymnasium.utils.RecordConstructorArgs.__init__(
-            self, shield=shield, pose_of=pose_of, logits=logits, possible=possible,
-            _disable_deepcopy=True, **settings,
-        )  # fmt: skip
+            self,
+            shield=shield,
+            pose_of=pose_of,
+            logits=logits,
+            possible=possible,
+            _disable_deepcopy=True,
+            **settings,
+        )
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
         self._settings = {"uncertainty": "none", "learn_map": False, **settings}
@@ -72,9 +77,11 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         actions = getattr(self.env.action_space, "n", None)
         if actions != len(shield.task.robot.actions):
             raise RobotError(
-                "the environment's actions are not the robot's", path="action_space",
-                got=str(self.env.action_space), expected=f"Discrete({len(shield.task.robot.actions)})",
-            )  # fmt: skip
+                "the environment's actions are not the robot's",
+                path="action_space",
+                got=str(self.env.action_space),
+                expected=f"Discrete({len(shield.task.robot.actions)})",
+            )
         self.session = shield.session(initial_pose=self._pose_of(self.env), **self._settings)
         return observation, {**info, **self._decide(self.session, observation, None, False)}
 

@@ -56,9 +56,11 @@ class ShieldLogitsProcessor(LogitsProcessor):
         self._logits = None if logits is None else np.asarray(logits, dtype=np.float64)
         if self._logits is None and self.longest > 1:
             raise LogitsError(
-                "actions of several tokens need the model's logits of whole actions", path="logits",
-                got=None, expected="what score_actions gives",
-            )  # fmt: skip
+                "actions of several tokens need the model's logits of whole actions",
+                path="logits",
+                got=None,
+                expected="what score_actions gives",
+            )
         self._prompt = -1  # the length of the prompt, known at the first token
         self.decision: Decision | None = None
 
@@ -117,9 +119,11 @@ def check_tokens(tokens: Sequence[Sequence[int]], eos: int | None = None) -> lis
             )
         if eos is None and any(other[: len(one)] == one and other != one for other in read):
             raise InputError(
-                "this action's tokens begin another's", path=f"tokens[{i}]", got=list(one),
+                "this action's tokens begin another's",
+                path=f"tokens[{i}]",
+                got=list(one),
                 expected="an `eos` that tells where an action ends",
-            )  # fmt: skip
+            )
     return read
 
 

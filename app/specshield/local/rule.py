@@ -61,8 +61,14 @@ class Rule:
         """As the contract shows it."""
         about = self.policy.about()
         return {
-            "from": self.begins, "origin": self.origin, "clock": self.clock,
-            "policy_ids": about["policy_ids"], "map_id": about["map_id"],
-            "formula": about["spec"]["formula"], "horizon": about["horizon"], "actions": about["actions"],
-            "terminal_actions": about["terminal_actions"], "spec_status": status,
-        }  # fmt: skip
+            "from": self.begins,
+            "origin": self.origin,
+            "clock": self.clock,
+            "policy_ids": about["policy_ids"],
+            "map_id": about["map_id"],
+            "formula": about["spec"]["formula"],
+            "horizon": about["horizon"],
+            "actions": about["actions"],
+            "terminal_actions": about["terminal_actions"],
+            "spec_status": status,
+        }

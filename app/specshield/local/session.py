@@ -119,13 +119,17 @@ class LocalSession:
         x_t = self._at(pose)
         held = self._held(sent)
         made = episode.decide(
-            self._rule.shield, self._rule.since([*self._poses, x_t]),
+            self._rule.shield,
+            self._rule.since([*self._poses, x_t]),
             None if logits is None else [-math.inf if z is None else z for z in wire.logit_values(logits)],
-            over, self._rule.signals(held), self._carry, witnesses,
+            over,
+            self._rule.signals(held),
+            self._carry,
+            witnesses,
             None if occupied is None else np.array(wire.point_values(occupied, "occupied")).reshape(-1, 2),
             None if free is None else np.array(wire.point_values(free, "free")).reshape(-1, 2),
             explanations if explain else None,
-        )  # fmt: skip
+        )
         answer = _answer(replace(made, t=self.t), self.info, over, witnesses, explain)
         self._poses.append(x_t)
         self._signals, self._carry, self._decisions[self.t] = held, made.carry, answer
@@ -170,10 +174,14 @@ class LocalSession:
         known = self._poses if pose is None and self.t > 0 else [*self._poses, x_t]
         ended, (status, _) = old.told(old.verdict(known, held)[0]), rule.verdict(known, held)
         info = replace(
-            self.info, **policy.about(), next_t=self.t, feasible=True, spec_status=status,
+            self.info,
+            **policy.about(),
+            next_t=self.t,
+            feasible=True,
+            spec_status=status,
             rules=(*self.info.rules[:-1], ended, rule.told(status)),
             any_signal=any_signal(rule.shield, seen, signals),
-        )  # fmt: skip
+        )
         self._rules.append(rule)
         self._carry, self._first = carry, first
         self._signals = {name: values[: self.t] for name, values in held.items()}
@@ -213,14 +221,18 @@ class LocalSession:
     def _check(self, over: bool) -> None:
         if self._over:
             raise SessionFinished(
-                "the session is over: no further step is decided", path="t", got=self.t,
+                "the session is over: no further step is decided",
+                path="t",
+                got=self.t,
                 expected="a new session",
-            )  # fmt: skip
+            )
         if self.main_task_done and not over:
             raise StepConflict(
                 "an earlier step said that the main task is done, which cannot be taken back",
-                path="main_task_done", got=False, expected="true",
-            )  # fmt: skip
+                path="main_task_done",
+                got=False,
+                expected="true",
+            )
 
     def _foreseen(self) -> Pose:
         """Where the last decision's action leads. Raises HistoryGap after a step without a decision."""

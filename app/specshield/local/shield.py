@@ -26,7 +26,6 @@ from specshield.reasons import refusal
 from specshield.robot import Robot, robot_from_json
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
-from specshield.shield.proposal import Proposer
 from specshield.shield.signals import any_signal
 from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task, parse_regions
@@ -67,8 +66,10 @@ class LocalShield:
         if name not in names:
             raise NotFound(
                 "no such policy came with specshield",
-                path="name", got=name, expected=f"one of {', '.join(names)}",
-            )  # fmt: skip
+                path="name",
+                got=name,
+                expected=f"one of {', '.join(names)}",
+            )
         wanted = json.loads((folder / "card.json").read_text())["map_id"]
         for path in sorted(MAPS.glob("*.yaml")):
             if wanted in (path.stem, _read_world(path)[0].content_hash):
@@ -86,25 +87,33 @@ class LocalShield:
             found = sorted(folder.glob("*.yaml"))
             if len(found) != 1:
                 raise MapError(
-                    "the folder does not say which map the policy is for", path="world",
-                    got=[path.name for path in found], expected=f"one .yaml in {folder}, or a `world`",
-                )  # fmt: skip
+                    "the folder does not say which map the policy is for",
+                    path="world",
+                    got=[path.name for path in found],
+                    expected=f"one .yaml in {folder}, or a `world`",
+                )
             world = found[0]
         try:
             card = json.loads((folder / "card.json").read_text())
             weights = (folder / "policy.safetensors").read_bytes()
         except (OSError, ValueError) as error:
             raise PolicyError(
-                f"no policy can be read there: {error}", path="folder", got=str(folder),
+                f"no policy can be read there: {error}",
+                path="folder",
+                got=str(folder),
                 expected="a folder with card.json and policy.safetensors",
-            ) from None  # fmt: skip
+            ) from None
         grid, rooms = _read_world(world)
         spec = card["spec"]
         task = make_task(
-            grid, robot_from_json(card["robot"]), spec["formula"], spec.get("regions"), rooms,
+            grid,
+            robot_from_json(card["robot"]),
+            spec["formula"],
+            spec.get("regions"),
+            rooms,
             spec.get("signals"),
-        )  # fmt: skip
-        return _prepared(load_policy(weights, card, task), card, weights)
+        )
+        return LocalShield(make_shield([load_policy(weights, card, task)]), card, weights)
 
     @staticmethod
     def make(
@@ -138,7 +147,7 @@ class LocalShield:
         card = {**made.card, "warnings": list(notices(policy)) if check else []}
         for notice in card["warnings"]:
             log.warning("%s", notice)
-        return _prepared(policy, card, weights)
+        return LocalShield(make_shield([policy]), card, weights)
 
     def save(self, folder: str | Path) -> None:
         """Write what `load` reads, which is also what a server takes in its folder of policies."""
@@ -167,11 +176,18 @@ class LocalShield:
         feasible, way = refusal.begin(shield, pose, allowed)
         status, _ = episode.close(shield, [pose])
         info = SessionInfo(
-            id=id, **self.about(), next_t=0, feasible=feasible, spec_status=status, main_task_done=False,
-            finished=False, expires_at="", margin=shield.config.margin,
+            id=id,
+            **self.about(),
+            next_t=0,
+            feasible=feasible,
+            spec_status=status,
+            main_task_done=False,
+            finished=False,
+            expires_at="",
+            margin=shield.config.margin,
             rules=(Rule(self, shield).told(status),),
             any_signal=any_signal(shield, np.array([pose], np.float64)),
-        )  # fmt: skip
+        )
         return LocalSession(self, shield, shaping, info, pose, way)
 
     def configured(self, config: Config, shaping: str) -> Shield:
@@ -183,21 +199,19 @@ class LocalShield:
         """What a session's info holds of its policy, and of the task that it is for."""
         task = self.task
         return {
-            "policy_ids": (str(self.card["id"]),), "map_id": task.grid.content_hash,
+            "policy_ids": (str(self.card["id"]),),
+            "map_id": task.grid.content_hash,
             "spec": {"formula": str(task.formula), "regions": self.card["spec"].get("regions", {})},
-            "horizon": task.horizon, "actions": task.robot.action_names,
+            "horizon": task.horizon,
+            "actions": task.robot.action_names,
             "terminal_actions": tuple(np.flatnonzero(task.robot.terminal).tolist()),
-        }  # fmt: skip
+        }
 
     @cache  # noqa: B019  a preference takes seconds to prepare, and shields are few
     def _preference(self, name: str) -> Any:
         grid = self.task.grid
         row, column = np.unravel_index(int(np.argmax(grid.clearance)), grid.clearance.shape)
         return prepare(name, self.task, self.shield.proposers, [*grid.centres[row, column], 0.0])
-
-
-def _prepared(policy: Proposer, card: Mapping[str, Any], weights: bytes) -> LocalShield:
-    return LocalShield(make_shield([policy]), card, weights)
 
 
 def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
@@ -211,9 +225,11 @@ def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
     images = [image for kind in (".pgm", ".png") if (image := path.with_suffix(kind)).is_file()]
     if not path.is_file() or not images:
         raise MapError(
-            "no map can be read there", path="world", got=str(path),
+            "no map can be read there",
+            path="world",
+            got=str(path),
             expected="a .yaml with its image beside it",
-        )  # fmt: skip
+        )
     named = path.with_suffix(".regions.json")
     areas = json.loads(named.read_text()) if named.is_file() else {}
     rooms = parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})

@@ -83,11 +83,15 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
     """
     settings = settings or Settings()
     app = FastAPIOffline(
-        title="specshield", version=__version__, description=DESCRIPTION, openapi_tags=TAGS,
-        lifespan=lambda app: _life(app, settings, embedded), redoc_url=None,
+        title="specshield",
+        version=__version__,
+        description=DESCRIPTION,
+        openapi_tags=TAGS,
+        lifespan=lambda app: _life(app, settings, embedded),
+        redoc_url=None,
         generate_unique_id_function=lambda route: "_".join([*map(str, route.tags), route.name]),
         swagger_ui_parameters={"defaultModelsExpandDepth": 0, "tryItOutEnabled": True},
-    )  # fmt: skip
+    )
     for module in (pages, specs, maps, robots, policies, sessions, pictures, events, system):
         app.include_router(module.router)
     app.include_router(events.overview)
@@ -128,17 +132,32 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     own = None if settings.api_key is None else settings.api_key.get_secret_value()
     keys, gauges = Keys(store.redis, own), Gauges(store, jobs)
     server = Server(
-        settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy, keys,
+        settings,
+        store,
+        library,
+        known,
+        sessions,
+        jobs,
+        gauges,
+        watchers,
+        worker,
+        startup,
+        heavy,
+        keys,
         claims,
-    )  # fmt: skip
+    )
     body.clear(settings.data_dir / "incoming")
     app.state.server = server
     server.streams.close_at_stop()  # which comes when what follows has drained
     drain_at_sigterm(startup, settings.drain)
     running = (
-        prepare(startup, check), tend(embedded, worker, startup), mover.run(), watchers.run(), keys.follow(),
+        prepare(startup, check),
+        tend(embedded, worker, startup),
+        mover.run(),
+        watchers.run(),
+        keys.follow(),
         _adopt(library, known),
-    )  # fmt: skip
+    )
     tasks = [asyncio.create_task(each) for each in running]
     try:
         await asyncio.wait(tasks[:1], timeout=NEARLY)  # who asked now would be told to wait a second

@@ -51,9 +51,8 @@ watchers = Gauge(
     "specshield_watchers", "Streams of events that are open.", registry=registry, multiprocess_mode="livesum"
 )
 build = Gauge(
-    "specshield_build_info", "1, with the version.", ["version"],
-    registry=registry, multiprocess_mode="max",
-)  # fmt: skip
+    "specshield_build_info", "1, with the version.", ["version"], registry=registry, multiprocess_mode="max"
+)
 build.labels(__version__).set(1)
 _refusal = {error.type: refusals.labels(error.type) for error in tree()}
 

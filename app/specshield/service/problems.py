@@ -148,9 +148,10 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
         return InputError(f"{what} is not JSON: {reason}", path=below or None, expected="a JSON object")
     if isinstance(body, bytes):  # not read at all
         return errors.UnsupportedMediaType(
-            "the body is not declared as JSON", path="Content-Type",
+            "the body is not declared as JSON",
+            path="Content-Type",
             expected="the header Content-Type: application/json",
-        )  # fmt: skip
+        )
     # Where a word or an object would do, an object is told what it lacks, not that it is no word.
     found = [
         e for e in found if e["type"] != "literal_error" or not isinstance(e.get("input"), dict)

@@ -37,16 +37,19 @@ class Settings(BaseSettings):
     models_dir: Path = Field(shipped.MODELS, description="Policies there at start, one folder each.")
     maps_dir: Path = Field(shipped.MAPS, description="Maps there at start, <name>.yaml beside its image.")
     redis_url: str | None = Field(
-        None, validation_alias=AliasChoices("redis_url", "REDIS_URL"),
+        None,
+        validation_alias=AliasChoices("redis_url", "REDIS_URL"),
         description="The store, as storage/connect.py says; unset, the server starts its own.",
-    )  # fmt: skip
+    )
     store_timeout: float = Field(
         2.0, gt=0, le=LONGEST, description="Longest wait for one answer of the store [s]."
     )
     store_replicas: int = Field(
-        0, ge=0, le=8,
+        0,
+        ge=0,
+        le=8,
         description="Replicas of the store at REDIS_URL that have to have a step before it is answered.",
-    )  # fmt: skip
+    )
     api_key: SecretStr | None = Field(
         None, description="Asked for as `Authorization: Bearer <key>`; unset, none is."
     )
@@ -67,9 +70,10 @@ class Settings(BaseSettings):
         10_000, ge=100, description="Most members of objects in a JSON body, uploads excepted."
     )
     max_spec_bytes: int = Field(
-        256 << 10, ge=1024,
+        256 << 10,
+        ge=1024,
         description="Largest spec of a policy, and largest outlines of a map's rooms, as JSON [bytes].",
-    )  # fmt: skip
+    )
     max_header_bytes: int = Field(32 << 10, ge=1024, description="Largest head of a request [bytes].")
     max_connections: int = Field(2000, ge=8, description="Most connections at once to one server process.")
     request_timeout: float = Field(
@@ -98,9 +102,10 @@ class Settings(BaseSettings):
         32 << 30, ge=0, description="Most that all maps and policies take on the disk [bytes]."
     )
     disk_reserve_bytes: int = Field(
-        64 << 20, ge=0,
+        64 << 20,
+        ge=0,
         description="Free space of the data folder's disk that only running sessions use up [bytes].",
-    )  # fmt: skip
+    )
     max_maps: int = Field(1000, ge=1, description="Most uploaded maps kept.")
     max_policies: int = Field(1000, ge=1, description="Most policies kept.")
     max_sessions: int = Field(100_000, ge=1, description="Most sessions kept.")
@@ -108,18 +113,22 @@ class Settings(BaseSettings):
         7 * 24 * 3600, ge=1, description="A session is erased this long after its last change [s]."
     )
     archive_after: int = Field(
-        3600, ge=1,
+        3600,
+        ge=1,
         description="A session that has not changed for so long moves to the archive [s]; one that has ended "
         "does after 60 s, or after this long.",
-    )  # fmt: skip
+    )
     archive_bytes: int = Field(
-        100 << 30, ge=1 << 20,
+        100 << 30,
+        ge=1 << 20,
         description="Where the archive holds so much, none moves there and none is begun [bytes].",
-    )  # fmt: skip
+    )
     drain: float = Field(
-        0.0, ge=0, le=3600,
+        0.0,
+        ge=0,
+        le=3600,
         description="How long a server that was told to stop goes on answering, /readyz excepted [s].",
-    )  # fmt: skip
+    )
     shield_cache: int = Field(32, ge=1, description="Prepared shields kept in memory.")
 
     max_watchers: int = Field(1000, ge=0, description="Most open streams of events, for each server process.")
@@ -201,9 +210,10 @@ def read_settings() -> Settings:
     """Those of this process's environment. Raises InputError, which names the variable at fault."""
     if os.environ.get("SPECSHIELD_API_KEY") == "":  # empty counts as unset: nobody means an open server by it
         raise InputError(
-            "SPECSHIELD_API_KEY is empty", path="SPECSHIELD_API_KEY",
+            "SPECSHIELD_API_KEY is empty",
+            path="SPECSHIELD_API_KEY",
             expected="a key, or the variable not set",
-        )  # fmt: skip
+        )
     try:
         return Settings()
     except ValidationError as invalid:
@@ -213,6 +223,7 @@ def read_settings() -> Settings:
         secret = field in ("redis_url", "api_key")  # a URL may hold a password
         shown = "" if secret else f": {wrong['input']!r}"
         raise InputError(
-            f"{name} is not valid{shown}", path=name,
+            f"{name} is not valid{shown}",
+            path=name,
             expected=wrong["msg"].removeprefix("Value error, ").removeprefix("Input should be "),
-        ) from None  # fmt: skip
+        ) from None

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from specshield.errors import InputError, SpecshieldError
 from specshield.handover import begun
 from specshield.lookahead.preferences import PROJECTION, prepare
-from specshield.reasons.explanation import explanations
 from specshield.service.heavy.tables import Made, make
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
@@ -22,10 +22,9 @@ from specshield.service.sessions.chain import Chain, Config
 from specshield.service.sessions.config import asked_by, settings_of
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.rules import carried_over, way
-from specshield.service.sessions.session import columns
+from specshield.service.sessions.session import decide
 from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
-from specshield.shield import episode
 from specshield.shield.decision import Carry, Shield, make_shield
 from specshield.shield.taught import Taught
 from specshield.world.learned import LearnedMap
@@ -119,18 +118,10 @@ def _again(
     rows = found.rows[config.origin : t + 1, : 3 + len(names)]
     if len(kept.rows) != len(config.actions):
         raise InputError(f"step {t} is of {len(kept.rows)} actions", t=t)
-    if not history.agree(kept.pose_sent(rows[-1]), rows[-1, :3]).all():
+    asked = kept.asked(rows[-1], names)
+    if not history.agree(np.array(asked.pose), rows[-1, :3]).all():
         raise InputError(f"the pose sent at step {t} is not the one stored", t=t)
-    logits, points = kept.logits_sent(), (kept.points_sent("occupied"), kept.points_sent("free"))
-    decision = episode.decide(
-        shield, rows[:, :3], logits, kept.main_task_done, columns(rows, names), carry, kept.all_witnesses,
-        *points, explanations if kept.explain else None,
-    )  # fmt: skip
-    made = record.make(
-        replace(decision, t=t), rows[-1], kept.before, kept.pose_sent(rows[-1]).tolist(), logits,
-        kept.main_task_done, kept.signals_sent(rows[-1], names), names, kept.all_witnesses, *points,
-        kept.explain, kept.tables,
-    )  # fmt: skip
+    decision, made = decide(shield, asked, t, rows, names, carry, kept.before, kept.tables)
     return made, pack_carry(decision.carry).unpacked()
 
 

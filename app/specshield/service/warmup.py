@@ -73,7 +73,7 @@ def _decide(task: Task) -> None:
         shield = make_shield([policy], config)
         episode.start(shield, START)
         first = episode.decide(shield, [START], logits)
-        record.make(first, np.array(START), b"", START, logits, False, {}, (), False)
+        record.make(first, record.Asked(START, logits, False), np.array(START), (), b"")
         second = [START, first.next_poses[0].tolist()]
         carry = replace(first.carry, stuck=((*START, 0),))
         episode.decide(shield, second, logits, carry=carry, occupied=[[1.9, 0.5]], explain=explanations)

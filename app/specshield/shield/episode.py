@@ -237,8 +237,9 @@ def _history(poses: ArrayLike) -> Floats:
     """Poses [t + 1, 3] with theta in (-pi, pi], as f has it. Raises PoseError where they are not finite."""
     array = np.array(poses, dtype=np.float64, order="C")
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0 or not _wrapped(array):
-        got = str(poses)[:80]
-        raise PoseError("not poses", path="poses", got=got, expected="a list of finite [x, y, theta]")
+        raise PoseError(
+            "not poses", path="poses", got=str(poses)[:80], expected="a list of finite [x, y, theta]"
+        )
     return array
 
 

@@ -147,9 +147,7 @@ def simulated(
     motions = np.concatenate(rows) if len(rows) > 1 else [*rows, np.empty((0, prefix.steps), np.int64)][0]
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
     leaves = np.empty((len(motions), prefix.view.tree.size))
-    violated = (
-        prefix.high <= SATISFIED_ABOVE
-    )  # then every row is wanted whole: parts of the rule are judged on it
+    violated = prefix.high <= SATISFIED_ABOVE  # then parts of the rule are judged, on every row as a whole
     finite = _simulate_and_rate(
         body,
         prefix.view,

@@ -95,12 +95,7 @@ class Union:
 
 
 Region = Circle | Rectangle | Polygon | Union
-KINDS: Mapping[str, type[Region]] = {
-    "circle": Circle,
-    "rectangle": Rectangle,
-    "polygon": Polygon,
-    "union": Union,
-}
+KINDS = {kind.__name__.lower(): kind for kind in (Circle, Rectangle, Polygon, Union)}
 
 
 def signed_distance(region: Region, points: ArrayLike) -> Floats:
@@ -252,12 +247,7 @@ def region_from_json(spec: Any, path: str) -> Region:
     spec = checks.mapping(spec, path)
     kind = checks.member(spec, "type", path)
     if not isinstance(kind, str) or kind not in KINDS:
-        raise MapError(
-            f"{path} is not a known kind of region",
-            path=f"{path}.type",
-            got=kind,
-            expected="one of " + ", ".join(KINDS),
-        )
+        raise checks.wrong("kind of region", f"{path}.type", kind, "one of " + ", ".join(KINDS))
     names = [field.name for field in fields(KINDS[kind])]
     if extra := sorted(set(map(str, spec)) - {"type", *names}):
         raise MapError(

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from specshield.errors import InputError, LimitReached, NotFound, StoreError, Unauthorized
 from specshield.service.library.files import now
-from specshield.service.storage.connect import FAILURES
+from specshield.service.storage.connect import reaching
 
 T = TypeVar("T")
 KEYS = "specshield:keys"
@@ -134,9 +134,11 @@ class Keys:
         record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
             raise InputError(
-                "there is a key of this name", path="name", got=name,
+                "there is a key of this name",
+                path="name",
+                got=name,
                 expected="another; or revoke that one first",
-            )  # fmt: skip
+            )
         await _reached(self._store.hincrby(KEYS, "", 1))
         return secret
 
@@ -155,7 +157,5 @@ def digest_of(key: bytes) -> str:
 
 
 async def _reached(answer: Awaitable[T]) -> T:
-    try:
+    with reaching():
         return await answer
-    except FAILURES as error:
-        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error

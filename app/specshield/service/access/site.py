@@ -37,15 +37,18 @@ def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[st
     server = scope.get("server") or ("", None)
     if not names_server(host, server[0], server[1], allowed):
         raise MisdirectedRequest(
-            "this server does not answer for the host that was asked for", path="Host", got=host,
+            "this server does not answer for the host that was asked for",
+            path="Host",
+            got=host,
             expected="the address that the server listens on, or a name in SPECSHIELD_ALLOWED_HOSTS",
-        )  # fmt: skip
+        )
     if _from_elsewhere(scope.get("method", ""), headers, host, allowed):
         raise CrossSite(
-            "a page of another origin may not use this server", path="Origin",
+            "a page of another origin may not use this server",
+            path="Origin",
             got=headers.get(b"origin", b"").decode("latin-1") or None,
             expected="a program, or a page that comes from this server",
-        )  # fmt: skip
+        )
     if scope.get("method") in WITH_BODY and scope["path"].startswith("/v1/") and _has_body(headers):
         _check_type(scope["path"], headers.get(b"content-type", b"").decode("latin-1"))
 
@@ -108,6 +111,8 @@ def _check_type(path: str, declared: str) -> None:
         taken.append("application/msgpack")
     if kind not in taken and not JSON.fullmatch(kind):
         raise UnsupportedMediaType(
-            "the body is not declared as a type that is taken here", path="Content-Type", got=declared,
+            "the body is not declared as a type that is taken here",
+            path="Content-Type",
+            got=declared,
             expected=f"the header Content-Type: {' or '.join(taken)}",
-        )  # fmt: skip
+        )

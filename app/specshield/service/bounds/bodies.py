@@ -90,9 +90,11 @@ class Bodies:
         try:
             async with asyncio.timeout_at(begun + self._patience) as deadline:
                 return await _receive(
-                    receive, body, limit,
+                    receive,
+                    body,
+                    limit,
                     lambda: deadline.reschedule(begun + self._patience + body.size / self._slowest),
-                )  # fmt: skip
+                )
         except TimeoutError:
             raise RequestTimeout(
                 f"the body took too long: {body.size} bytes came in {loop.time() - begun:.0f} s",
@@ -103,9 +105,11 @@ class Bodies:
         """A schema says of each member that it does not know it: thousands would take long to say so."""
         if isinstance(content, bytes) and len(content) > LONG_JSON and content.count(b":") > self._members:
             raise InputError(
-                "the body has too many members", path="body", got=content.count(b":"),
+                "the body has too many members",
+                path="body",
+                got=content.count(b":"),
                 expected=f"at most {self._members}, and no more colons than that in texts",
-            )  # fmt: skip
+            )
 
 
 async def _receive(receive: Receive, body: Body, limit: int, came: Callable[[], None]) -> bool:

@@ -63,9 +63,12 @@ def described(app: FastAPI) -> dict[str, Any]:
     """OpenAPI, made once."""
     if app.openapi_schema is None:
         schema = get_openapi(
-            title=app.title, version=app.version, description=app.description, routes=app.routes,
+            title=app.title,
+            version=app.version,
+            description=app.description,
+            routes=app.routes,
             tags=app.openapi_tags,
-        )  # fmt: skip
+        )
         schemas = schema["components"]["schemas"]
         for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which never leave it
             schemas.pop(name, None)

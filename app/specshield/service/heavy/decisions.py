@@ -8,12 +8,11 @@ from specshield.service.heavy.uploads import policies_of
 from specshield.service.schemas.sessions import SessionRequest
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import sessions, steps, switch
-from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session
 from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.switch import Wanted
 from specshield.service.settings import Settings
-from specshield.shield.decision import Config, Decision
+from specshield.shield.decision import Config
 
 
 @cache
@@ -21,12 +20,9 @@ def _shields(settings: Settings) -> Shields:
     return Shields(policies_of(settings), settings.shield_cache)
 
 
-def step(
-    settings: Settings, session: Session, request: StepBody
-) -> tuple[Session, Decision, StepRecord, float]:
-    """The session with its new row, the decision, its record, and the seconds that it took."""
-    made = steps.timed(_shields(settings), session, request)
-    return made[0], made[1], made[2], made[3]
+def step(settings: Settings, session: Session, request: StepBody) -> tuple[steps.Decided, float]:
+    """The step, and the seconds that it took."""
+    return steps.timed(_shields(settings), session, request)[:2]
 
 
 def begin(settings: Settings, request: SessionRequest, config: Config, owner: str) -> sessions.Begun:

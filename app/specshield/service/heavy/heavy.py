@@ -28,13 +28,23 @@ class Heavy:
     def __init__(self, settings: Settings) -> None:
         self._settings, self._template = settings, Template()
         self.tasks = Pool(
-            self._template, size=2, memory=settings.heavy_memory, nice=TASKS_NICE, waiting=WAITING, idle=IDLE,
+            self._template,
+            size=2,
+            memory=settings.heavy_memory,
+            nice=TASKS_NICE,
+            waiting=WAITING,
+            idle=IDLE,
             unused=self._unused,
-        )  # fmt: skip
+        )
         self.decisions = Pool(
-            self._template, size=max(os.cpu_count() or 1, 2), memory=DECISION_MEMORY, nice=DECISIONS_NICE,
-            waiting=1000, idle=10 * IDLE, unused=self._unused,
-        )  # fmt: skip
+            self._template,
+            size=max(os.cpu_count() or 1, 2),
+            memory=DECISION_MEMORY,
+            nice=DECISIONS_NICE,
+            waiting=1000,
+            idle=10 * IDLE,
+            unused=self._unused,
+        )
 
     async def run(self, request: Request, function: str, *arguments: Any) -> Any:
         """What a function of heavy/uploads.py returns, or "pictures:function" of the module beside it. Its
@@ -46,10 +56,13 @@ class Heavy:
         module, _, name = function.rpartition(":")
         work = asyncio.ensure_future(
             self.tasks.run(
-                f"specshield.service.heavy.{module or 'uploads'}:{name}", self._settings, *arguments,
-                seconds=self._settings.heavy_timeout, owner=owner,
+                f"specshield.service.heavy.{module or 'uploads'}:{name}",
+                self._settings,
+                *arguments,
+                seconds=self._settings.heavy_timeout,
+                owner=owner,
             )
-        )  # fmt: skip
+        )
         gone = asyncio.ensure_future(_gone(request))
         try:
             await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)

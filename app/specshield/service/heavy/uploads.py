@@ -142,7 +142,7 @@ def check_policy(settings: Settings, content: Content, owner: str) -> tuple[Reco
         raise (error if error.path == "robot" else error.at("spec.formula")) from None
     record = policies.described(about, task)
     if asked.name is not None:
-        policies.check_name(record, owner, asked.name)
+        policies.check_name(asked.name, record.id, owner)
     return record, asked.name
 
 

@@ -16,19 +16,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from specshield.errors import (
-    Conflict,
-    InputError,
-    InsufficientStorage,
-    LimitReached,
-    NameTaken,
-    NotFound,
-    StoreError,
-)
+from specshield.errors import Conflict, InputError, InsufficientStorage, LimitReached, NameTaken, NotFound
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.library import files
 from specshield.service.settings import Settings
-from specshield.service.storage.connect import FAILURES
+from specshield.service.storage.connect import reaching
 
 SCRIPT = Path(__file__).with_name("claims.lua").read_text()
 PATIENCE = 5.0  # [s] to wait for a deletion of the same id; one takes milliseconds. Chosen by hand
@@ -69,30 +61,19 @@ class Claims:
 
     def named(self, kind: str, name: str, owner: str) -> str | None:
         """The id of what this owner calls by that name."""
-        found = reached(lambda: self._store.hget(_key("names", kind, owner), name))
-        return None if found is None else str(found.decode())
+        return self._text(_key("names", kind, owner), name)
 
     def name_of(self, kind: str, id: str, owner: str) -> str | None:
-        found = reached(lambda: self._store.hget(_key("named", kind, owner), id))
+        return self._text(_key("named", kind, owner), id)
+
+    def _text(self, key: str, field: str) -> str | None:
+        found = reached(lambda: self._store.hget(key, field))
         return None if found is None else str(found.decode())
 
     def names(self, kind: str, owner: str) -> dict[str, str]:
         """{id: name} of everything that this owner has named."""
         found = reached(lambda: self._store.hgetall(_key("named", kind, owner)))
         return {id.decode(): name.decode() for id, name in found.items()}
-
-    def check_name(self, kind: str, name: str, id: str, owner: str, shipped: Mapping[str, str]) -> None:
-        """Raises NameTaken where something else than `id` has the name, and InputError for one that nothing
-        can have. shipped: {name: id} of what came with the server.
-        """
-        if files.HASH.fullmatch(name) or (id in shipped.values() and shipped.get(name) != id):
-            raise InputError(
-                "this cannot be named so", path="name", got=name,
-                expected="a name that does not look like an id, for what did not come with the server",
-            )  # fmt: skip
-        bearer = shipped.get(name) or self.named(kind, name, owner)
-        if bearer not in (None, id):
-            raise taken(name, str(bearer))
 
     def name(self, kind: str, id: str, owner: str, name: str) -> None:
         """Names what an owner has; a former name of it is free again. Raises NameTaken and NotFound."""
@@ -124,8 +105,9 @@ class Claims:
             whose, limit = ("this key's", most) if said == "owner" else ("the server's", limits[3])
             raise InsufficientStorage(
                 f"{whose} maps and policies may take {limit} bytes, and {size} more do not fit",
-                expected="room for it: delete a map or a policy", limit=limit,
-            )  # fmt: skip
+                expected="room for it: delete a map or a policy",
+                limit=limit,
+            )
         if said == "no map":
             raise NotFound("the map was deleted", path="map_id", got=map_id, expected="an id from /v1/maps")
         try:
@@ -201,6 +183,7 @@ class Claimed:
 
     def __init__(self, kind: str, claims: Claims | None, settings: Settings) -> None:
         self._kind, self._given, self._folder = kind, claims, files.kept(settings, kind)
+        self._named: Mapping[str, Any] = {}  # what came with the server
 
     def adopt(self) -> None:
         """Gives what nobody has, of a time before owners, to the owner without a name."""
@@ -213,6 +196,22 @@ class Claimed:
     def _map_of(self, id: str) -> str:
         """Of a policy the map, as `Claims.adding` takes it."""
         return ""
+
+    def check_name(self, name: str, id: str, owner: str) -> None:
+        """Raises NameTaken where something else than `id` has the name, and InputError for one that nothing
+        can have.
+        """
+        shipped = {each: known.id for each, known in self._named.items()}
+        if files.HASH.fullmatch(name) or (id in shipped.values() and shipped.get(name) != id):
+            raise InputError(
+                "this cannot be named so",
+                path="name",
+                got=name,
+                expected="a name that does not look like an id, for what did not come with the server",
+            )
+        bearer = shipped.get(name) or self._claims.named(self._kind, name, owner)
+        if bearer not in (None, id):
+            raise taken(name, str(bearer))
 
     @property
     def _claims(self) -> Claims:
@@ -242,7 +241,5 @@ def taken(name: str, id: str) -> NameTaken:
 
 def reached(action: Callable[[], Any]) -> Any:
     """What a question to the store gives. Raises StoreError where it cannot be reached."""
-    try:
+    with reaching():
         return action()
-    except FAILURES as error:
-        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error

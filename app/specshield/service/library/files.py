@@ -67,19 +67,17 @@ def check_writable(folder: Path, name: str) -> None:
             pass
     except OSError as error:
         raise InputError(
-            f"{name} cannot be used: {error.strerror}", path=name, got=str(folder),
+            f"{name} cannot be used: {error.strerror}",
+            path=name,
+            got=str(folder),
             expected="a folder to write to",
-        ) from error  # fmt: skip
-
-
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_bytes())
+        ) from error
 
 
 def find_json(path: Path) -> Any:
     """None where there is no such file, or no more: another process may delete what this one looks at."""
     try:
-        return read_json(path)
+        return json.loads(path.read_bytes())
     except FileNotFoundError:
         return None
 
@@ -107,11 +105,6 @@ def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
             raise
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-
-
-def weight(content: Mapping[str, bytes]) -> int:
-    """Bytes that these files take."""
-    return sum(len(part) for part in content.values())
 
 
 def weight_of(folder: Path) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import logging
 import secrets
 from collections.abc import Iterator, Mapping
@@ -65,7 +66,7 @@ class Maps(Claimed):
         super().__init__("maps", claims, settings)
         self._max_rooms = settings.max_spec_bytes
         self._recent = files.Recent[Map](KEPT_IN_MEMORY)
-        self._named = {str(found.name): found for found in _shipped(settings.maps_dir)}
+        self._named: Mapping[str, Map] = {str(found.name): found for found in _shipped(settings.maps_dir)}
 
     def get(self, key: str) -> Map:
         """By id, or one that came with the server, whoever asks. Raises NotFound."""
@@ -116,19 +117,19 @@ class Maps(Claimed):
         id = _id(grid, rooms)
         found = self.shipped(id)
         if name is not None:
-            shipped = {each: known.id for each, known in self._named.items()}
-            self._claims.check_name("maps", name, id if found is None else found.id, key.name, shipped)
+            self.check_name(name, id if found is None else found.id, key.name)
         if found is not None:
             return found
         if len(files.to_json(_rooms_json(rooms))) > self._max_rooms:
             raise MapError(
-                "the outlines of the rooms are too large", path="rooms",
+                "the outlines of the rooms are too large",
+                path="rooms",
                 expected=f"at most {self._max_rooms} bytes as JSON: simpler outlines",
-            )  # fmt: skip
+            )
         made, folder = Map(id, grid, rooms), self._folder / id
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
         content = {"map.yaml": dump_map(grid)[0].encode(), "map.png": made.png(), "map.json": meta}
-        with self._claims.adding("maps", id, key, files.weight(content)):
+        with self._claims.adding("maps", id, key, sum(map(len, content.values()))):
             if not files.there(folder):
                 files.write_folder(folder, content)
         if name is not None:
@@ -142,15 +143,20 @@ class Maps(Claimed):
         if found is not None:
             raise InUse(
                 f"map {found.name!r} came with the server and cannot be deleted",
-                path="map_id", got=key, expected="a map that was sent here",
-            )  # fmt: skip
+                path="map_id",
+                got=key,
+                expected="a map that was sent here",
+            )
         key, token = self._id_of(key, owner), secrets.token_hex(8)
         user = self._claims.mark("maps", key, owner, token)
         if user is not None:
             raise InUse(
-                f"policy {user!r} is for this map", path="map_id", got=key,
-                expected="a map that no policy is for: delete the policy first", policy_id=user,
-            )  # fmt: skip
+                f"policy {user!r} is for this map",
+                path="map_id",
+                got=key,
+                expected="a map that no policy is for: delete the policy first",
+                policy_id=user,
+            )
         try:
             if self._claims.free("maps", key, owner, token):
                 self._recent.drop(key)
@@ -161,9 +167,11 @@ class Maps(Claimed):
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
         """One page of an owner's maps and those of all, as JSON, had without reading the cells."""
         keys, following = files.page(
-            [*self._named, *self._own(owner)], after, limit,
+            [*self._named, *self._own(owner)],
+            after,
+            limit,
             lambda key: files.size(self._folder / key / "map.json"),
-        )  # fmt: skip
+        )
         names, shown = self._claims.names("maps", owner), []
         for key in keys:
             with suppress(NotFound):  # deleted at this moment
@@ -207,7 +215,7 @@ def _shipped(folder: Path) -> Iterator[Map]:
             )
             grid = load_map(path.read_text(), image.read_bytes())
             named = path.with_suffix(".regions.json")
-            areas = files.read_json(named) if named.is_file() else {}
+            areas = json.loads(named.read_bytes()) if named.is_file() else {}
             rooms = parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})
         except (SpecshieldError, StopIteration, ValueError) as error:
             log.warning("map %s is left out: %s", path, error or "no image beside it")

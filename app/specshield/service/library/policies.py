@@ -62,7 +62,7 @@ class Policies(Claimed):
         self._maps, self._models = maps, settings.models_dir
         self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
-        self._named = {str(record.name): record for record in self._shipped()}
+        self._named: Mapping[str, Record] = {str(record.name): record for record in self._shipped()}
 
     def record(self, key: str) -> Record:
         """By id, or one that came with the server, whoever asks. Raises NotFound."""
@@ -116,9 +116,11 @@ class Policies(Claimed):
     def _load(self, record: Record) -> Proposer:
         if record.card is None:
             raise PolicyError(
-                f"policy {record.id} is not ready", path="policy_id", got=record.id,
+                f"policy {record.id} is not ready",
+                path="policy_id",
+                got=record.id,
                 expected="a policy whose status is `ready`",
-            )  # fmt: skip
+            )
         folder = self._models / record.name if record.name else self._folder / record.id
         return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
 
@@ -137,16 +139,13 @@ class Policies(Claimed):
         size = len(files.to_json(spec))
         if size > self._max_spec:
             raise InputError(
-                "the spec is too large", path="spec", got=f"{size} bytes as JSON",
+                "the spec is too large",
+                path="spec",
+                got=f"{size} bytes as JSON",
                 expected=f"at most {self._max_spec}, regions that the formula does not name left out",
-            )  # fmt: skip
+            )
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)
-
-    def check_name(self, record: Record, owner: str, name: str) -> None:
-        """Raises NameTaken, and InputError for a name that this policy cannot have."""
-        shipped = {each: known.id for each, known in self._named.items()}
-        self._claims.check_name("policies", name, record.id, owner, shipped)
 
     def name(self, record: Record, owner: str, name: str) -> None:
         """Names an owner's policy. Raises NameTaken."""
@@ -162,12 +161,6 @@ class Policies(Claimed):
             return self.record(id)
         except NotFound:
             return None
-
-    def add(self, record: Record, key: Key) -> Record:
-        """Notes a policy that is still to be made, unless there is one already. Raises LimitReached,
-        InsufficientStorage.
-        """
-        return self._add(record, {}, key)
 
     def add_card(
         self, about: Description, card: Mapping[str, Any], weights: bytes, key: Key, name: str | None = None
@@ -190,20 +183,25 @@ class Policies(Claimed):
         _check_options(about)
         record = replace(record, id=id, card=card)
         if name is not None:
-            self.check_name(record, key.name, name)
-        added = self._add(record, {"policy.safetensors": weights, "card.json": files.to_json(card)}, key)
+            self.check_name(name, record.id, key.name)
+        added = self.add(record, key, {"policy.safetensors": weights, "card.json": files.to_json(card)})
         if name is not None:
             self.name(added, key.name, name)
         return added
 
-    def _add(self, record: Record, trained: Mapping[str, bytes], key: Key) -> Record:
+    def add(self, record: Record, key: Key, trained: Mapping[str, bytes] | None = None) -> Record:
+        """Notes a policy, unless there is one already. trained: its files, where it is not still to be made.
+        Raises LimitReached, InsufficientStorage.
+        """
         if record.id in (found.id for found in self._named.values()):
             return self.record(record.id)
         record = replace(record, created_at=files.now())
         stored = asdict(replace(record, card=None))
         del stored["card"]
-        content, folder = {"policy.json": files.to_json(stored), **trained}, self._folder / record.id
-        size = max(files.weight(content), files.weight_of(folder))  # all of it, if it is trained already
+        content, folder = {"policy.json": files.to_json(stored), **(trained or {})}, self._folder / record.id
+        size = max(
+            sum(map(len, content.values())), files.weight_of(folder)
+        )  # all of it, if it is trained already
         with self._claims.adding("policies", record.id, key, size, self._own_map(record.about)):
             if not folder.is_dir():
                 files.write_folder(folder, content)
@@ -252,9 +250,11 @@ class Policies(Claimed):
         """One page of an owner's policies and those of all."""
         own = (id for id in self._claims.ids("policies", owner) if (self._folder / id).is_dir())
         keys, following = files.page(
-            [*self._named, *own], after, limit,
+            [*self._named, *own],
+            after,
+            limit,
             lambda key: sum(files.size(self._folder / key / name) for name in ("policy.json", "card.json")),
-        )  # fmt: skip
+        )
         found = [self.made_here(key) for key in keys]  # None: deleted at this moment
         return [record for record in found if record is not None], following
 
@@ -264,7 +264,7 @@ class Policies(Claimed):
     def _shipped(self) -> Iterator[Record]:
         for path in sorted(self._models.glob("*/card.json")):
             try:
-                card = files.read_json(path)
+                card = json.loads(path.read_bytes())
                 about = describe(card)
                 about = replace(about, map_id=self._maps.get(about.map_id).id)
                 record = Record(card["id"], about, self.task(about).horizon, path.parent.name, None, card)

@@ -6,6 +6,7 @@ import itertools
 import re
 import secrets
 import time
+from collections import defaultdict
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -28,7 +29,7 @@ class Observe:
             await self.app(scope, receive, send)
             return
         start = time.perf_counter()
-        timing: dict[str, float] = {}
+        timing = defaultdict[str, float](float)
         scope.setdefault("state", {})["timing"] = timing
         asked = next((v for n, v in scope["headers"] if n == b"x-request-id"), b"").decode("latin-1")
         request_id = asked if REQUEST_ID.fullmatch(asked) else f"{STARTED}{next(_count):08x}"

@@ -109,11 +109,12 @@ PLACE = rf"^{ID}(:(-1|[0-9]{{1,7}}))?$"
 Places = Annotated[
     list[Annotated[str, Field(pattern=PLACE)]],
     Query(
-        min_length=1, max_length=MOST_SESSIONS,
+        min_length=1,
+        max_length=MOST_SESSIONS,
         openapi_examples={"example": {"value": [f"{examples.SESSION['id']}:-1"]}},
         description="Ids of sessions; `id:41` begins after step 41, `id:-1` with the first, `id` now.",
     ),
-]  # fmt: skip
+]
 
 
 @overview.get(

@@ -11,7 +11,6 @@ from pydantic import ValidationError
 
 from specshield.errors import InputError, SpecshieldError
 from specshield.service import problems
-from specshield.service.schemas.answers import StepAnswer, to_json, to_msgpack
 from specshield.service.schemas.steps import StepBody, StepRequest
 
 MSGPACK = "application/msgpack"
@@ -32,10 +31,6 @@ def read_step(body: bytes | str, packed: bool) -> StepBody:
 def accepts(header: str, kind: str) -> bool:
     """Whether a header Accept names this kind, and does not refuse it by q=0."""
     return re.search(rf"{kind}(?!\s*;\s*q=0(\.0*)?\s*(,|$))", header) is not None
-
-
-def write_answer(answer: StepAnswer, packed: bool) -> bytes:
-    return to_msgpack(answer) if packed else to_json(answer)
 
 
 def write_problem(error: SpecshieldError, packed: bool) -> bytes:

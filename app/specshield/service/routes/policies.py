@@ -77,24 +77,21 @@ async def create(request: Request, server: ServerState, caller: Caller) -> Any:
 
 
 def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict[str, Any]:
-    record = server.policies.made_here(asked.id)
-    if record is not None and _training(server, record).status != "failed":
-        return _called(server, caller, server.policies.add(asked, caller), called)
-    name = asked.about.method
+    made, name = server.policies.made_here(asked.id), asked.about.method
+    queued = made is None or _training(server, made).status == "failed"
     own = [] if server.worker is None else server.worker.methods
-    if name not in own and not server.jobs.worker_there(name):
+    if queued and name not in own and not server.jobs.worker_there(name):
         needs = METHODS.get(name).needs
         installed = f" where {' and '.join(needs)} is installed" if needs else ""
         raise TrainingUnavailable(
-            f"no worker is running that makes policies by {name}", path="method", got=name,
+            f"no worker is running that makes policies by {name}",
+            path="method",
+            got=name,
             expected=f"a worker: start one with `specshield worker`{installed}, then ask again",
-        )  # fmt: skip
+        )
     record = server.policies.add(asked, caller)
-    server.jobs.start(record.id, name)
-    return _called(server, caller, record, called)
-
-
-def _called(server: Server, caller: Key, record: Record, called: str | None) -> dict[str, Any]:
+    if queued:
+        server.jobs.start(record.id, name)
     if called is not None:
         server.policies.name(record, caller.name, called)
     return _show(server, record, caller.name)
@@ -185,9 +182,11 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
     record = await asyncio.to_thread(server.policies.find, policy_id, owner)
     if record.name is not None:
         raise InUse(
-            f"policy {record.name!r} came with the server and cannot be deleted", path="policy_id",
-            got=policy_id, expected="a policy that was made or sent here",
-        )  # fmt: skip
+            f"policy {record.name!r} came with the server and cannot be deleted",
+            path="policy_id",
+            got=policy_id,
+            expected="a policy that was made or sent here",
+        )
     claims, token = server.claims, secrets.token_hex(8)
     training = await asyncio.to_thread(_training, server, record)
     if training.status in ("queued", "training") and not await asyncio.to_thread(
@@ -200,9 +199,12 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
         session = await server.sessions.using(owner, record.id)
         if session is not None:
             raise InUse(
-                f"session {session!r} still uses this policy", path="policy_id", got=policy_id,
-                expected="a policy that no session uses: close the session first", session_id=session,
-            )  # fmt: skip
+                f"session {session!r} still uses this policy",
+                path="policy_id",
+                got=policy_id,
+                expected="a policy that no session uses: close the session first",
+                session_id=session,
+            )
         if await asyncio.to_thread(server.policies.delete, record, owner, token):
             await asyncio.to_thread(server.jobs.forget, record.id)
     finally:

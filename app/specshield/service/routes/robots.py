@@ -30,7 +30,9 @@ async def read(name: RobotName) -> Any:
     """Its footprint, and what each action does: metres along the heading, then radians counter-clockwise."""
     if name not in PRESETS:
         raise NotFound(
-            f"there is no robot {name!r}", path="name", got=name,
+            f"there is no robot {name!r}",
+            path="name",
+            got=name,
             expected=f"one of {', '.join(sorted(PRESETS))}",
-        )  # fmt: skip
+        )
     return describe(PRESETS[name])

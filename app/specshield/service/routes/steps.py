@@ -6,23 +6,21 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from specshield.errors import SpecshieldError
 from specshield.service import problems
 from specshield.service.access.owners import scoped
-from specshield.service.routes.messages import MSGPACK, accepts, read_step, write_answer
+from specshield.service.routes.messages import MSGPACK, accepts, read_step
+from specshield.service.schemas.answers import to_json, to_msgpack
+from specshield.service.schemas.base import ID
 from specshield.service.state import Server
 
-PATH = re.compile(r"/v1/sessions/([A-Za-z0-9][A-Za-z0-9_.-]{0,63})/steps")
+PATH = re.compile(rf"/v1/sessions/({ID})/steps")
+ROUTE = SimpleNamespace(path="/v1/sessions/{session_id}/steps")  # what the metrics call it
 PACKED, JSON = MSGPACK.encode(), b"application/json"
-
-
-class _Route:
-    """What the metrics call it."""
-
-    path = "/v1/sessions/{session_id}/steps"
 
 
 class StepRoute:
@@ -38,7 +36,7 @@ class StepRoute:
         if found is None:
             await self.app(scope, receive, send)
             return
-        scope["route"], scope["path_params"] = _Route, {"session_id": found[1]}
+        scope["route"], scope["path_params"] = ROUTE, {"session_id": found[1]}
         headers = dict(scope["headers"])
         message = await receive()  # bounds/bodies.py gives the body in one piece
         if message["type"] != "http.request":  # the caller has gone
@@ -55,7 +53,7 @@ class StepRoute:
             await problems.response(error)(scope, receive, send)
             return
         packed = accepts(headers.get(b"accept", b"").decode("latin-1"), MSGPACK)
-        content = write_answer(answer, packed)
+        content = to_msgpack(answer) if packed else to_json(answer)
         told = [(b"content-length", b"%d" % len(content)), (b"content-type", PACKED if packed else JSON)]
         await send({"type": "http.response.start", "status": 200, "headers": told})
         await send({"type": "http.response.body", "body": content})

@@ -12,6 +12,7 @@ import logging
 import re
 import secrets
 import time
+from collections import defaultdict
 from typing import Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -19,11 +20,13 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from specshield.errors import BodyTooLarge, ServerError, SpecshieldError
 from specshield.service import metrics, problems
 from specshield.service.access.owners import scoped
-from specshield.service.routes.messages import read_step, write_answer, write_problem
+from specshield.service.routes.messages import read_step, write_problem
+from specshield.service.schemas.answers import to_json, to_msgpack
+from specshield.service.schemas.base import ID
 from specshield.service.state import Server
 from specshield.service.watch import logs
 
-PATH = re.compile(r"/v1/sessions/([A-Za-z0-9][A-Za-z0-9_.-]{0,63})/stream")
+PATH = re.compile(rf"/v1/sessions/({ID})/stream")
 ROUTE = "/v1/sessions/{session_id}/stream"
 GOING_AWAY = 1001  # RFC 6455: the server goes down
 log = logging.getLogger("specshield")
@@ -103,8 +106,8 @@ class _Stream:
             api_key = await self._server.keys.check(self._authorization)  # it may have been revoked
             self._scope["state"]["rates"].take(api_key, True)
             request = read_step(content, packed)
-            answer = await self._server.sessions.steps.decide(self._key, request, {})
-            return 200, write_answer(answer, packed)
+            answer = await self._server.sessions.steps.decide(self._key, request, defaultdict(float))
+            return 200, to_msgpack(answer) if packed else to_json(answer)
         except SpecshieldError as known:
             error = known
             problems.tell(self._scope, error)

@@ -47,12 +47,4 @@ class StepAnswer(msgspec.Struct, frozen=True, kw_only=True):
     explanations: tuple[Explanation | None, ...] | msgspec.UnsetType = msgspec.UNSET
 
 
-_json, _msgpack = msgspec.json.Encoder(), msgspec.msgpack.Encoder()
-
-
-def to_json(answer: StepAnswer) -> bytes:
-    return _json.encode(answer)
-
-
-def to_msgpack(answer: StepAnswer) -> bytes:
-    return _msgpack.encode(answer)
+to_json, to_msgpack = msgspec.json.Encoder().encode, msgspec.msgpack.Encoder().encode

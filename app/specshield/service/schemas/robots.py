@@ -16,9 +16,11 @@ class Footprint(Strict):
 
     radius: float = Field(gt=0, le=5, description="In metres.")
     offset: list[float] = Field(
-        default_factory=lambda: [0.0, 0.0], min_length=2, max_length=2,
+        default_factory=lambda: [0.0, 0.0],
+        min_length=2,
+        max_length=2,
         description="Of its centre in the robot's frame: [ahead, to the left] in metres.",
-    )  # fmt: skip
+    )
 
 
 class ActionSpec(Strict):

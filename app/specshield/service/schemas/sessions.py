@@ -26,9 +26,10 @@ class KnownUncertainty(Strict):
     """What is known of the robot before its first step."""
 
     translation: float = Field(
-        ge=0.0, le=MOST_TRANSLATION,
+        ge=0.0,
+        le=MOST_TRANSLATION,
         description="Standard deviation of where a motion leads, along each axis [m].",
-    )  # fmt: skip
+    )
     rotation: float = Field(ge=0.0, le=math.pi, description="The same of its heading [rad].")
     slip: float = Field(0.0, ge=0.0, le=1.0, description="Probability that a motion is not executed at all.")
 
@@ -41,9 +42,12 @@ class _Policies(Strict):
 
     policy_id: Id | None = Field(None, description="Id or name of the policy.")
     policy_ids: list[Id] | None = Field(
-        None, min_length=1, max_length=8, fail_fast=True,
+        None,
+        min_length=1,
+        max_length=8,
+        fail_fast=True,
         description="Several policies for one task: an action is feasible if any says so.",
-    )  # fmt: skip
+    )
 
     @model_validator(mode="after")
     def _one_way_to_name_policies(self) -> Self:
@@ -72,9 +76,11 @@ class SessionRequest(_Policies):
         0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
     )
     slack: int = Field(
-        0, ge=0, le=1000,
+        0,
+        ge=0,
+        le=1000,
         description="Steps to keep in hand: each F of the conjunction is met so much earlier, if it can be.",
-    )  # fmt: skip
+    )
     evaluation: Literal["feasibility", "robustness"] = Field(
         "feasibility",
         description="What J is: 1 or 0, for whether the rule can be kept (`feasibility`), or the robustness "
@@ -98,9 +104,11 @@ class SessionRequest(_Policies):
         True, description="A motion that stops short of what was foreseen marks what it ran into."
     )
     map_memory: int | None = Field(
-        None, ge=1, le=1_000_000,
+        None,
+        ge=1,
+        le=1_000_000,
         description="An `occupied` point is forgotten after so many steps; null: never.",
-    )  # fmt: skip
+    )
     threshold_over: Literal["step", "episode"] = Field(
         "step", description="Whether `threshold` holds at each step, or for the episode as a whole."
     )

@@ -19,21 +19,25 @@ class StepRequest(Strict):
     model_config = ConfigDict(json_schema_extra={"examples": [examples.STEP]})
 
     t: int = Field(
-        ge=0, le=1_000_000,
+        ge=0,
+        le=1_000_000,
         description="The step to decide. It is the lock: sent again, it returns the stored answer.",
-    )  # fmt: skip
+    )
     poses: Poses = Field(
         description="Ends with x_t; the whole history or any newest part that joins what the server has."
     )
     logits: list[float | None] | None = Field(
-        None, max_length=256,
+        None,
+        max_length=256,
         description="Logits, one an action; null is minus infinity. Not needed after the main task.",
-    )  # fmt: skip
+    )
     main_task_done: bool = Field(False, description="The main task is over; stays true once it is.")
     signals: dict[str, float] | None = Field(
-        None, max_length=64, fail_fast=True,
+        None,
+        max_length=64,
+        fail_fast=True,
         description="Samples at t of the signals that the spec declares; one left out holds its last value.",
-    )  # fmt: skip
+    )
     witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
     occupied: Points | None = Field(
         None,

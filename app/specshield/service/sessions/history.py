@@ -25,13 +25,18 @@ def join(stored: Floats, t: int, poses: Floats) -> Floats:
     if first < 0:
         raise PoseError(
             f"{len(poses)} poses cannot end at step {t}: a trajectory has {t + 1} poses up to there",
-            path="poses", got=len(poses), expected=f"1 to {t + 1} poses, the last of them x_{t}",
-        )  # fmt: skip
+            path="poses",
+            got=len(poses),
+            expected=f"1 to {t + 1} poses, the last of them x_{t}",
+        )
     if first > length:
         raise HistoryGap(
-            f"the poses begin at step {first}; the server has those before step {length}", path="poses",
-            got=first, expected=f"poses from step {length} or earlier up to step {t}", expected_t=length,
-        )  # fmt: skip
+            f"the poses begin at step {first}; the server has those before step {length}",
+            path="poses",
+            got=first,
+            expected=f"poses from step {length} or earlier up to step {t}",
+            expected_t=length,
+        )
     overlap = min(length, t + 1) - first
     if overlap == 0:
         return poses
@@ -39,10 +44,13 @@ def join(stored: Floats, t: int, poses: Floats) -> Floats:
     if len(differs):
         row = int(differs[0])
         raise HistoryConflict(
-            f"the pose of step {first + row} is not the one stored", path=f"poses[{row}]",
-            got=poses[row].tolist(), expected=f"{stored[first + row].tolist()} within {TOLERANCE:g}",
-            t=first + row, stored=stored[first + row].tolist(),
-        )  # fmt: skip
+            f"the pose of step {first + row} is not the one stored",
+            path=f"poses[{row}]",
+            got=poses[row].tolist(),
+            expected=f"{stored[first + row].tolist()} within {TOLERANCE:g}",
+            t=first + row,
+            stored=stored[first + row].tolist(),
+        )
     return poses[overlap:]
 
 

@@ -17,19 +17,31 @@ import hashlib
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from specshield.arrays import Bytes, Codes, Floats
-from specshield.compiled import kernel
+from specshield.arrays import Floats
 from specshield.service.schemas.answers import Explanation, Residual, StepAnswer
+from specshield.service.sessions.packing import COLUMNS, full, pack_table, sparse, unpack_table
 from specshield.shield.decision import Decision
 
 FORMAT = 2
 MOST_SIGNALS = 64  # columns of a session: MessagePack's integers have 64 bits
-COLUMNS = 5  # of an action's row in the table: J, rho, x, y, theta
+
+
+class Asked(NamedTuple):
+    """What a caller sent with a step. pose: x_t. logits [A], -inf for null; occupied, free [n, 2]: points."""
+
+    pose: Sequence[float]
+    logits: Floats | None
+    main_task_done: bool
+    signals: Mapping[str, float] = {}
+    all_witnesses: bool = False
+    occupied: Floats | None = None
+    free: Floats | None = None
+    explain: bool = False
 
 
 class StepRecord(msgspec.Struct, frozen=True, array_like=True):
@@ -38,16 +50,16 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     format: `FORMAT`, of records of this layout. before: SHA-256, as `link` has it.
 
     Asked: pose, x_t as it was sent, three float64, None where it is the stored one to the bit. logits: the
-    finite ones, as `_sparse` has them. signals: which were sent, bit i for column i of the row's signals;
+    finite ones, as `sparse` has them. signals: which were sent, bit i for column i of the row's signals;
     their values are there. all_witnesses: whether one was asked for each action.
 
     occupied, free: the points that were sent, two float64 each. explain: whether explanations were asked for.
     tables: which the policies went by, as the digest of the map they were made for; None: their own.
 
-    Answered: distribution, as `_sparse` has it. rows: for each action, which distinct row of the table is
+    Answered: distribution, as `sparse` has it. rows: for each action, which distinct row of the table is
     its own. table: each distinct row's J, rho and next pose (x, y, theta), as indices into `pool`, in one
-    byte each, or two where the pool is larger. pool: float64 beside the six that `_known` lists. Actions
-    are one byte each: an action set has at most 256.
+    byte each, or two where the pool is larger. pool: float64 beside the six that every step has
+    (packing.py). Actions are one byte each: an action set has at most 256.
     """
 
     format: int
@@ -86,26 +98,26 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True):
     tables: bytes | None = None
     any_signal: bool | None = None
 
-    def points_sent(self, kind: str) -> Floats | None:
-        """[n, 2]: the `occupied` or `free` points that were sent; None where none were."""
-        content = getattr(self, kind)
-        return None if content is None else np.frombuffer(content, "<f8").reshape(-1, 2)
+    def asked(self, row: Floats, names: Sequence[str]) -> Asked:
+        """What was sent with the step. row: the stored one; names: of its signals, by column."""
+        pose = (row[:3] if self.pose is None else np.frombuffer(self.pose, "<f8")).tolist()
+        signals = {name: float(row[3 + i]) for i, name in enumerate(names) if self.signals >> i & 1}
+        logits, occupied, free = self.logits_sent(), _points(self.occupied), _points(self.free)
+        return Asked(
+            pose, logits, self.main_task_done, signals, self.all_witnesses, occupied, free, self.explain
+        )
 
     def logits_sent(self) -> Floats | None:
         """[A], -inf where the logit was null; None where none were sent."""
-        return None if self.logits is None else _full(self.logits, len(self.rows), -math.inf, True)
+        return None if self.logits is None else full(self.logits, len(self.rows), -math.inf, True)
 
-    def pose_sent(self, row: Floats) -> Floats:
-        """x_t [3] as the caller sent it; row: the stored one of this step."""
-        return row[:3] if self.pose is None else np.frombuffer(self.pose, "<f8")
 
-    def signals_sent(self, row: Floats, names: Sequence[str]) -> dict[str, float]:
-        """names: of the row's signals, by column."""
-        return {name: float(row[3 + i]) for i, name in enumerate(names) if self.signals >> i & 1}
+def _points(sent: bytes | None) -> Floats | None:
+    return None if sent is None else np.frombuffer(sent, "<f8").reshape(-1, 2)
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(StepRecord)
+decode = msgspec.msgpack.Decoder(StepRecord).decode
 
 
 def logits_json(record: StepRecord) -> list[float | None] | None:
@@ -119,10 +131,6 @@ def encode(record: StepRecord) -> bytes:
     return _encoder.encode(msgspec.structs.astuple(record)[:-1] if bare else record)
 
 
-def decode(content: bytes) -> StepRecord:
-    return _decoder.decode(content)
-
-
 def digest(content: bytes) -> bytes:
     """SHA-256 of a record or a config."""
     return hashlib.sha256(content).digest()
@@ -134,48 +142,56 @@ def link(last: bytes, rows: Floats) -> bytes:
 
 
 def make(
-    decision: Decision, row: Floats, before: bytes, pose: Sequence[float], logits: Floats | None,
-    main_task_done: bool, signals: Mapping[str, float], names: Sequence[str], all_witnesses: bool,
-    occupied: Floats | None = None, free: Floats | None = None, explain: bool = False,
+    decision: Decision,
+    asked: Asked,
+    row: Floats,
+    names: Sequence[str],
+    before: bytes,
     tables: bytes | None = None,
-) -> StepRecord:  # fmt: skip
-    """The record of `decision`, made at step t and its stored `row` for a caller who sent what follows.
-
-    logits [A], -inf for null. names: of the rows' signals, by column.
+) -> StepRecord:
+    """The record of a decision. row: the stored one of its step; names: of its signals, by column. before,
+    tables: as the record has them.
     """
+    pose, logits, main_task_done, signals, all_witnesses, occupied, free, explain = asked
     sent = struct.pack("<3d", *pose)
     actions = np.empty((len(decision.distribution), COLUMNS))
     for column, values in enumerate((decision.j_values, decision.robustness)):
         actions[:, column] = [math.nan if value is None else value for value in values]
     actions[:, 2:] = decision.next_poses
-    rows, table, pool = _pack_table(actions, row)
+    rows, table, pool = pack_table(actions, row)
     return StepRecord(
-        format=FORMAT, before=before, t=decision.t, pose=None if sent == row[:3].tobytes() else sent,
-        logits=None if logits is None else _sparse(logits, -math.inf, True), main_task_done=main_task_done,
+        format=FORMAT, before=before, t=decision.t,
+        pose=None if sent == row[:3].tobytes() else sent,
+        logits=None if logits is None else sparse(logits, -math.inf, True), main_task_done=main_task_done,
         signals=sum(1 << i for i, name in enumerate(names) if name in signals), all_witnesses=all_witnesses,
-        mode=decision.mode, distribution=_sparse(decision.distribution, 0.0, False), rows=rows, table=table,
-        pool=pool, action=decision.action, completion_action=decision.completion_action,
+        mode=decision.mode, distribution=sparse(decision.distribution, 0.0, False),
+        rows=rows, table=table, pool=pool,
+        action=decision.action, completion_action=decision.completion_action,
         spec_status=decision.spec_status, feasible_mass=decision.feasible_mass, kl=decision.kl,
-        reason=decision.reason, finished=decision.finished, residual=decision.residual,
-        in_collision=decision.in_collision,
+        reason=decision.reason, finished=decision.finished,
+        residual=decision.residual, in_collision=decision.in_collision,
         witness=None if decision.witness is None else bytes(decision.witness),
         witnesses=tuple(None if w is None else bytes(w) for w in decision.witnesses),
         warnings=decision.warnings, margin=decision.margin, slack=decision.slack,
         threshold_left=decision.threshold_left, map_revision=decision.map_revision,
         occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
-        free=None if free is None else free.astype("<f8").tobytes(), explain=explain,
-        explanations=_explained(decision), tables=tables, any_signal=decision.any_signal,
+        free=None if free is None else free.astype("<f8").tobytes(),
+        explain=explain, explanations=_explained(decision), tables=tables, any_signal=decision.any_signal,
     )  # fmt: skip
 
 
 def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
     """What the caller is answered: to the byte as `answer` has it of the record, in a third of the time."""
     return _answer(
-        decision, action_name=decision.action_name, distribution=decision.distribution,
-        j_values=list(decision.j_values), robustness=list(decision.robustness),
-        next_poses=decision.next_poses, explanations=_explained(decision) if explain else None,
-        all_witnesses=all_witnesses,
-    )  # fmt: skip
+        decision,
+        all_witnesses,
+        _explained(decision) if explain else None,
+        action_name=decision.action_name,
+        distribution=decision.distribution.tolist(),
+        j_values=list(decision.j_values),
+        robustness=list(decision.robustness),
+        next_poses=decision.next_poses.tolist(),
+    )
 
 
 def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
@@ -185,133 +201,45 @@ def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
     )
 
 
-def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
-    """What the caller was answered. row: the stored one of this step; names: of the actions."""
-    table = _unpack_table(record, row)
-    distribution = _full(record.distribution, len(record.rows), 0.0, False)
-    return _answer(
-        record, action_name=names[record.action], distribution=distribution,
-        j_values=[None if value != value else value for value in table[:, 0].tolist()],
-        robustness=[None if value != value else value for value in table[:, 1].tolist()],
-        next_poses=table[:, 2:], explanations=record.explanations if record.explain else None,
-        all_witnesses=record.all_witnesses,
-    )  # fmt: skip
-
-
-def _answer(
-    made: Decision | StepRecord, action_name: str, distribution: Floats, j_values: list[float | None],
-    robustness: list[float | None], next_poses: Floats, explanations: tuple[Explanation | None, ...] | None,
-    all_witnesses: bool,
-) -> StepAnswer:  # fmt: skip
-    """Of a decision or its record; what follows `made` are the members that the two hold in different forms.
-
-    distribution [A], next_poses [A, 3]; explanations: None where they were not asked for.
-    """
-    asked: dict[str, Any] = {} if made.any_signal is None else {"any_signal": made.any_signal}
-    if explanations is not None:
-        asked["explanations"] = explanations
-    if all_witnesses:
-        asked["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
-    return StepAnswer(
-        t=made.t, mode=made.mode, distribution=distribution.tolist(), j_values=j_values,
-        robustness=robustness, action=made.action, action_name=action_name,
-        completion_action=made.completion_action, spec_status=made.spec_status,
-        feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason, finished=made.finished,
-        next_poses=next_poses.tolist(), residual=None if made.residual is None else Residual(*made.residual),
-        in_collision=made.in_collision, witness=None if made.witness is None else list(made.witness),
-        warnings=made.warnings, margin=made.margin, slack=made.slack, threshold_left=made.threshold_left,
-        map_revision=made.map_revision, **asked,
-    )  # fmt: skip
-
-
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _known(row: Floats) -> Floats:
-    """[6]: numbers that need no room of their own. Where an action does not turn, theta is that of x_t."""
-    return np.array([*row[:3].tolist(), 0.0, 1.0, math.nan], "<f8")
+def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:
+    """What the caller was answered. row: the stored one of this step; names: of the actions."""
+    table = unpack_table(record.rows, record.table, record.pool, row)
+    return _answer(
+        record,
+        record.all_witnesses,
+        record.explanations if record.explain else None,
+        action_name=names[record.action],
+        distribution=full(record.distribution, len(record.rows), 0.0, False).tolist(),
+        j_values=[None if value != value else value for value in table[:, 0].tolist()],
+        robustness=[None if value != value else value for value in table[:, 1].tolist()],
+        next_poses=table[:, 2:].tolist(),
+    )
 
 
-def _pack_table(actions: Floats, row: Floats) -> tuple[bytes, bytes, bytes]:
-    """`rows`, `table` and `pool` of a record. actions [A, 5]; NaN stands for null."""
-    known, size = _known(row), actions.size
-    rows, table, pool = np.empty(len(actions), np.uint8), np.empty(size, np.uint16), np.empty(size)
-    distinct, fresh = _take_apart(actions, known, rows, table, pool)
-    wide = np.uint8 if len(known) + fresh <= 256 else np.uint16
-    return rows.tobytes(), table[: distinct * COLUMNS].astype(wide).tobytes(), pool[:fresh].tobytes()
-
-
-@kernel
-def _take_apart(actions: Floats, known: Floats, rows: Bytes, table: Codes, pool: Floats) -> tuple[int, int]:
-    """Writes rows [A], table and pool as `StepRecord` has them; how many distinct rows, and numbers in the
-    pool, there are. Numbers are told apart by their bits.
+def _answer(
+    made: Decision | StepRecord,
+    all_witnesses: bool,
+    explanations: tuple[Explanation | None, ...] | None,
+    **own: Any,
+) -> StepAnswer:
+    """Of a decision or its record; own: the members that the two hold in different forms. explanations: None
+    where they were not asked for.
     """
-    words, seen, fresh = actions.view(np.int64), known.view(np.int64), pool.view(np.int64)
-    firsts, distinct, count = np.empty(len(words), np.int64), 0, 0
-    for a in range(len(words)):
-        at, same = 0, 0
-        while at < distinct and same < COLUMNS:
-            first, same = firsts[at], 0
-            while same < COLUMNS and words[first, same] == words[a, same]:
-                same += 1
-            at += same < COLUMNS
-        rows[a] = at
-        if at < distinct:
-            continue
-        firsts[distinct] = a
-        distinct += 1
-        for column in range(COLUMNS):
-            word, place = words[a, column], 0
-            while place < len(seen) and seen[place] != word:
-                place += 1
-            while len(seen) <= place < len(seen) + count and fresh[place - len(seen)] != word:
-                place += 1
-            if place == len(seen) + count:
-                fresh[count] = word
-                count += 1
-            table[at * COLUMNS + column] = place
-    return distinct, count
-
-
-def _unpack_table(record: StepRecord, row: Floats) -> Floats:
-    """[A, 5]: J, rho, x, y, theta."""
-    words = np.concatenate([_known(row), np.frombuffer(record.pool, "<f8")])
-    wide = "<u1" if len(words) <= 256 else "<u2"
-    distinct = words[np.frombuffer(record.table, wide)].reshape(-1, COLUMNS)
-    table: Floats = distinct[np.frombuffer(record.rows, "<u1")]
-    return table
-
-
-def _sparse(values: Floats, absent: float, shortens: bool) -> bytes:
-    """float64 without the values that are `absent`: a bit for each value, then those whose bit is set. With
-    `shortens` as float32, where that loses nothing.
-    """
-    bits, kept = np.zeros((len(values) + 7) // 8, np.uint8), np.empty(len(values))
-    count, short = _keep(values, absent, bits, kept)
-    return bits.tobytes() + kept[:count].astype("<f4" if short and shortens else "<f8").tobytes()
-
-
-@kernel
-def _keep(values: Floats, absent: float, bits: Bytes, kept: Floats) -> tuple[int, bool]:
-    """Sets the bits of the values that are not `absent`, and writes those into `kept`; how many there are,
-    and whether float32 holds them all.
-    """
-    count, short = 0, True
-    for i in range(len(values)):
-        if values[i] != absent or np.signbit(values[i]) != np.signbit(absent):
-            bits[i >> 3] |= 128 >> (i & 7)
-            kept[count] = values[i]
-            count += 1
-            short = short and float(np.float32(values[i])) == values[i]
-    return count, short
-
-
-def _full(content: bytes, size: int, absent: float, shortens: bool) -> Floats:
-    """`_sparse` undone."""
-    head = (size + 7) // 8
-    there = np.unpackbits(np.frombuffer(content, np.uint8, head), count=size).view(np.bool_)
-    values = np.full(size, absent)
-    short = shortens and len(content) - head == 4 * int(there.sum())
-    values[there] = np.frombuffer(content, "<f4" if short else "<f8", offset=head)
-    return values
+    if made.any_signal is not None:
+        own["any_signal"] = made.any_signal
+    if explanations is not None:
+        own["explanations"] = explanations
+    if all_witnesses:
+        own["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
+    return StepAnswer(
+        t=made.t, mode=made.mode, action=made.action, completion_action=made.completion_action,
+        spec_status=made.spec_status, feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason,
+        finished=made.finished, residual=None if made.residual is None else Residual(*made.residual),
+        in_collision=made.in_collision, witness=None if made.witness is None else list(made.witness),
+        warnings=made.warnings, margin=made.margin, slack=made.slack, threshold_left=made.threshold_left,
+        map_revision=made.map_revision, **own,
+    )  # fmt: skip

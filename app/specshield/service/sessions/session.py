@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import msgspec
@@ -12,6 +12,7 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
 from specshield.quick import quick
+from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
 from specshield.service.access.owners import shown
 from specshield.service.library import files
@@ -21,9 +22,11 @@ from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import history, record
 from specshield.service.sessions import rules as ruled
 from specshield.service.sessions.config import settings_of
+from specshield.service.sessions.record import Asked, StepRecord
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import Dump, Record
-from specshield.shield.decision import Config
+from specshield.shield import episode
+from specshield.shield.decision import Carry, Config, Decision, Shield
 
 F = TypeVar("F")
 RACES = 10  # writes lost to others before a caller is told so
@@ -137,14 +140,19 @@ def check_step(session: Session, request: StepBody) -> None:
     check_last(t, session.config["max_steps"])
     if t < state.next_t:
         raise StepConflict(
-            f"step {t} was passed over and can no longer be decided", path="t", got=t,
-            expected=f"{state.next_t} or later", expected_t=state.next_t,
-        )  # fmt: skip
+            f"step {t} was passed over and can no longer be decided",
+            path="t",
+            got=t,
+            expected=f"{state.next_t} or later",
+            expected_t=state.next_t,
+        )
     if state.main_task_done and not request.main_task_done:
         raise StepConflict(
             "an earlier step said that the main task is done, which cannot be taken back",
-            path="main_task_done", got=False, expected="true",
-        )  # fmt: skip
+            path="main_task_done",
+            got=False,
+            expected="true",
+        )
 
 
 def check_last(t: int, last: int) -> None:
@@ -158,15 +166,14 @@ def check_last(t: int, last: int) -> None:
 def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:
     """The stored answer. Raises StepConflict where it answered another request."""
     kept, row = record.decode(step), session.rows[request.t]
-    same = (
-        request.poses[-1] == kept.pose_sent(row).tolist()
-        and (request.signals or {}) == kept.signals_sent(row, session.signal_names)
-        and request.main_task_done == kept.main_task_done
-        and _equal(logits_of(request), kept.logits_sent())
-        and _equal(points_of(request.occupied), kept.points_sent("occupied"))
-        and _equal(points_of(request.free), kept.points_sent("free"))
-    )
-    if not same:
+    asked, before = asked_of(request), kept.asked(row, session.signal_names)
+    if not (
+        (asked.pose, asked.signals, asked.main_task_done)
+        == (before.pose, before.signals, before.main_task_done)
+        and _equal(asked.logits, before.logits)
+        and _equal(asked.occupied, before.occupied)
+        and _equal(asked.free, before.free)
+    ):
         raise StepConflict(
             f"step {request.t} was decided for another x_t, logits, signals, main_task_done, occupied or "
             "free",
@@ -179,20 +186,56 @@ def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:
     return record.answer(kept, row, session.rules[ruled.at(session.rules, request.t)]["actions"])
 
 
-def logits_of(request: StepBody) -> Floats | None:
-    """[A], -inf for null."""
-    if request.logits is None:
-        return None
-    return np.array([-np.inf if value is None else value for value in request.logits], np.float64)
+def asked_of(request: StepBody) -> Asked:
+    logits = request.logits
+    return Asked(
+        request.poses[-1],
+        None if logits is None else np.array([-np.inf if z is None else z for z in logits], np.float64),
+        request.main_task_done,
+        request.signals or {},
+        request.witnesses,
+        _points(request.occupied),
+        _points(request.free),
+        request.explain,
+    )
 
 
-def points_of(sent: Sequence[Sequence[float]] | None) -> Floats | None:
-    """[n, 2]: the points of a request; None where none were sent."""
+def _points(sent: Sequence[Sequence[float]] | None) -> Floats | None:
     return None if sent is None else np.array(sent, np.float64).reshape(-1, 2)
 
 
 def _equal(a: Floats | None, b: Floats | None) -> bool:
     return a is b if a is None or b is None else np.array_equal(a, b)
+
+
+def decide(
+    shield: Shield,
+    asked: Asked,
+    t: int,
+    since: Floats,
+    names: Sequence[str],
+    carry: Carry | None,
+    before: bytes,
+    tables: bytes | None,
+) -> tuple[Decision, StepRecord]:
+    """The decision of step t, and its record. since: the rows that the rule looks at, the last that of x_t;
+    names: of their signals, by column. carry: of the decision before. before, tables: as the record has them.
+    """
+    decision = episode.decide(
+        shield,
+        since[:, :3],
+        asked.logits,
+        asked.main_task_done,
+        columns(since, names),
+        carry,
+        asked.all_witnesses,
+        asked.occupied,
+        asked.free,
+        explanations if asked.explain else None,
+    )
+    if decision.t != t:  # the rule's clock began after the session
+        decision = replace(decision, t=t)
+    return decision, record.make(decision, asked, since[-1], names, before, tables)
 
 
 def lines(session: Session, steps: Sequence[bytes]) -> Iterator[bytes]:
@@ -219,9 +262,11 @@ def pack(rows: Floats) -> bytes:
 
 def over(session: Session, t: int) -> SessionFinished:
     return SessionFinished(
-        f"session {session.id!r} is over: no further step is decided", path="t", got=t,
+        f"session {session.id!r} is over: no further step is decided",
+        path="t",
+        got=t,
         expected="a step already decided, to read it again",
-    )  # fmt: skip
+    )
 
 
 def there(found: F | None, key: str) -> F:
@@ -234,9 +279,11 @@ def there(found: F | None, key: str) -> F:
 def missing(key: str) -> NotFound:
     id = shown(key)
     return NotFound(
-        f"there is no session {id!r}; it may have expired", path="id", got=id,
+        f"there is no session {id!r}; it may have expired",
+        path="id",
+        got=id,
         expected="an id from /v1/sessions",
-    )  # fmt: skip
+    )
 
 
 def contended(key: str) -> Conflict:

@@ -55,9 +55,7 @@ from specshield.shield.preference import Preference
 from specshield.shield.signals import any_signal
 
 R = TypeVar("R")
-# The config; whether the start is feasible, and whether it is whatever the signals do (`State`); the
-# formula's verdict on it; and the first row.
-Begun = tuple[dict[str, Any], tuple[bool, bool | None], str, Floats]
+Begun = tuple[dict[str, Any], State, Floats]  # its config, its state without when it expires, its first row
 
 
 class Sessions:
@@ -88,38 +86,27 @@ class Sessions:
             preference = await prepared(self._run, self._shields, *asked)
         ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
         try:
-            config, begun, status, rows = await self._begun(request, settings, preference, key.name)
+            begun: Begun  # in another process where the policies' decisions take long, else in a thread
+            if preference is None and await self._run(self._shields.slow_policies, ids):
+                begun = await self._heavy.decide(
+                    "begin", request, settings, key.name, session=",".join(ids), key=tuple(ids)
+                )
+            else:
+                made_of = self._policies, self._shields, request, settings, preference, key.name
+                begun = await self._run(begin, *made_of)
         except Exception:  # whatever was wrong with a policy that has been deleted meanwhile, it is not there
             await self._run(self._policies.still_there, ids, key.name)
             raise
-        content = files.to_json(config)
-        feasible, withstands = begun
-        carry = handover.begun(rules.way(config))
-        state = State(
-            1, 0, feasible, status, self._expiry(), record.digest(content),
-            carry=None if carry is None else pack_carry(carry), any_signal=withstands,
-        )  # fmt: skip
+        config, state, rows = begun
+        state = msgspec.structs.replace(state, expires_at=self._expiry())
         stored_as = scoped(key.name, config["id"])
-        await self._store.create(stored_as, content, Change(state.packed(), pack(rows)))
+        await self._store.create(stored_as, files.to_json(config), Change(state.packed(), pack(rows)))
         try:  # whoever deletes a policy sees this session now, or has marked the policy before
             await self._run(self._policies.still_there, config["policy_ids"], key.name)
         except SpecshieldError:
             await self._store.delete(stored_as)
             raise
         return describe([config], state)
-
-    async def _begun(
-        self, request: SessionRequest, settings: Config, preference: Preference | None, owner: str
-    ) -> Begun:
-        """In a thread, or in another process where the policies' decisions take long."""
-        if preference is None:
-            ids = await self._run(lambda: [self._policies.find(key, owner).id for key in request.policies])
-            if await self._run(self._shields.slow_policies, ids):
-                begun: Begun = await self._heavy.decide(
-                    "begin", request, settings, owner, session=",".join(ids), key=tuple(ids)
-                )
-                return begun
-        return await self._run(begin, self._policies, self._shields, request, settings, preference, owner)
 
     def _checked(self, request: SessionRequest) -> Config:
         """The session's settings. Raises InputError for those that cannot be had."""
@@ -162,18 +149,24 @@ class Sessions:
                 last = session.config["max_steps"] + 1  # where the last step led
                 if request.t > last:
                     raise InputError(
-                        f"step {request.t} is past the session's last", path="t", got=request.t,
+                        f"step {request.t} is past the session's last",
+                        path="t",
+                        got=request.t,
                         expected=f"at most {last}",
-                    )  # fmt: skip
+                    )
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
                     raise over(session, request.t)
             session, status, bounds = await self._run(self._closed, session)
             if not state.closed:
                 state = msgspec.structs.replace(
-                    session.state, length=len(session.rows), spec_status=status, finished=True, closed=True,
+                    session.state,
+                    length=len(session.rows),
+                    spec_status=status,
+                    finished=True,
+                    closed=True,
                     expires_at=self._expiry(),
-                )  # fmt: skip
+                )
                 change = Change(state.packed(), *session.added())
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue
@@ -277,4 +270,15 @@ def begin(
         "nonce": secrets.token_hex(8),
         "way": (way or b"").hex(),
     }
-    return config, (feasible, any_signal(shield, rows[:, :3])), status, rows
+    carry = handover.begun(rules.way(config))
+    state = State(
+        length=1,
+        next_t=0,
+        feasible=feasible,
+        spec_status=status,
+        expires_at=0.0,
+        head=record.digest(files.to_json(config)),
+        carry=None if carry is None else pack_carry(carry),
+        any_signal=any_signal(shield, rows[:, :3]),
+    )
+    return config, state, rows

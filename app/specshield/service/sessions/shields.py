@@ -133,9 +133,13 @@ class Shields:
 
 
 async def prepared(
-    run: Callable[..., Awaitable[Any]], shields: Shields, shaping: str, keys: Sequence[str],
-    pose: Sequence[float], owner: str,
-) -> Preference:  # fmt: skip
+    run: Callable[..., Awaitable[Any]],
+    shields: Shields,
+    shaping: str,
+    keys: Sequence[str],
+    pose: Sequence[float],
+    owner: str,
+) -> Preference:
     """The preference that a session with these policies asks for, once it can be used. run: calls a function
     in a thread. Raises FragmentError where it cannot be prepared for the formula.
     """
@@ -145,6 +149,8 @@ async def prepared(
         return preference
     except FragmentError as error:
         raise FragmentError(
-            f"{shaping!r} cannot be had for this formula: {error.message}", path="shaping", got=shaping,
+            f"{shaping!r} cannot be had for this formula: {error.message}",
+            path="shaping",
+            got=shaping,
             expected="'projection', or a formula that 'reachability' takes",
-        ) from None  # fmt: skip
+        ) from None

@@ -40,7 +40,7 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
 
 class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
-    """A `Carry` with its next poses as float64 bytes, three a motion."""
+    """A `Carry`, field by field in its order, with its next poses as float64 bytes, three a motion."""
 
     t: int
     next_poses: bytes
@@ -54,19 +54,14 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
     stuck: tuple[Stuck, ...] = ()
 
     def unpacked(self) -> Carry:
+        t, poses, *rest = msgspec.structs.astuple(self)
         # Writable: kernels were compiled for that.
-        poses = np.frombuffer(self.next_poses, "<f8").reshape(-1, 3).copy()
-        return Carry(
-            self.t, poses, self.witnesses, self.memory, self.residuals, self.threshold_left, self.learned,
-            self.action, self.way, self.stuck,
-        )  # fmt: skip
+        return Carry(t, np.frombuffer(poses, "<f8").reshape(-1, 3).copy(), *rest)
 
 
 def pack_carry(carry: Carry) -> PackedCarry:
-    return PackedCarry(
-        carry.t, carry.next_poses.astype("<f8", copy=False).tobytes(), carry.witnesses, carry.memory,
-        carry.residuals, carry.threshold_left, carry.learned, carry.action, carry.way, carry.stuck,
-    )  # fmt: skip
+    t, poses, *rest = vars(carry).values()
+    return PackedCarry(t, poses.astype("<f8", copy=False).tobytes(), *rest)
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -15,7 +16,6 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.errors import SpecshieldError
 from specshield.quick import quick
-from specshield.reasons.explanation import explanations
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
@@ -26,18 +26,16 @@ from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import (
     RACES,
     Session,
+    asked_of,
     check_step,
-    columns,
     contended,
-    logits_of,
+    decide,
     missing,
-    points_of,
     replay,
 )
 from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State, pack_carry
 from specshield.service.storage.store import Change, Store
-from specshield.shield import episode
 from specshield.shield.decision import Decision
 from specshield.shield.taught import Taught, changes_map
 from specshield.task import check_signals
@@ -121,7 +119,7 @@ class Steps:
         self.recent = files.Recent[Session](ROOM, attrgetter("size"))
         self._paces = files.Recent[Pace](1000)
 
-    async def decide(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
+    async def decide(self, id: str, request: StepBody, timing: defaultdict[str, float]) -> StepAnswer:
         """The answer. `timing` collects the seconds of rollout and store."""
         self.deciding += 1
         try:
@@ -129,7 +127,7 @@ class Steps:
         finally:
             self.deciding -= 1
 
-    async def _answer(self, id: str, request: StepBody, timing: dict[str, float]) -> StepAnswer:
+    async def _answer(self, id: str, request: StepBody, timing: defaultdict[str, float]) -> StepAnswer:
         session, step = self.recent.peek(id), None
         if session is not None and request.t < session.state.next_t:
             session = None  # a replay, or an error: both are the store's to tell
@@ -138,7 +136,7 @@ class Steps:
             if session is None:
                 asked = time.perf_counter()
                 found = await self._store.load(id, request.t)
-                _add(timing, "store", asked)
+                timing["store"] += time.perf_counter() - asked
                 if found is None:
                     raise missing(id)
                 session, step, current = Session.of(found), found.step, True
@@ -156,7 +154,7 @@ class Steps:
             change, state = self._change(decided, request)
             asked = time.perf_counter()
             written = await self._store.append(id, session.version, change)
-            _add(timing, "store", asked)
+            timing["store"] += time.perf_counter() - asked
             if isinstance(written, bytes):
                 told_later = len(decided.session.rows) - 1 - session.state.length
                 answer = record.told(decided.decision, request.witnesses, request.explain)
@@ -178,74 +176,63 @@ class Steps:
     def _change(self, decided: Decided, request: StepBody) -> tuple[Change, State]:
         session, decision, content = decided.session, decided.decision, record.encode(decided.record)
         state = msgspec.structs.replace(
-            session.state, length=len(session.rows), next_t=len(session.rows),
-            spec_status=decision.spec_status, expires_at=time.time() + self._ttl,
-            head=record.digest(content), main_task_done=request.main_task_done, finished=decision.finished,
+            session.state,
+            length=len(session.rows),
+            next_t=len(session.rows),
+            spec_status=decision.spec_status,
+            expires_at=time.time() + self._ttl,
+            head=record.digest(content),
+            main_task_done=request.main_task_done,
+            finished=decision.finished,
             carry=pack_carry(decision.carry),
-        )  # fmt: skip
+        )
         return Change(state.packed(), *session.added(), request.t, content), state
 
-    async def _decide(self, session: Session, request: StepBody, timing: dict[str, float]) -> Decided:
+    async def _decide(self, session: Session, request: StepBody, timing: defaultdict[str, float]) -> Decided:
         ids = tuple(session.config["policy_ids"])
+        made: Decided
         if self._shields.slow(session):
-            made = await self._heavy.decide("step", session, request, session=session.id, key=ids)
-            timing["rollout"] = timing.get("rollout", 0.0) + made[-1]
-            return Decided(*made[:3])
+            made, seconds = await self._heavy.decide("step", session, request, session=session.id, key=ids)
+            timing["rollout"] += seconds
+            return made
         learns = _learns(session, request)
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
-        cpu: float | None
+        cpu: float | None = None
         if learns or not pace.short:
-            loop = asyncio.get_running_loop()
-            *made, seconds, cpu = await loop.run_in_executor(
-                self._threads, timed, self._shields, session, request
-            )
+            loop, asked = asyncio.get_running_loop(), (self._shields, session, request)
+            made, seconds, cpu = await loop.run_in_executor(self._threads, timed, *asked)
         elif pace.doubted:
-            *made, seconds, cpu = timed(self._shields, session, request)
+            made, seconds, cpu = timed(self._shields, session, request)
         else:  # asking for the thread's own time would cost a tenth of the step
-            begun, cpu = time.perf_counter(), None
-            made = list(decided(self._shields, session, request))
+            begun = time.perf_counter()
+            made = decided(self._shields, session, request)
             seconds = time.perf_counter() - begun
-        timing["rollout"] = timing.get("rollout", 0.0) + seconds
+        timing["rollout"] += seconds
         if not learns:  # what a map that changed costs says nothing of other sessions of the policy
             pace.add(seconds, cpu)
             if pace.long:
                 self._shields.note_slow(session)
-        return Decided(*made)
+        return made
 
 
-def timed(
-    shields: Shields, session: Session, request: StepBody
-) -> tuple[Session, Decision, StepRecord, float, float]:
+def timed(shields: Shields, session: Session, request: StepBody) -> tuple[Decided, float, float]:
     """As `decided`, with the seconds that it took, and those of them that this thread computed."""
     begun, computed = time.perf_counter(), time.thread_time()
     made = decided(shields, session, request)
-    return *made, time.perf_counter() - begun, time.thread_time() - computed
+    return made, time.perf_counter() - begun, time.thread_time() - computed
 
 
-def decided(shields: Shields, session: Session, request: StepBody) -> tuple[Session, Decision, StepRecord]:
-    shield, signals = shields.of(session), request.signals or {}
-    check_signals(session.signal_names, signals)
-    state, logits = session.state, logits_of(request)
-    session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), signals))
+def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
+    shield, asked, names, state = shields.of(session), asked_of(request), session.signal_names, session.state
+    check_signals(names, asked.signals)
+    session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
     carry = None if state.carry is None else state.carry.unpacked()
-    occupied, free = points_of(request.occupied), points_of(request.free)
     tables = None
     if carry is not None and changes_map(carry.learned):
         known = Taught.from_bytes(carry.learned).map
         shield, tables = shields.tables.of(session.config["nonce"], shield, known)
-    since = session.since
-    decision = episode.decide(
-        shield, since[:, :3], logits, request.main_task_done, columns(since, session.signal_names), carry,
-        request.witnesses, occupied, free, explanations if request.explain else None,
-    )  # fmt: skip
-    if len(since) < len(session.rows):  # the rule's clock began after the session
-        decision = replace(decision, t=request.t)
-    made = record.make(
-        decision, session.rows[-1], record.link(state.head, session.rows[state.next_t :]), request.poses[-1],
-        logits, request.main_task_done, signals, session.signal_names, request.witnesses, occupied, free,
-        request.explain, tables,
-    )  # fmt: skip
-    return session, decision, made
+    before = record.link(state.head, session.rows[state.next_t :])
+    return Decided(session, *decide(shield, asked, request.t, session.since, names, carry, before, tables))
 
 
 def _learns(session: Session, request: StepBody) -> bool:
@@ -253,7 +240,3 @@ def _learns(session: Session, request: StepBody) -> bool:
     carry = session.state.carry
     changed = carry is not None and changes_map(carry.learned)
     return changed or bool(request.occupied) or bool(request.free)
-
-
-def _add(timing: dict[str, float], name: str, start: float) -> None:
-    timing[name] = timing.get(name, 0.0) + time.perf_counter() - start

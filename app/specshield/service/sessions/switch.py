@@ -136,9 +136,12 @@ def _wanted(
         raise over(session, t)
     if t < state.next_t:
         raise StepConflict(
-            f"step {t} is decided, or was passed over: no other rule can hold there", path="t", got=t,
-            expected=f"{state.next_t} or later", expected_t=state.next_t,
-        )  # fmt: skip
+            f"step {t} is decided, or was passed over: no other rule can hold there",
+            path="t",
+            got=t,
+            expected=f"{state.next_t} or later",
+            expected_t=state.next_t,
+        )
     if len(session.rules) >= rules.MOST_RULES:
         raise LimitReached(
             f"a session has at most {rules.MOST_RULES} rules", expected="a new session for what follows"
@@ -149,10 +152,12 @@ def _wanted(
         return Wanted(session, t, policy_ids, request.clock, session.rows[t])
     if len(session.rows) < t or step is None:
         raise HistoryGap(
-            f"the server does not know where the robot is at step {t}", path="poses", got=None,
+            f"the server does not know where the robot is at step {t}",
+            path="poses",
+            got=None,
             expected=f"poses from step {len(session.rows)} or earlier up to step {t}",
             expected_t=len(session.rows),
-        )  # fmt: skip
+        )
     row = session.rows[-1].copy()
     row[:3] = _foreseen(session, step)
     return Wanted(session, t, policy_ids, request.clock, row)
@@ -179,18 +184,22 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
     last = origin + task.horizon + 1
     if last > max(most_steps, old["max_steps"]):
         raise InputError(
-            "the rule ends after the last step that a session can have", path="policy_id",
-            got=f"step {last}", expected=f"at most step {most_steps}",
-        )  # fmt: skip
+            "the rule ends after the last step that a session can have",
+            path="policy_id",
+            got=f"step {last}",
+            expected=f"at most step {most_steps}",
+        )
     most = max(old["max_steps"], last)
     check_last(t, most)
     signals = task.signals
     names = [*session.signal_names, *rules.added(session.signal_names, signals)]
     if len(names) > record.MOST_SIGNALS:
         raise InputError(
-            "the session's rules have too many signals together", path="policy_id", got=len(names),
+            "the session's rules have too many signals together",
+            path="policy_id",
+            got=len(names),
             expected=f"at most {record.MOST_SIGNALS}; or a new session for this rule",
-        )  # fmt: skip
+        )
     before = record.link(session.state.head, session.rows[session.state.next_t : t])
     config = {
         **old,
@@ -204,9 +213,12 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
     }
     verdict, _ = shields.verdict(old, session.rows, session.signal_names)
     made = replace(
-        session, rules=[*session.rules, config], settings=settings_of(config),
-        rows=rules.widened(session.rows, session.signal_names, signals), signal_names=names,
-    )  # fmt: skip
+        session,
+        rules=[*session.rules, config],
+        settings=settings_of(config),
+        rows=rules.widened(session.rows, session.signal_names, signals),
+        signal_names=names,
+    )
     carry = None if session.state.carry is None else session.state.carry.unpacked()
     known = rules.carried_over(carry, old, config)
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
@@ -218,9 +230,14 @@ def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: i
     rows = made.since
     status = episode.close(shield, rows[:, :3], columns(rows, names))[0] if len(rows) else "pending"
     state = msgspec.structs.replace(
-        session.state, length=len(made.rows), next_t=t, feasible=True, spec_status=status,
-        head=record.digest(files.to_json(config)), carry=None if carry is None else pack_carry(carry),
+        session.state,
+        length=len(made.rows),
+        next_t=t,
+        feasible=True,
+        spec_status=status,
+        head=record.digest(files.to_json(config)),
+        carry=None if carry is None else pack_carry(carry),
         verdicts=(*session.state.verdicts, verdict),
         any_signal=any_signal(shield, seen[:, :3], columns(seen, names)),
-    )  # fmt: skip
+    )
     return replace(made, state=state)

@@ -94,6 +94,7 @@ class ArchivingStore(Store):
         return found if found is not None else await self.in_thread(self._archived, id)
 
     async def delete(self, id: str) -> bool:
+        """Erases all of it. False where there was nothing."""
         async with self._reaching():
             found = await self._erase(keys=_keys(id), args=["", FENCE])
             await self.redis.zrem(INDEX, id)
@@ -110,12 +111,9 @@ class ArchivingStore(Store):
             high = f"({owner[:-1]}A" if owner else "+"  # A follows @
             running = [id.decode() for id in await self.redis.zrangebylex(INDEX, low, high, 0, limit)]
             ids = sorted({*running, *archived})[:limit]
-            fit, room = await self._that_fit([id.encode() for id in ids], PAGE_BYTES) if ids else ([], 0)
-            more, ids = len(ids) == limit or len(fit) < len(ids), ids[: len(fit)]
-            async with self.redis.pipeline(transaction=False) as pipe:
-                for id in ids:
-                    pipe.hmget(keys(id)[0], "config", "state")
-                live = await pipe.execute() if ids else []
+            fit, room = await self._that_fit(ids, PAGE_BYTES)
+            more, ids = len(ids) == limit or len(fit) < len(ids), fit
+            live = await self._of_each(ids, "hmget", "config", "state")
         found: list[tuple[bytes, bytes]] = []
         for id, (config, state) in zip(ids, live, strict=True):
             after = id.removeprefix(owner)
@@ -140,15 +138,10 @@ class ArchivingStore(Store):
         async with self._reaching():
             low = "-" if after is None else f"({after}"
             ids = [id.decode() for id in await self.redis.zrangebylex(INDEX, low, "+", 0, limit)]
-            async with self.redis.pipeline(transaction=False) as pipe:
-                for id in ids:
-                    pipe.pttl(keys(id)[0])  # every change sets it anew
-                left = await pipe.execute() if ids else []
-                waits = {id: self._ttl - ms / 1000 for id, ms in zip(ids, left, strict=True) if ms >= 0}
-                idle = [id for id, seconds in waits.items() if seconds >= least]
-                for id in idle:
-                    pipe.hget(keys(id)[0], "state")
-                states = await pipe.execute() if idle else []
+            left = await self._of_each(ids, "pttl")  # every change sets it anew
+            waits = {id: self._ttl - ms / 1000 for id, ms in zip(ids, left, strict=True) if ms >= 0}
+            idle = [id for id, seconds in waits.items() if seconds >= least]
+            states = await self._of_each(idle, "hget", "state")
             expired = [id.encode() for id, ms in zip(ids, left, strict=True) if ms == -2]
             if expired:
                 await self.take_off(expired)

@@ -10,7 +10,8 @@ which is for the store; options after a ? are redis-py's, as in ?ssl_ca_certs=/e
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -25,6 +26,8 @@ import redis.retry
 import redis.sentinel
 from redis.backoff import ExponentialBackoff
 
+from specshield.errors import StoreError
+
 FORMS = (
     "redis://127.0.0.1:6379/0, rediss://..., unix:///path, redis+sentinel://h1,h2/service, redis+cluster://h1"
 )
@@ -35,6 +38,19 @@ CONNECTIONS = 64  # of one server process to a single server; those who want mor
 TRIES = 3  # after the first; all within the caller's time limit. Chosen by hand.
 JOBS = "{specshield}:rq"  # what rq's keys begin with in a cluster, so that one server of it has them all
 PORTS = {"sentinel": 26379, "cluster": 6379}
+
+
+@contextmanager
+def reaching() -> Iterator[None]:
+    """A store that cannot be reached meanwhile is a StoreError."""
+    try:
+        yield
+    except FAILURES as error:
+        raise away(error) from error
+
+
+def away(error: Exception) -> StoreError:
+    return StoreError(f"the store cannot be reached: {type(error).__name__}")
 
 
 class _Cluster(redis.asyncio.cluster.RedisCluster):

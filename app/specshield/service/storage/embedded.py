@@ -32,9 +32,11 @@ class EmbeddedStore:
         self.socket = self.folder / "socket"
         if len(os.fsencode(self.socket)) > 100:
             raise StoreError(
-                "the data folder's path is too long for a unix socket", path="SPECSHIELD_DATA_DIR",
-                got=str(data_dir), expected="a path of at most 87 bytes, or REDIS_URL set",
-            )  # fmt: skip
+                "the data folder's path is too long for a unix socket",
+                path="SPECSHIELD_DATA_DIR",
+                got=str(data_dir),
+                expected="a path of at most 87 bytes, or REDIS_URL set",
+            )
         self._use: int | None = None
         self._keeper: subprocess.Popen[bytes] | None = None
 
@@ -90,17 +92,18 @@ class EmbeddedStore:
         return () if self._use is None else (self._use,)
 
     def leave(self) -> None:
-        if self._use is not None:
-            os.close(self._use)
-            self._use = None
+        self._let_go()
         if self._keeper is not None:  # the last user waits, so that what it leaves behind is whole
             with contextlib.suppress(subprocess.TimeoutExpired):  # others still use it
                 self._keeper.wait(0.2)
 
-    def _open(self) -> None:
+    def _let_go(self) -> None:
         if self._use is not None:
             os.close(self._use)
             self._use = None
+
+    def _open(self) -> None:
+        self._let_go()
         users = self.folder / "users"
         if not users.exists():
             os.mkfifo(users, 0o600)

@@ -37,9 +37,14 @@ def main(folder: Path, command: list[str]) -> int:
     with open(folder / "store.log", "ab", buffering=0) as log:
         # The lock's descriptor goes to the store too: it is free only when both are gone.
         store = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=folder, pass_fds=[lock],
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=folder,
+            pass_fds=[lock],
             preexec_fn=_as_store,
-        )  # fmt: skip
+        )
 
     def watch() -> None:
         while os.read(0, 4096):

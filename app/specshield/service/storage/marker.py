@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import secrets
 import time
+from contextlib import closing
 from typing import Any
 
-from specshield.errors import InputError, StoreError
-from specshield.service.storage.connect import FAILURES, connect
+from specshield.errors import InputError
+from specshield.service.storage.connect import connect, reaching
 from specshield.service.storage.objects import open_objects
 
 FILE = "store-id"
@@ -28,15 +29,9 @@ def check_files(url: str, place: str, timeout: float) -> None:
     files = open_objects(place)
     mine = files.read(FILE)
     made = secrets.token_hex(16).encode()
-    try:
-        store = connect(url, blocking=True, socket_timeout=timeout)
-        try:
-            first = store.set(KEY, mine or made, nx=True)
-            theirs = store.get(KEY)
-        finally:
-            store.close()
-    except FAILURES as error:
-        raise StoreError(f"the store cannot be reached: {type(error).__name__}") from error
+    with reaching(), closing(connect(url, blocking=True, socket_timeout=timeout)) as store:
+        first = store.set(KEY, mine or made, nx=True)
+        theirs = store.get(KEY)
     if first and mine is None:
         files.write(FILE, made)
         return

@@ -119,18 +119,14 @@ class Folder:
         except (FileNotFoundError, NotADirectoryError):
             return []
 
-    @_reaching
     def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
-        return self._sizes(folder)
-
-    def _sizes(self, folder: str) -> Iterator[tuple[str, int]]:
         for found in sorted((self.root / folder).iterdir()) if (self.root / folder).is_dir() else ():
             with contextlib.suppress(FileNotFoundError):  # it may go at any time
                 path, about = found.relative_to(self.root).as_posix(), found.stat()
                 if found.name.startswith(DRAFT) and about.st_mtime < time.time() - LEFT:
                     found.unlink()  # by a process that was killed
                 elif S_ISDIR(about.st_mode):
-                    yield from self._sizes(path)
+                    yield from self.sizes(path)
                 elif not found.name.startswith("."):
                     yield path, about.st_size
 

@@ -16,10 +16,10 @@ from typing import Any
 
 import anyio
 
-from specshield.errors import SessionExists, StoreError
+from specshield.errors import SessionExists
 from specshield.quick import quick
 from specshield.service.access.owners import between, shown
-from specshield.service.storage.connect import FAILURES, connect, is_cluster
+from specshield.service.storage.connect import FAILURES, away, connect, is_cluster
 from specshield.service.storage.wire import PART, Script, Wire, too_few
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
@@ -102,7 +102,7 @@ class Store:
         except (*FAILURES, RuntimeError) as error:
             if isinstance(error, RuntimeError) and "handler is closed" not in str(error):
                 raise  # that one is uvloop's word for a connection that the other side has closed
-            raise _away(error) from error
+            raise away(error) from error
 
     async def ping(self) -> None:
         """Whether it takes a write: one whose disk is full still answers reads."""
@@ -167,7 +167,7 @@ class Store:
             try:
                 written = await self._wire.run(APPEND, keys(id), args)
             except FAILURES as error:
-                raise _away(error) from error
+                raise away(error) from error
         return written if isinstance(written, bytes) else _record(*written)
 
     async def _replicated(self, id: str, version: bytes | None) -> None:
@@ -192,13 +192,6 @@ class Store:
             (config, state, version), found, left = await pipe.execute()
         return None if config is None or found is None else Dump(config, state, version, found, left)
 
-    async def delete(self, id: str) -> bool:
-        """Erase all of it. False where there was nothing."""
-        async with self._reaching():
-            found = await self.redis.unlink(*keys(id))
-            await self.redis.zrem(INDEX, id)
-        return bool(found)
-
     async def count(self, owner: str | None) -> int:
         """How many sessions an owner has, or with None all of them; some may have expired."""
         low, high = _range(owner)
@@ -219,11 +212,8 @@ class Store:
 
     async def versions(self, ids: Sequence[str]) -> list[bytes | None]:
         """Of each session the version, None where the store has none. One round trip."""
-        async with self._reaching(), self.redis.pipeline(transaction=False) as pipe:
-            for id in ids:
-                pipe.hget(keys(id)[0], "version")
-            found: list[bytes | None] = await pipe.execute()
-        return found
+        async with self._reaching():
+            return await self._of_each(ids, "hget", "version")
 
     async def news(self, asked: Sequence[tuple[str, int, int, int]]) -> list[News | None]:
         """For each (id, t, bytes of a row, count): what it has from step t on, at most so many steps."""
@@ -245,23 +235,25 @@ class Store:
             nodes = await self.redis.info("memory", target_nodes="primaries")
             return sum(int(node["used_memory"]) for node in nodes.values())
 
-    async def _that_fit(self, ids: list[bytes], room: int) -> tuple[list[bytes], int]:
-        """The first ids whose configs come to about `room` bytes, at least one, and what is left of it."""
+    async def _of_each(self, ids: Sequence[str], command: str, *fields: str) -> list[Any]:
+        """What this command tells of each session's hash. One round trip, none without ids."""
         async with self.redis.pipeline(transaction=False) as pipe:
             for id in ids:
-                pipe.hstrlen(keys(id.decode())[0], "config")
-            for taken, size in enumerate(await pipe.execute(), start=1):
-                room -= size
-                if room <= 0:
-                    return ids[:taken], room
+                getattr(pipe, command)(keys(id)[0], *fields)
+            told: list[Any] = await pipe.execute() if ids else []
+        return told
+
+    async def _that_fit(self, ids: list[str], room: int) -> tuple[list[str], int]:
+        """The first ids whose configs come to about `room` bytes, at least one, and what is left of it."""
+        for taken, size in enumerate(await self._of_each(ids, "hstrlen", "config"), start=1):
+            room -= size
+            if room <= 0:
+                return ids[:taken], room
         return ids, room
 
     async def _gone(self, ids: Sequence[bytes]) -> list[bytes]:
         """Those that have no session."""
-        async with self.redis.pipeline(transaction=False) as pipe:
-            for id in ids:
-                pipe.exists(keys(id.decode())[0])
-            there = await pipe.execute()
+        there = await self._of_each([id.decode() for id in ids], "exists")
         return [id for id, found in zip(ids, there, strict=True) if not found]
 
 
@@ -285,7 +277,3 @@ def _record(
 def exists(id: str) -> SessionExists:
     told = f"there is a session {shown(id)!r} already"
     return SessionExists(told, path="id", got=shown(id), expected="an id not in use")
-
-
-def _away(error: Exception) -> StoreError:
-    return StoreError(f"the store cannot be reached: {type(error).__name__}")

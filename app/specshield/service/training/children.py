@@ -34,15 +34,16 @@ class TrainingWorker:
     @property
     def methods(self) -> list[str]:
         """Those that the worker makes policies by; none where it is another server's, or has died."""
-        alive = self._process is not None and self._process.poll() is None
-        return self._methods if alive else []
+        return self._methods if self._alive else []
+
+    @property
+    def _alive(self) -> bool:
+        return self._process is not None and self._process.poll() is None
 
     def ensure(self) -> None:
         """Start the worker, unless it runs already: as this process's child or as another server's."""
-        if self._process is not None:
-            if self._process.poll() is None:
-                return
-            self._process = None
+        if self._alive:
+            return
         self._settings.data_dir.mkdir(parents=True, exist_ok=True)
         lock = os.open(self._settings.data_dir / "worker.lock", os.O_RDWR | os.O_CREAT, 0o600)
         try:
@@ -50,9 +51,11 @@ class TrainingWorker:
             # It ends when this process does: its standard input is a pipe from here.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "worker", "--until-eof"],
-                env=self._settings.environment(), stdin=subprocess.PIPE, pass_fds=[lock],
+                env=self._settings.environment(),
+                stdin=subprocess.PIPE,
+                pass_fds=[lock],
                 start_new_session=True,
-            )  # fmt: skip
+            )
             self._methods = available()
         except BlockingIOError:
             pass

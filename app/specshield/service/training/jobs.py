@@ -74,10 +74,14 @@ class Jobs:
     def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
         settings = self._settings
         Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer).enqueue(
-            "specshield.service.training.worker.train", id, attempt,
+            "specshield.service.training.worker.train",
+            id,
+            attempt,
             job_timeout=settings.training_timeout if learns(method) else settings.synthesis_timeout,
-            result_ttl=0, failure_ttl=24 * 3600, at_front=at_front,
-        )  # fmt: skip
+            result_ttl=0,
+            failure_ttl=24 * 3600,
+            at_front=at_front,
+        )
 
     def get(self, id: str) -> Training:
         """How the training of a policy stands. One that the store knows nothing of counts as failed."""

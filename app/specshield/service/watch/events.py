@@ -85,9 +85,15 @@ class Watchers:
                     feed.wake()
 
     def decided(
-        self, id: str, before: bytes, after: bytes, state: State, row: Floats, made: StepRecord,
+        self,
+        id: str,
+        before: bytes,
+        after: bytes,
+        state: State,
+        row: Floats,
+        made: StepRecord,
         answered: StepAnswer,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Notes a step that this process has decided and stored, see `steps.Tell`. Where more is new
         to the watchers, they read it from the store; so they do of a rule's first step, with its switch.
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import anyio
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -28,24 +27,22 @@ class Gauges:
         async with self._asking:  # of many scrapes at once one asks
             if time.monotonic() - self._asked > KEPT_FOR:
                 try:
-                    self._found = list(await self._families())
+                    self._found = await self._families()
                 except StoreError:
                     self._found = [_up(0)]
                 self._asked = time.monotonic()
         return self._found
 
-    async def _families(self) -> Iterator[Metric]:
+    async def _families(self) -> list[Metric]:
         sessions, held = await self._store.count(None), await self._store.held_bytes()
         waiting, ended = await anyio.to_thread.run_sync(self._jobs.counts)
-        return iter(
-            (
-                _up(1),
-                GaugeMetricFamily("specshield_sessions", "Sessions that the store holds.", sessions),
-                GaugeMetricFamily("specshield_store_bytes", "Memory that the store takes.", held),
-                _by(GaugeMetricFamily, "specshield_jobs", "Jobs that wait or run.", waiting),
-                _by(CounterMetricFamily, "specshield_jobs_ended", "Jobs that have ended.", ended),
-            )
-        )
+        return [
+            _up(1),
+            GaugeMetricFamily("specshield_sessions", "Sessions that the store holds.", sessions),
+            GaugeMetricFamily("specshield_store_bytes", "Memory that the store takes.", held),
+            _by(GaugeMetricFamily, "specshield_jobs", "Jobs that wait or run.", waiting),
+            _by(CounterMetricFamily, "specshield_jobs_ended", "Jobs that have ended.", ended),
+        ]
 
 
 def _up(value: int) -> Metric:

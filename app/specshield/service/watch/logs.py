@@ -20,7 +20,6 @@ from starlette.types import Scope
 from uvicorn.config import LOGGING_CONFIG
 from uvicorn.logging import DefaultFormatter
 
-LEVELS = ("debug", "info", "warning", "error")
 log = logging.getLogger("specshield")
 request: ContextVar[Scope | None] = ContextVar("request", default=None)  # the one that is being answered
 TRACEPARENT = re.compile(rb"[0-9a-f]{2}-([0-9a-f]{32})-([0-9a-f]{16})-[0-9a-f]{2}")  # W3C Trace Context
