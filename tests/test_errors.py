@@ -48,4 +48,6 @@ def test_an_error_says_what_where_and_what_is_valid():
         raise error
     assert str(InputError("t is late", path="t")) == "t is late", "the field is told already"
     assert str(InputError("the step is late", path="t")) == "t: the step is late"
+    said = InputError("not a word; expected a word", got="1", expected="a word")
+    assert str(said) == "not a word; got '1'; expected a word", "what is expected is told already"
     assert len(str(InputError("long", got="x" * 5000))) < 300

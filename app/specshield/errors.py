@@ -86,7 +86,8 @@ class SpecshieldError(Exception):
         shown = "" if self.got is None else repr(self.got)
         got = f"; got {shown if len(shown) <= SHOWN else shown[:SHOWN] + '…'}" if shown else ""
         expected = f"; expected {self.expected}" if self.expected else ""
-        return f"{where}{self.message}{got}{expected}"
+        message = self.message.removesuffix(expected)  # some say themselves what is expected
+        return f"{where}{message}{got}{expected}"
 
     def at(self, path: str) -> SpecshieldError:
         """The same error, its path put below `path`: 'formula' at 'spec' is 'spec.formula'."""

@@ -139,6 +139,8 @@ def refusal(
 
 def _wrong(conjuncts: Sequence[Conjunct], tried: int) -> str:
     """What the conjuncts say of it, in words; tried: how many ways were."""
+    if not conjuncts:
+        return "The rule reads neither poses nor signals, so no motion changes whether it is kept."
     failing = [each for each in conjuncts if not each.feasible_alone]
     if failing:
         alone = "Even with the rest of the rule left out, on" if len(conjuncts) > 1 else "On"

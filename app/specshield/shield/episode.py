@@ -163,6 +163,11 @@ def decide(
         doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)
         judged = recovered(told, shield, taught, judged, prefix, tail, spec_status, care)
         judged = without(judged, shield, doubts, risky)
+        if judged.vain and judged.some:
+            said = (
+                *said,
+                "only ways by a motion that has led nowhere from here are left, so it is tried again",
+            )
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             known = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(known, poses, signals, log_prior, judged.feasible)

@@ -11,7 +11,7 @@ from specshield.policy.reachability.around.search import _slot_of
 from specshield.policy.reachability.policy import synthesise
 from specshield.policy.reachability.tables import Guide
 from specshield.policy.tree import make_tree
-from specshield.robot import STRETCH
+from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import make_body, simulate
 from specshield.stl import robustness
@@ -70,6 +70,37 @@ def test_a_way_is_found_without_the_motions_that_led_nowhere():
     free = ~in_vain(barred, history[0], ways.motions, poses, True)
     kept = [robustness(task.formula, task.samples(np.concatenate([history, led]))) > 0 for led in poses[free]]
     assert any(kept)
+
+
+def test_a_way_out_is_found_of_a_place_that_is_narrower_than_the_tables_lattice():
+    """A car that cannot reverse has stood in a corner for a while, too near a wall for the tables to know
+    a way out, and the turn that they would begin with leads nowhere.
+    """
+    occupied = np.zeros((15, 32), np.bool_)
+    occupied[[0, -1]] = occupied[:, [0, -1]] = True
+    occupied[:5, [11, 21]] = occupied[9:, [11, 21]] = True
+    actions = [
+        {"name": "ahead", "translate": 0.3},
+        {"name": "arc left", "translate": 0.2, "rotate": 0.35},
+        {"name": "arc right", "translate": 0.2, "rotate": -0.35},
+        {"name": "left", "rotate": 0.35},
+        {"name": "right", "rotate": -0.35},
+        {"name": "wait"},
+    ]
+    footprint = {"radius": 0.2, "offset": [-0.05, 0.0]}
+    robot = robot_from_json({"footprint": footprint, "on_contact": "stop", "actions": actions})
+    grid = OccupancyGrid(occupied, 0.25, (-1.0, -2.0, 0.0))
+    goal = {"type": "rectangle", "min": [2.2, 0.6], "max": [3.8, 1.4]}
+    task = make_task(grid, robot, "F[0,70] Goal", {"Goal": goal})
+    history = np.tile([-0.529, -0.546, 1.603], (21, 1))
+    barred = np.array([[*history[0], robot.action_names.index("right"), 0.05, 0.2]])
+    ways = synthesise(task).avoiding(barred).propose(history, {}, 0.0)
+    poses, body = np.empty((*ways.motions.shape, 3)), make_body(robot, grid)
+    for motions, led in zip(ways.motions, poses, strict=True):
+        simulate(body, history[0], motions, led)
+    free = ~in_vain(barred, history[0], ways.motions, poses, True)
+    samples = [task.samples(np.concatenate([history, led])) for led in poses[free]]
+    assert any(robustness(task.formula, each) > 0.0 for each in samples)
 
 
 TWO_DOORS = OCCUPIED.copy()

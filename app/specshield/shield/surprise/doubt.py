@@ -99,8 +99,9 @@ def recovered(
         known = taught.map
         free = on_map(told, revised(known, forget(known, known.occupied & (known.by != SENT))))
         ways = futures(prefix, free.body, free.proposers, None, (0.0,))
-        first, _, said, helps = most_kept(free, judged.part, ways)
+        first, _, lacks, helps = most_kept(free, judged.part, ways)
         first = first if helps else ways.preferred
+        said = ("no way is left by what was run into, so that is set aside for this action", *lacks)
     tried = replace(tried, warnings=(*tried.warnings, *said))
     return replace(judged, tried=tried, completion=int(shield.task.robot.representative[first]))
 

@@ -138,6 +138,8 @@ def _reach(
     turns_matter = reads_heading(rules.programs, rules.regions)
     put(tree, 0, pose[0], pose[1], pose[2], 0, -1, -1)
     copy_progress(scratch.status, scratch.run, tree.status[0], tree.run[0])
+    # In places that are narrower than their lattice, tables know no way out: from there they bound nothing.
+    bounded = slack_at(guide, pose[0], pose[1], pose[2], t, scratch, scratch.ahead, UNKNOWN) >= BAND
     count, size = 1, push(tree.heap, 0, 0, 0.0)
     while size > 0:
         here, rank = tree.heap.row[0], -tree.heap.rank[0]
@@ -174,9 +176,10 @@ def _reach(
                 corners = find_corners(tables.cell, v, u, scratch.corners)
             about, known = (scratch.corners, corners) if stays else (scratch.ahead, UNKNOWN)
             ahead = slack_at(guide, x, y, theta, t + s + 1, scratch, about, known)
-            if ahead < BAND:
+            if ahead < BAND and bounded:
                 tree.table[slot] = -1  # the end of its chain; its row goes to the next pose
                 continue
+            ahead = max(ahead, BAND)
             spare = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
             size = push(tree.heap, size, count, -(min(ahead, spare) + ONWARD * (s + 1)))
             count += 1
