@@ -44,7 +44,7 @@ export async function fetched(path, options = {}) {
       notice("");
       return response;
     }
-    const told = await response.json().catch(() => ({ detail: response.statusText }));
+    const told = await response.json().catch(() => ({ detail: `the server answered ${response.status} ${response.statusText}`.trim() }));
     if (response.status === 401) {
       await askForKey(wrong || shown !== null);
       wrong = true;
