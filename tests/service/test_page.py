@@ -255,6 +255,9 @@ def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path):
     with serving(tmp_path, SPECSHIELD_API_KEY="a-secret-key") as running, browsing() as (page, _):
         page.goto(running.url)
         field = page.get_by_label("API key")
+        field.wait_for()
+        for _ in range(3):
+            page.keyboard.press("Escape")
         field.fill("wrong")
         field.press("Enter")
         page.get_by_text("does not know this key").wait_for()

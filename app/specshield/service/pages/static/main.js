@@ -1,7 +1,9 @@
 // Which view is shown: the part of the address after '#', such as #/sessions/robot-1.
 
-import { Problem } from "./lib/api.js";
-import { el, say } from "./lib/dom.js";
+import { fetched, Problem } from "./lib/api.js";
+import { el, problem } from "./lib/dom.js";
+import { notice } from "./lib/notice.js";
+import { patiently } from "./lib/patience.js";
 
 const VIEWS = [
   [/^\/(sessions)?$/, () => import("./views/sessions.js")],
@@ -23,31 +25,64 @@ async function show() {
   const { signal } = leaving;
   const [path, query] = (location.hash.slice(1) || "/").split("?");
   mark(path);
-  const found = VIEWS.map(([form, load]) => [form.exec(path), load]).find(([match]) => match);
+  notice("");
+  const [load, id] = found(path);
   const place = el("div", { class: "view" });
   main.replaceChildren(place);
-  if (!found) {
+  document.title = "specshield";
+  headed(place, signal);
+  if (!load) {
     place.append(el("h1", {}, "There is no such page"), el("p", {}, el("a", { href: "#/" }, "All robots")));
     return;
   }
+  const shown = { id, query: new URLSearchParams(query), signal };
   try {
-    const view = await found[1]();
-    const [, name = ""] = found[0];
-    await view.show(place, { id: decodeURIComponent(name), query: new URLSearchParams(query), signal });
-    if (!signal.aborted) {
-      document.title = `${place.querySelector("h1")?.textContent ?? ""} · specshield`;
-      main.focus({ preventScroll: true });
-    }
+    await patiently(async () => {
+      place.replaceChildren(); // what an attempt before has left
+      await (await module(load)).show(place, shown);
+    }, signal);
   } catch (error) {
     if (!signal.aborted) fail(place, error);
   }
 }
 
+/** The view of a path, and what it is a view of. Nothing where there is none. */
+function found(path) {
+  const [match, load] = VIEWS.map(([form, load]) => [form.exec(path), load]).find(([match]) => match) ?? [];
+  try {
+    return match ? [load, decodeURIComponent(match[1] ?? "")] : [];
+  } catch {
+    return []; // an id that is written as none can be
+  }
+}
+
+/** A view's module. That it cannot be read tells nothing of the server, so that the server is asked. */
+async function module(load) {
+  try {
+    return await load();
+  } catch {
+    await fetched("page/main.js", { cache: "no-store" });
+    return load();
+  }
+}
+
+/** As soon as the view has its heading, the window is called after it, and the keyboard is in the view. */
+function headed(place, signal) {
+  const changed = new MutationObserver(() => {
+    const heading = place.querySelector("h1");
+    if (!heading) return;
+    changed.disconnect();
+    document.title = `${heading.textContent} · specshield`;
+    main.focus({ preventScroll: true });
+  });
+  changed.observe(place, { childList: true, subtree: true });
+  signal.addEventListener("abort", () => changed.disconnect());
+}
+
 function fail(place, error) {
-  const told = error instanceof Problem ? error.told() : String(error);
   if (!(error instanceof Problem)) console.error(error);
-  place.append(el("p", { class: "problem", role: "alert" }, told));
-  say(told);
+  if (!place.querySelector("h1")) place.append(el("h1", {}, "This cannot be shown"));
+  place.append(problem(error));
 }
 
 function mark(path) {
@@ -59,5 +94,9 @@ function mark(path) {
   }
 }
 
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault(); // what follows '#' is the view
+  main.focus();
+});
 addEventListener("hashchange", show);
 show();

@@ -1,6 +1,10 @@
 // The server's API, with the key that this tab was given.
 
-const KEY = "specshield-key";
+import { askForKey, key } from "./key.js";
+import { notice } from "./notice.js";
+
+/** When the server last answered; null before its first answer. */
+export let answeredAt = null;
 
 /** A problem document (RFC 9457) as an error. */
 export class Problem extends Error {
@@ -19,31 +23,36 @@ export class Problem extends Error {
 
 const wait = (seconds) => new Promise((done) => setTimeout(done, 1000 * seconds));
 
-/** Asks until the server is ready and has its key; gives the response of a request that succeeded. */
-export async function fetched(path, options = {}) {
-  for (let wrong = false; ; ) {
-    const key = sessionStorage.getItem(KEY);
-    const headers = { ...options.headers, ...(key ? { Authorization: `Bearer ${key}` } : {}) };
-    const response = await fetch(path, { ...options, headers });
-    if (response.ok) {
-      starting("");
-      return response;
-    }
-    const told = await response.json().catch(() => ({ status: response.status, detail: response.statusText }));
-    if (response.status === 401) {
-      await askForKey(wrong || key !== null);
-      wrong = true;
-    } else if (told.type === "starting") {
-      starting(`One moment: ${told.detail}.`);
-      await wait(Number(response.headers.get("Retry-After")) || 1);
-    } else throw new Problem(told);
+/** What comes from the network. Where nothing comes, or not all of it, that is a Problem as any other. */
+async function arrived(coming) {
+  try {
+    return await coming;
+  } catch (error) {
+    if (error.name === "AbortError" || error instanceof Problem) throw error;
+    throw new Problem({ type: "no-answer", detail: "the server does not answer" });
   }
 }
 
-/** Says how far a server is that is not ready yet. */
-function starting(text) {
-  const place = document.getElementById("starting");
-  if (place.textContent !== text) place.textContent = text;
+/** Asks until the server is ready and has its key; gives the response of a request that succeeded. */
+export async function fetched(path, options = {}) {
+  for (let wrong = false; ; ) {
+    const shown = key();
+    const headers = { ...options.headers, ...(shown ? { Authorization: `Bearer ${shown}` } : {}) };
+    const response = await arrived(fetch(path, { ...options, headers }));
+    if (response.ok) {
+      answeredAt = new Date();
+      notice("");
+      return response;
+    }
+    const told = await response.json().catch(() => ({ detail: `the server answered ${response.status} ${response.statusText}`.trim() }));
+    if (response.status === 401) {
+      await askForKey(wrong || shown !== null);
+      wrong = true;
+    } else if (told.type === "starting") {
+      notice(`One moment: ${told.detail}.`);
+      await wait(Number(response.headers.get("Retry-After")) || 1);
+    } else throw new Problem({ ...told, status: response.status });
+  }
 }
 
 /** JSON of an answer. json: a body to send; form: files to send. */
@@ -55,7 +64,7 @@ export async function ask(path, { json, form, ...options } = {}) {
         ? { method: "POST", body: form }
         : {};
   const response = await fetched(path, { ...sent, ...options });
-  return response.status === 204 ? null : response.json();
+  return response.status === 204 ? null : arrived(response.json());
 }
 
 /** Every item of a list. */
@@ -69,16 +78,21 @@ export async function all(path, options) {
   return items;
 }
 
-export const picture = async (path, options) => (await fetched(path, options)).blob();
+export const picture = async (path, options) => arrived((await fetched(path, options)).blob());
 
-/** The data of server-sent events, as they come: by fetch, since an EventSource shows no key. */
-export async function* events(path, signal) {
+/**
+ * The data of server-sent events, as they come: by fetch, since an EventSource shows no key.
+ * alive: called whenever the server has sent something, be it only that it is there.
+ */
+export async function* events(path, signal, alive) {
   const response = await fetched(path, { signal, headers: { Accept: "text/event-stream" } });
+  alive();
   if (!response.body) return;
   const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
   for (let rest = ""; ; ) {
-    const { done, value } = await reader.read();
+    const { done, value } = await arrived(reader.read());
     if (done) return;
+    alive();
     const blocks = (rest + value).split("\n\n");
     rest = blocks.pop();
     for (const block of blocks) {
@@ -86,24 +100,4 @@ export async function* events(path, signal) {
       if (data.length) yield JSON.parse(data.map((line) => line.slice(6)).join("\n"));
     }
   }
-}
-
-let asking = null;
-
-/** Shows the dialog; all who wait for a key share it. */
-function askForKey(wrong) {
-  asking ??= new Promise((done) => {
-    const dialog = document.getElementById("key");
-    const form = dialog.querySelector("form");
-    dialog.querySelector(".wrong").textContent = wrong ? "The server does not know this key." : "";
-    dialog.addEventListener("cancel", (event) => event.preventDefault());
-    form.onsubmit = () => {
-      sessionStorage.setItem(KEY, form.elements.key.value.trim());
-      form.reset();
-      asking = null;
-      done();
-    };
-    dialog.showModal();
-  });
-  return asking;
 }

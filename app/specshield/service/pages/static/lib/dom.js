@@ -21,6 +21,9 @@ export function say(text) {
   document.getElementById("said").textContent = text;
 }
 
+/** An error as the page shows it. */
+export const problem = (error) => el("p", { class: "problem", role: "alert" }, error.told?.() ?? error.message);
+
 export const percent = (share) =>
   share > 0 && share < 0.001 ? "<0.1 %" : `${(100 * share).toFixed(share > 0.0995 ? 0 : 1)} %`;
 
@@ -31,7 +34,8 @@ export function metres(value) {
   return `${value < 0 ? "−" : ""}${Math.abs(value).toFixed(2)} m`;
 }
 
-export const short = (id) => (id.length > 24 ? `${id.slice(0, 8)}…` : id);
+/** Both ends of a long id: those of a fleet often differ in the last letters alone. */
+export const short = (id) => (id.length > 24 ? `${id.slice(0, 11)}…${id.slice(-11)}` : id);
 
 /** A named thing by its name. */
 export const called = (thing) => thing.name ?? short(thing.id);
@@ -40,6 +44,28 @@ export const button = (text, onclick, more = {}) => el("button", { type: "button
 
 /** A row of a description list. */
 export const pair = (name, ...value) => [el("dt", {}, name), el("dd", {}, ...value)];
+
+/**
+ * One child of `parent` for each item, in their order. A child stays while its item does, so that it keeps the
+ * keyboard. key: of an item; make: a child for one; fill: writes into a child what may have changed.
+ */
+export function keep(parent, items, { key, make, fill }) {
+  const before = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  const now = items.map((item) => {
+    const child = before.get(key(item)) ?? make(item);
+    child.dataset.key = key(item);
+    fill(child, item);
+    return child;
+  });
+  const stay = new Set(now);
+  for (const child of [...parent.children]) if (!stay.has(child)) child.remove();
+  now.forEach((child, i) => child !== parent.children[i] && parent.insertBefore(child, parent.children[i] ?? null));
+}
+
+/** Writes a text where it is another. */
+export function write(element, text) {
+  if (element.textContent !== String(text)) element.textContent = text;
+}
 
 /** Calls `work` once after the last call, `wait` milliseconds later. */
 export function later(work, wait) {

@@ -1,31 +1,89 @@
 // What happens to sessions, as it happens. A page that nobody sees keeps no connection: a browser has six.
 
-import { events, Problem } from "./api.js";
+import { ask, events } from "./api.js";
+import { passes, pause } from "./patience.js";
+
+const AGAIN = 500; // [ms] before a stream that ended is asked for again
+const SILENT = 40_000; // [ms] without a word after which a connection is lost: the server sends something every 15 s
 
 /**
- * Calls `take` with each item of these sessions, and with {session, finished: true} at the end of one.
+ * Calls `take` with each item of these sessions, and at the end of one with {session, finished: true}, which has
+ * `erased: true` where the session is no longer there.
  * after: Map of id to the last step that is known, -1 for none; it is kept up to date.
+ * connected: called with true when the stream is there, and with false when it is lost; it is asked for again.
  */
-export async function follow(after, take, signal) {
+export async function follow(after, take, connected, signal) {
+  const end = (item) => {
+    after.delete(item.session);
+    take(item);
+  };
+  let doubted = false; // whether a stream has ended, and with it may have the sessions: they may be erased
   while (after.size && !signal.aborted) {
     await seen(signal);
-    const stop = new AbortController();
-    const hide = () => document.hidden && stop.abort();
-    document.addEventListener("visibilitychange", hide);
-    signal.addEventListener("abort", () => stop.abort());
+    const line = new Line(signal);
+    const alive = () => {
+      line.heard();
+      connected(true);
+    };
     try {
+      for (const id of doubted ? [...after.keys()] : [])
+        if (await erased(id, line.signal)) end({ session: id, finished: true, erased: true });
+      if (!after.size) return;
+      doubted = false;
       const places = [...after].map(([id, t]) => `session=${encodeURIComponent(`${id}:${t}`)}`);
-      for await (const item of events(`v1/events?${places.join("&")}`, stop.signal)) {
-        if (item.finished) after.delete(item.session);
-        else after.set(item.session, item.t);
-        take(item);
+      for await (const item of events(`v1/events?${places.join("&")}`, line.signal, alive)) {
+        if (item.finished) end({ ...item, erased: await erased(item.session, line.signal) });
+        else {
+          after.set(item.session, item.t);
+          take(item);
+        }
       }
+      doubted = true;
     } catch (error) {
-      if (error instanceof Problem && error.status < 500 && error.status !== 429) throw error;
+      if (line.silent || passes(error)) {
+        doubted = true;
+        if (!signal.aborted) connected(false);
+      } else if (!line.signal.aborted) throw error;
     } finally {
-      document.removeEventListener("visibilitychange", hide);
+      line.close();
     }
-    await new Promise((done) => setTimeout(done, 500));
+    await pause(AGAIN);
+  }
+}
+
+/** Its signal ends a stream when the page is left or hidden, and when nothing was heard for too long. */
+class Line {
+  constructor(leaving) {
+    this.stop = new AbortController();
+    this.signal = AbortSignal.any([leaving, this.stop.signal]);
+    this.hide = () => document.hidden && this.stop.abort();
+    document.addEventListener("visibilitychange", this.hide);
+    this.heard();
+  }
+
+  heard() {
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => {
+      this.silent = true;
+      this.stop.abort();
+    }, SILENT);
+  }
+
+  close() {
+    clearTimeout(this.timer);
+    document.removeEventListener("visibilitychange", this.hide);
+    this.stop.abort(); // what is left of a stream that is no longer read
+  }
+}
+
+/** Whether a session is no longer there. */
+async function erased(id, signal) {
+  try {
+    await ask(`v1/sessions/${encodeURIComponent(id)}`, { signal });
+    return false;
+  } catch (error) {
+    if (error.status === 404) return true;
+    throw error;
   }
 }
 

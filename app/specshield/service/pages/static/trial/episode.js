@@ -1,35 +1,64 @@
 // One episode of a simulated robot, step by step through the API, as any robot's program does it.
 
 import { ask } from "../lib/api.js";
+import { passes } from "../lib/patience.js";
+
+const path = (session) => `v1/sessions/${encodeURIComponent(session.id)}`;
 
 export class Episode {
   /** session: as the API shows it. model: logits for a pose. taken: called with each item {t, pose, ...}. */
   constructor(session, world, model, taken) {
-    Object.assign(this, { session, world, model, taken, t: 0, ended: false, over: false });
+    Object.assign(this, { session, world, model, taken, t: 0, ended: false, settled: false, over: false });
   }
 
   async step() {
     if (this.over) return;
+    if (!this.settled) await this.decide();
+    if (this.settled) await this.close();
+  }
+
+  /** A step that was not answered may have been decided: it is sent again as it was. */
+  async decide() {
     const { session, world, t } = this;
-    const pose = world.pose;
-    const logits = this.ended ? null : this.model(pose);
-    const occupied = world.seen();
-    const body = { t, poses: [pose], logits, main_task_done: this.ended, explain: true, ...(occupied && { occupied }) };
-    const path = `v1/sessions/${encodeURIComponent(session.id)}`;
-    const decision = await ask(`${path}/steps`, { json: body });
-    this.taken({ t, pose, logits, decision });
+    this.sent ??= this.next();
+    const { body, pose, seen } = this.sent;
+    let decision;
+    try {
+      decision = await ask(`${path(session)}/steps`, { json: body });
+    } catch (error) {
+      if (!passes(error)) this.sent = null; // it was refused, and nothing was decided
+      throw error;
+    }
+    this.sent = null;
+    for (const obstacle of seen) obstacle.told = true;
+    this.taken({ t, pose, logits: body.logits, decision });
     const ends = session.terminal_actions.includes(decision.action);
     if (ends) this.ended = true;
     const action = ends ? decision.completion_action : decision.action;
-    if (action !== null) world.execute(decision.next_poses[action]);
+    const pushed = world.pose !== pose; // meanwhile: it is not where the action would have begun
+    if (action !== null && !pushed) world.execute(decision.next_poses[action]);
     this.t += 1;
-    const settled = decision.spec_status === "satisfied" || t >= session.horizon || decision.finished;
-    if (settled || (ends && action === null)) await this.close(path);
+    this.settled = decision.spec_status === "satisfied" || t >= session.horizon || decision.finished || (ends && action === null);
   }
 
-  async close(path) {
+  /** What is sent for step t: what the robot sees and its model wants now. */
+  next() {
+    const { pose } = this.world;
+    const seen = this.world.seen();
+    const occupied = seen.flatMap((obstacle) => this.world.points(obstacle));
+    const logits = this.ended ? null : this.model(pose);
+    const body = { t: this.t, poses: [pose], logits, main_task_done: this.ended, explain: true, ...(seen.length && { occupied }) };
+    return { body, pose, seen };
+  }
+
+  async close() {
+    const told = await ask(`${path(this.session)}/close`, { json: {} });
     this.over = true;
-    const told = await ask(`${path}/close`, { json: {} });
     this.taken({ finished: true, spec_status: told.spec_status });
   }
+}
+
+/** Ends a session that nobody drives any more, where the server can be reached; also while the page is left. */
+export function abandon(session) {
+  ask(`${path(session)}/close`, { json: {}, keepalive: true }).catch(() => {});
 }

@@ -5,6 +5,7 @@ import { centre, wrap } from "../lib/motion.js";
 const SEES = 2.5; // [m] how far the robot's sensors reach
 export const SIZE = 0.25; // [m] radius of an obstacle
 const PUSH = 0.35; // [m]
+const MOST_POINTS = 2000; // that a step takes of what is occupied
 
 export class World {
   constructor(robot, occupancy, pose) {
@@ -67,18 +68,23 @@ export class World {
     return [x + reach * Math.cos(this.pose[2]), y + reach * Math.sin(this.pose[2])];
   }
 
-  /** What the robot sees for the first time now: points on obstacles, as a step takes them. */
+  /** The obstacles that the robot sees now and that the service was not told of, no more than one step takes. */
   seen() {
-    const { resolution } = this.occupancy.map;
-    const points = [];
-    for (const obstacle of this.obstacles) {
+    let room = MOST_POINTS;
+    return this.obstacles.filter((obstacle) => {
       const [x, y] = obstacle.place;
-      if (obstacle.told || Math.hypot(x - this.pose[0], y - this.pose[1]) > SEES) continue;
-      obstacle.told = true;
-      const pitch = Math.max(resolution, SIZE / 12);
-      for (let dx = -SIZE; dx <= SIZE; dx += pitch)
-        for (let dy = -SIZE; dy <= SIZE; dy += pitch) if (Math.hypot(dx, dy) <= SIZE) points.push([x + dx, y + dy]);
-    }
-    return points.length ? points.slice(0, 2000) : null;
+      if (obstacle.told || Math.hypot(x - this.pose[0], y - this.pose[1]) > SEES) return false;
+      room -= this.points(obstacle).length;
+      return room >= 0;
+    });
+  }
+
+  /** Points all over an obstacle, as a step takes them. */
+  points({ place: [x, y] }) {
+    const pitch = Math.max(this.occupancy.map.resolution, SIZE / 12);
+    const points = [];
+    for (let dx = -SIZE; dx <= SIZE; dx += pitch)
+      for (let dy = -SIZE; dy <= SIZE; dy += pitch) if (Math.hypot(dx, dy) <= SIZE) points.push([x + dx, y + dy]);
+    return points;
   }
 }

@@ -1,37 +1,51 @@
 // Several robots on one floor: #/floor?sessions=a,b,c
 
 import { ask } from "../lib/api.js";
-import { called, el, onceAFrame, short } from "../lib/dom.js";
+import { called, el, onceAFrame, problem, short } from "../lib/dom.js";
 import { Floor } from "../lib/floor.js";
 import { follow } from "../lib/live.js";
 import { Mark } from "../lib/mark.js";
+import { passes } from "../lib/patience.js";
 import { Replay } from "./replay.js";
+import { State } from "./state.js";
 
 const AT_ONCE = 3; // trajectories that are read at once: a browser has six connections to a server
 
 export async function show(place, { query, signal }) {
   const ids = (query.get("sessions") ?? "").split(",").filter(Boolean);
   const found = await Promise.allSettled(ids.map((id) => ask(`v1/sessions/${encodeURIComponent(id)}`, { signal })));
+  const away = found.find(({ reason }) => reason && (signal.aborted || passes(reason)));
+  if (away) throw away.reason;
   const sessions = found.filter(({ value }) => value).map(({ value }) => value);
+  const gone = ids.flatMap((id, i) => (found[i].value ? [] : [missing(id, found[i].reason)]));
   if (!sessions.length) {
-    place.append(el("h1", {}, "No such robots"), el("p", {}, "These sessions are gone: ", ids.join(", ")));
+    const none = ids.length ? "None of the robots in the address can be shown." : "The address names no robot.";
+    place.append(el("h1", {}, "No such robots"), el("p", {}, none), unseen(gone));
     return;
   }
   const [{ map_id }] = sessions;
   const map = await ask(`v1/maps/${map_id}`, { signal });
   const robots = sessions.filter((session) => session.map_id === map_id);
+  const elsewhere = sessions.filter((session) => session.map_id !== map_id).map(({ id }) => `${id} is on another floor.`);
   const floor = new Floor(map, `Floor with ${robots.length} robots`);
   floor.regions(Object.assign({}, ...robots.map((session) => session.spec.regions)), await avoided(robots, signal));
   const all = robots.map((session, i) => {
     return { session, items: [], mark: new Mark(floor, session.robot, session.id, i), row: row(session, i) };
   });
+  const state = new State();
   const draw = onceAFrame(() => all.forEach((each) => shown(each, replay.t)));
   const replay = new Replay(draw);
   const heads = ["Robot", "Step", "Mode", "Feasible", "Rule"].map((name) => el("th", { scope: "col" }, name));
   const list = el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, all.map((each) => each.row)));
   draw();
   place.append(
-    el("h1", {}, `${robots.length === 1 ? "One robot" : `${robots.length} robots`} on ${called(map)}`),
+    el(
+      "div",
+      { class: "row spread" },
+      el("h1", {}, `${robots.length === 1 ? "One robot" : `${robots.length} robots`} on ${called(map)}`),
+      state.element,
+    ),
+    unseen([...gone, ...elsewhere]),
     el(
       "div",
       { class: "watch" },
@@ -50,15 +64,32 @@ export async function show(place, { query, signal }) {
   await Promise.all([floor.load(signal).then(draw), ...Array.from({ length: AT_ONCE }, read)]);
   const by = new Map(all.map((each) => [each.session.id, each]));
   const after = new Map(all.filter((each) => !each.session.finished).map((each) => [each.session.id, each.items.length - 1]));
-  follow(after, (item) => {
+  const take = (item) => {
     const each = by.get(item.session);
-    if (item.finished) each.session.spec_status = item.spec_status;
+    state.heard();
+    if (item.finished) Object.assign(each.session, { spec_status: item.spec_status ?? each.session.spec_status, erased: item.erased });
     else {
       each.items[item.t] = item;
       replay.extend(item.t);
     }
     draw();
-  }, signal).catch((error) => place.append(el("p", { class: "problem", role: "alert" }, error.message)));
+  };
+  follow(after, take, (connected) => state.live(connected), signal).then(
+    () => signal.aborted || state.over("over"),
+    (error) => {
+      state.over("no longer followed");
+      place.append(problem(error));
+    },
+  );
+}
+
+/** Why a session is not shown, in one sentence. */
+const missing = (id, reason) => (reason.status === 404 ? `${id} is gone.` : `${id}: ${reason.message}.`);
+
+/** The robots that were asked for and are not on the picture. */
+function unseen(sentences) {
+  const lines = sentences.map((text) => el("li", {}, text));
+  return lines.length ? el("div", { class: "unshown" }, "Not shown:", el("ul", { class: "warnings" }, lines)) : "";
 }
 
 async function load(each, signal) {
@@ -94,5 +125,6 @@ function shown({ session, items, mark, row }, t) {
   const status = t >= items.length - 1 ? (decision?.spec_status === "pending" ? session.spec_status : decision?.spec_status ?? session.spec_status) : (decision?.spec_status ?? "pending");
   const cells = [item.t, decision?.mode ?? without, mass === null || mass === undefined ? "–" : `${(100 * mass).toFixed(0)} %`];
   cells.forEach((text, k) => (row.children[k + 1].textContent = text));
-  row.children[4].replaceChildren(el("span", { class: `badge ${status}` }, status));
+  const told = session.erased ? "erased" : status;
+  row.children[4].replaceChildren(el("span", { class: `badge ${told}` }, told));
 }

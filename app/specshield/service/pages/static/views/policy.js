@@ -1,7 +1,8 @@
 // One policy: how far it is, and from where its rule can be kept.
 
 import { ask, picture } from "../lib/api.js";
-import { called, el, pair, percent, say } from "../lib/dom.js";
+import { called, el, pair, percent, problem, say } from "../lib/dom.js";
+import { patiently, pause } from "../lib/patience.js";
 
 const EVERY = 700; // [ms] between two looks while it is made
 
@@ -20,19 +21,19 @@ export async function show(place, { id, signal }) {
   async function watchOver() {
     try {
       while (policy.status === "queued" || policy.status === "training") {
-        await new Promise((done) => setTimeout(done, EVERY));
+        await pause(EVERY);
         if (signal.aborted) return;
-        policy = await ask(path, { signal });
+        policy = await patiently(() => ask(path, { signal }), signal);
         state.replaceChildren(...stands(policy));
       }
       if (policy.status !== "ready") return say("The policy could not be made.");
       say("The policy is ready.");
       figure.replaceChildren(el("p", { role: "status" }, "Looking from where the rule can be kept …"));
       const image = el("img", { alt: `From where ${policy.spec.formula} can be kept`, class: "whole" });
-      image.src = URL.createObjectURL(await picture(`${path}/image.svg`, { signal }));
+      image.src = URL.createObjectURL(await patiently(() => picture(`${path}/image.svg`, { signal }), signal));
       figure.replaceChildren(image);
     } catch (error) {
-      if (!signal.aborted) figure.replaceChildren(el("p", { class: "problem", role: "alert" }, error.told?.() ?? error.message));
+      if (!signal.aborted) figure.replaceChildren(problem(error));
     }
   }
 }
@@ -49,6 +50,7 @@ function stands(policy) {
     head,
     typeof share === "number" ? el("p", {}, `By its own count, the rule can be kept from ${percent(share)} of the starts that it drew at random.`) : null,
     typeof any === "number" ? el("p", {}, `That is if the signals stay as they are. Whatever they do, it can be kept from ${percent(any)}.`) : null,
+    policy.warnings.length ? el("ul", { class: "warnings" }, policy.warnings.map((text) => el("li", {}, text))) : null,
     share === 0 ? el("p", { class: "problem", role: "alert" }, "From no place can this rule be kept: its windows may be too short, or a region out of reach.") : null,
     el("p", {}, el("a", { class: "button main", href: `#/try/${policy.id}` }, "Try it")),
   ].filter(Boolean);

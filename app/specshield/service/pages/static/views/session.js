@@ -1,8 +1,9 @@
 // One session, live and from its beginning.
 
 import { ask } from "../lib/api.js";
-import { el, pair, say } from "../lib/dom.js";
+import { el, pair, problem, say } from "../lib/dom.js";
 import { follow } from "../lib/live.js";
+import { State } from "./state.js";
 import { Watch } from "./watch.js";
 
 export async function show(place, { id, signal }) {
@@ -10,10 +11,8 @@ export async function show(place, { id, signal }) {
   const session = await ask(path, { signal });
   const map = await ask(`v1/maps/${session.map_id}`, { signal });
   const watch = new Watch(session, map);
-  place.append(
-    el("div", { class: "row spread" }, el("h1", {}, session.id), el("p", { class: "state", role: "status" })),
-    watch.element,
-  );
+  const state = new State();
+  place.append(el("div", { class: "row spread" }, el("h1", {}, session.id), state.element), watch.element);
   watch.side.append(about(session));
   await watch.load(signal);
   const { items } = await ask(`${path}/trajectory`, { signal });
@@ -21,22 +20,26 @@ export async function show(place, { id, signal }) {
   const decided = items.findLast((item) => item.decision)?.t;
   if (session.finished && decided !== undefined) watch.replay.go(decided); // what follows was not decided
   watch.show();
-  state(place, session.finished, session.spec_status);
-  if (!session.finished) listen(place, watch, id, items, signal);
+  if (session.finished) state.over(`over, the rule is ${session.spec_status}`);
+  else listen(place, watch, state, items, signal);
 }
 
-async function listen(place, watch, id, items, signal) {
+async function listen(place, watch, state, items, signal) {
+  const { id } = watch.session;
   const last = items.findLast((item) => item.decision)?.t ?? -1;
-  await follow(new Map([[id, last]]), (item) => {
+  const take = (item) => {
     if (item.rule >= watch.session.rules?.length) return dispatchEvent(new Event("hashchange")); // another rule
+    state.heard();
     if (!item.finished) return watch.push(item);
-    state(place, true, item.spec_status);
-    say(`The session is over: the rule is ${item.spec_status}.`);
-  }, signal).catch((error) => place.append(el("p", { class: "problem", role: "alert" }, error.message)));
-}
-
-function state(place, finished, status) {
-  place.querySelector(".state").textContent = finished ? `over, the rule is ${status}` : "live";
+    state.over(item.erased ? "erased: the server no longer has this session" : `over, the rule is ${item.spec_status}`);
+    say(item.erased ? "The session was erased." : `The session is over: the rule is ${item.spec_status}.`);
+  };
+  try {
+    await follow(new Map([[id, last]]), take, (connected) => state.live(connected), signal);
+  } catch (error) {
+    state.over("no longer followed");
+    place.append(problem(error));
+  }
 }
 
 function about(session) {

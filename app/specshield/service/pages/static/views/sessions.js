@@ -1,7 +1,8 @@
 // All robots: the sessions that are under way or over, by the floor that they are on.
 
 import { all } from "../lib/api.js";
-import { called, el, say, short } from "../lib/dom.js";
+import { called, el, keep, say, short, write } from "../lib/dom.js";
+import { again } from "../lib/patience.js";
 
 const EVERY = 2000; // [ms] between two looks at the list
 const MOST = 64; // robots on one picture
@@ -9,49 +10,67 @@ const MOST = 64; // robots on one picture
 export async function show(place, { signal }) {
   const maps = new Map((await all("v1/maps", { signal })).map((map) => [map.id, map]));
   const list = el("div", { class: "stack" });
+  let [before, count] = ["", Infinity];
+  const look = async (signal) => {
+    const sessions = (await all("v1/sessions", { signal })).reverse();
+    const now = JSON.stringify(sessions.map(({ expires_at: _, ...rest }) => rest));
+    if (now !== before) paint(list, sessions, maps);
+    if (sessions.length > count) say(`${sessions.length} robots`);
+    [before, count] = [now, sessions.length];
+  };
+  await look(signal);
   place.append(el("h1", {}, "Robots"), list);
-  let before = "";
-  while (!signal.aborted) {
-    if (!document.hidden) {
-      const sessions = (await all("v1/sessions", { signal })).reverse();
-      const now = JSON.stringify(sessions.map(({ expires_at: _, ...rest }) => rest));
-      if (now !== before) list.replaceChildren(...(sessions.length ? floors(sessions, maps) : [nobody()]));
-      if (before && now.length > before.length) say(`${sessions.length} robots`);
-      before = now;
-    }
-    await new Promise((done) => setTimeout(done, EVERY));
-  }
+  again(look, EVERY, place, signal);
 }
 
-function floors(sessions, maps) {
-  const groups = Map.groupBy(sessions, (session) => session.map_id);
-  return [...groups].map(([id, group]) => {
-    const name = maps.has(id) ? called(maps.get(id)) : short(id);
-    const ids = group.slice(0, MOST).map((session) => session.id);
-    const together = el("a", { href: `#/floor?sessions=${ids.join(",")}` }, `Show ${ids.length} on one floor`);
-    return el(
-      "section",
-      { class: "card", "aria-label": `Floor ${name}` },
-      el("div", { class: "row spread" }, el("h2", {}, name), together),
-      el("div", { class: "scroll" }, table(group)),
-    );
-  });
+function paint(list, sessions, maps) {
+  if (!sessions.length) return list.replaceChildren(nobody());
+  const floors = [...Map.groupBy(sessions, (session) => session.map_id)];
+  const name = (id) => (maps.has(id) ? called(maps.get(id)) : short(id));
+  keep(list, floors, { key: ([id]) => id, make: ([id]) => floor(name(id)), fill: fillFloor });
 }
 
-function table(sessions) {
-  const heads = ["Robot", "Rule", "Step", "The rule is", "The robot is"].map((name) => el("th", { scope: "col" }, name));
-  const rows = sessions.map((session) =>
-    el(
-      "tr",
-      {},
-      el("th", { scope: "row" }, el("a", { href: `#/sessions/${session.id}`, title: session.id }, short(session.id))),
-      el("td", {}, el("code", {}, session.spec.formula)),
-      el("td", { class: "number" }, step(session)),
-      el("td", {}, el("span", { class: `badge ${session.spec_status}` }, session.spec_status)),
-      el("td", {}, session.finished ? "over" : session.main_task_done ? "completing the rule" : "under way"),
-    ),
+function floor(name) {
+  return el(
+    "section",
+    { class: "card", "aria-label": `Floor ${name}` },
+    el("div", { class: "row spread" }, el("h2", {}, name), el("a", { class: "together" })),
+    el("div", { class: "scroll" }, table()),
   );
-  return el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, rows));
+}
+
+function fillFloor(section, [, sessions]) {
+  const ids = sessions.slice(0, MOST).map((session) => session.id);
+  const together = section.querySelector(".together");
+  together.href = `#/floor?sessions=${ids.join(",")}`;
+  write(together, `Show ${ids.length} on one floor`);
+  keep(section.querySelector("tbody"), sessions, { key: (session) => session.id, make: row, fill: fillRow });
+}
+
+function table() {
+  const heads = ["Robot", "Rule", "Step", "The rule is", "The robot is"].map((name) => el("th", { scope: "col" }, name));
+  return el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), el("tbody"));
+}
+
+function row({ id }) {
+  return el(
+    "tr",
+    {},
+    el("th", { scope: "row" }, el("a", { href: `#/sessions/${id}`, title: id }, short(id))),
+    el("td", {}, el("code")),
+    el("td", { class: "number" }),
+    el("td", {}, el("span")),
+    el("td"),
+  );
+}
+
+function fillRow(row, session) {
+  const [, rule, steps, status, robot] = row.children;
+  write(rule.firstChild, session.spec.formula);
+  write(steps, step(session));
+  status.firstChild.className = `badge ${session.spec_status}`;
+  write(status.firstChild, session.spec_status);
+  write(robot, session.finished ? "over" : session.main_task_done ? "completing the rule" : "under way");
 }
 
 /** How far a robot is in its rule; a session that was only told where its robot was has no step. */

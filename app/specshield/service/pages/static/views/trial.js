@@ -2,14 +2,16 @@
 
 import { ask } from "../lib/api.js";
 import { button, called, el, svg } from "../lib/dom.js";
-import { Episode } from "../trial/episode.js";
+import { passes } from "../lib/patience.js";
+import { abandon, Episode } from "../trial/episode.js";
 import { goalSeeker, wanderer } from "../trial/model.js";
 import { SIZE, World } from "../trial/world.js";
 import { Floor } from "../lib/floor.js";
 import { centre } from "../lib/motion.js";
 import { Watch } from "./watch.js";
 
-const TRIES = 60; // starts that are drawn before it is given up
+const TRIES = 60; // starts that the server may refuse before it is given up
+const DRAWS = 5000; // places that are drawn for each of them, until the robot fits
 const PACE = 120; // [ms] between two steps
 
 export async function show(place, { id, signal }) {
@@ -22,33 +24,46 @@ export async function show(place, { id, signal }) {
   floor.regions(policy.spec.regions ?? {}, avoided);
   const told = el("p", { class: "told", role: "alert" });
   const model = el("select", {}, el("option", { value: "goal" }, "goes to a goal"), el("option", { value: "wander" }, "wanders"));
+  const anywhere = button("Set it down anywhere", () => begin(null), { class: "main" });
   const setup = el(
     "section",
     { class: "card", "aria-label": "Begin" },
     el("h2", {}, "Begin"),
     el("p", {}, "Click on the floor to set the robot down there, or:"),
     el("label", {}, "The model ", model),
-    button("Set it down anywhere", () => begin(null), { class: "main" }),
+    anywhere,
     told,
   );
   place.append(el("h1", {}, `Try ${called(policy)}`), el("p", {}, el("code", {}, policy.spec.formula)), el("div", { class: "watch" }, floor.frame, setup));
-  const occupancy = await floor.load(signal);
-  floor.element.classList.add("drawing");
+  const read = floor.load(signal); // who is quick sets the robot down before that
   floor.element.addEventListener("click", (event) => begin(floor.point(event)));
+  await read;
+  floor.element.classList.add("drawing");
 
   async function begin(point) {
-    told.textContent = "";
+    if (anywhere.disabled) return; // it is being set down
+    anywhere.disabled = true;
+    told.textContent = "The robot is set down …";
+    let session = null;
+    const leave = () => session && abandon(session);
     try {
-      const session = await start(policy, occupancy, robot, point);
+      const occupancy = await read;
+      session = await start(policy, occupancy, robot, point, signal);
+      if (signal.aborted) return leave();
+      signal.addEventListener("abort", leave);
+      addEventListener("pagehide", leave, { signal });
       const watch = new Watch(session, map);
       await watch.load(signal);
       place.querySelector(".watch").replaceWith(watch.element);
       const world = new World(robot, watch.floor.occupancy, session.start);
-      new Controls(watch, world, robot, model.value, signal);
+      new Controls(watch, world, robot, model.value, signal, () => (session = null));
     } catch (error) {
+      leave();
+      session = null;
       told.textContent = error.told?.() ?? error.message;
       for (const { formula, late_by: late } of error.conjuncts ?? []) told.append(` ${formula}${late ? `: ${late} steps late` : ""};`);
     }
+    anywhere.disabled = false;
   }
 }
 
@@ -60,24 +75,35 @@ async function resolved(robot, signal) {
 }
 
 /** A session at a point, or where it is taken of those drawn at random; `start` is its pose. */
-async function start(policy, occupancy, robot, point) {
-  const [x0, y0, x1, y1] = occupancy.map.bounds;
-  for (let tried = 0; ; tried++) {
-    const [x, y] = point ?? [x0 + Math.random() * (x1 - x0), y0 + Math.random() * (y1 - y0)];
-    const pose = [x, y, point ? 0 : (2 * Math.random() - 1) * Math.PI]; // at a point, it looks along x
-    if (!point && !occupancy.fits(centre(robot, pose), robot.footprint.radius + 0.05) && tried < 20 * TRIES) continue;
+async function start(policy, occupancy, robot, point, signal) {
+  for (let refused = 0; ; ) {
+    const pose = point ? [...point, 0] : drawn(occupancy, robot); // at a point, it looks along x
     try {
       const session = await ask("v1/sessions", { json: { policy_id: policy.id, initial_pose: pose } });
       return { ...session, start: pose };
     } catch (error) {
-      if (point || !["infeasible-start", "invalid-pose"].includes(error.type) || tried > TRIES) throw error;
+      refused += 1;
+      if (point || !["infeasible-start", "invalid-pose"].includes(error.type) || refused >= TRIES) throw error;
     }
+    signal.throwIfAborted();
   }
 }
 
+/** A pose at random at which the robot fits. */
+function drawn(occupancy, robot) {
+  const [x0, y0, x1, y1] = occupancy.map.bounds;
+  for (let i = 0; i < DRAWS; i++) {
+    const place = [x0 + Math.random() * (x1 - x0), y0 + Math.random() * (y1 - y0)];
+    const pose = [...place, (2 * Math.random() - 1) * Math.PI];
+    if (occupancy.fits(centre(robot, pose), robot.footprint.radius + 0.05)) return pose;
+  }
+  throw new Error(`Of ${DRAWS} places drawn at random, the robot fits at none. Click on the floor where it does.`);
+}
+
 class Controls {
-  constructor(watch, world, robot, kind, signal) {
-    Object.assign(this, { watch, world, robot, kind, mode: null });
+  /** ended: called when the episode is over. */
+  constructor(watch, world, robot, kind, signal, ended) {
+    Object.assign(this, { watch, world, robot, kind, ended, mode: null, failure: null });
     this.episode = new Episode(watch.session, world, () => [], (item) => this.take(item));
     this.goal = svg("circle", { class: "goal", r: 0.15 });
     this.run = button("Run", () => this.toggle(), { class: "main" });
@@ -165,9 +191,11 @@ class Controls {
     this.busy = true;
     try {
       await this.episode.step();
+      if (this.told.textContent === this.failure) this.tell("");
     } catch (error) {
       this.pause();
-      this.tell(error.told?.() ?? error.message);
+      this.failure = passes(error) ? `${error.told()} Step or Run sends this step again.` : (error.told?.() ?? error.message);
+      this.tell(this.failure);
     }
     this.busy = false;
   }
@@ -186,6 +214,7 @@ class Controls {
 
   take(item) {
     if (!item.finished) return this.watch.push(item);
+    this.ended();
     this.pause();
     this.tell(`The episode is over: the rule is ${item.spec_status}.`);
     this.run.disabled = true;
