@@ -200,5 +200,5 @@ def _check_name(name: str, path: str, error: type[InputError]) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
         raise error(
             f"{name!r} cannot be a name", path=path, got=name,
-            expected=f"up to {MAX_NAME} letters, digits and _; no keyword of formulas, no x, y, theta",
+            expected=f"up to {MAX_NAME} letters a to z, digits and _; no keyword of formulas, no x, y, theta",
         )  # fmt: skip
