@@ -206,5 +206,5 @@ def _check_name(name: str, path: str, error: type[InputError]) -> None:
             f"{name!r} cannot be a name",
             path=path,
             got=name,
-            expected=f"up to {MAX_NAME} letters, digits and _; no keyword of formulas, no x, y, theta",
+            expected=f"up to {MAX_NAME} letters a to z, digits and _; no keyword of formulas, no x, y, theta",
         )

@@ -10,6 +10,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from specshield.stl.formula import BODY_WORDS, KEYWORDS
+from specshield.task import POSE_NAMES
 from tests.browsing import browsing, needs_chromium
 from tests.houses import HOUSES, needs_houses
 from tests.service.world import ahead, grid_json
@@ -159,6 +161,191 @@ def test_a_map_far_from_its_frames_origin_is_drawn_on_as_any(own):
         draw(page, Floor(page), "Circle", (253.25, -65.75), (253.75, -65.75), "Dock")
         numbers = [float(field.input_value()) for field in page.locator(".numbers input").all()]
     assert numbers == pytest.approx([448253.25, 5411934.25, 0.5], abs=0.02)
+    assert complaints == []
+
+
+@pytest.fixture
+def small(own):
+    """The address of the editor of the small map, 4 m by 3 m."""
+    id = httpx.post(f"{own.url}/v1/maps", json=grid_json(), timeout=None).json()["id"]
+    return f"{own.url}/#/maps/{id}"
+
+
+def test_a_region_takes_any_name_but_a_word_of_the_rules_and_what_is_edited_is_kept_at_once(small):
+    """A region called F would, named anew, have taken the operator F of the rule with it."""
+    fit = ["constructor", "toString", "__proto__", "true", "Dock_2"]
+    unfit = ["Küche", "Region 1", "1abc", "", "a" * 65, *KEYWORDS, *BODY_WORDS, *POSE_NAMES]
+    with browsing() as (page, complaints):
+        page.goto(small)
+        page.locator(".walls image").wait_for(state="attached")
+        draw(page, Floor(page), "Circle", (1.0, 1.0), (1.5, 1.0), "Dock")
+        draw(page, Floor(page), "Rectangle", (2.0, 1.0), (2.5, 1.5), "Stairs")
+        place, rule = page.get_by_label("Place"), page.get_by_role("textbox", name="Rule")
+        place.select_option("Dock")
+        page.get_by_role("button", name="be there once").click()
+        place.select_option("Stairs")
+        page.get_by_role("button", name="keep the body out").click()
+        field = page.get_by_label("Name of the region").first
+        wrong = page.locator(".regions .wrong").first
+        for name in [*unfit, "Stairs"]:
+            field.fill(name)
+            field.press("Enter")
+            assert wrong.inner_text().startswith(f'"{name}" '), name
+            assert wrong.inner_text().endswith("The region is still called Dock.")
+            assert rule.input_value() == "F[0,60] Dock and G[0,120] not touches(Stairs)"
+        for name in fit:
+            field.fill(name)
+            field.press("Enter")
+            assert wrong.inner_text() == ""
+            assert rule.input_value() == f"F[0,60] {name} and G[0,120] not touches(Stairs)"
+            page.locator(".timeline code", has_text=f"F[0,60] {name}").wait_for()  # the server takes it
+        renamed = """async (given) => (await import("/page/edit/names.js")).renamed(...given)"""
+        text = "touches(touches) and abs(x) > 1e1 or e1 U[0,5] touches"
+        wanted = "touches(Dock) and abs(x) > 1e1 or e1 U[0,5] Dock"
+        assert page.evaluate(renamed, [text, "touches", "Dock"]) == wanted
+        assert page.evaluate(renamed, [wanted, "e1", "E"]) == wanted.replace(" e1", " E")
+
+        radius = page.get_by_label("r", exact=True)
+        radius.fill("")
+        radius.press("Tab")
+        assert radius.input_value() == "0.5"
+        assert "it is 0.5, as before" in wrong.inner_text()
+        rule.fill("F[0,61] Dock_2")
+        page.reload()
+        page.locator(".timeline code", has_text="F[0,61] Dock_2").wait_for()
+        names = [field.input_value() for field in page.get_by_label("Name of the region").all()]
+        assert names == ["Dock_2", "Stairs"]
+    assert complaints == []
+
+
+def test_regions_are_made_with_a_keyboard_alone(small):
+    with browsing() as (page, complaints):
+        page.goto(small)
+        page.locator(".walls image").wait_for(state="attached")
+        rows = page.locator("ul.regions li")
+        circle, rectangle, polygon = (
+            page.get_by_role("button", name=name, exact=True) for name in ("Circle", "Rectangle", "Polygon")
+        )
+
+        def numbers(row):
+            return [field.input_value() for field in rows.nth(row).locator(".numbers input").all()]
+
+        circle.press("Enter")
+        page.keyboard.press("Enter")
+        assert numbers(0) == ["2", "1.5", "0.38"]
+        page.keyboard.type("Dock")  # its name is chosen, to be written over
+        page.keyboard.press("Enter")
+        assert page.locator("g.region[data-name=Dock]").count() == 1
+        rectangle.press("Enter")
+        assert rectangle.get_attribute("aria-pressed") == "true"
+        page.keyboard.press("Escape")
+        assert rectangle.get_attribute("aria-pressed") == "false"
+        assert rectangle.evaluate("button => document.activeElement === button")
+        rectangle.press("Enter")
+        page.keyboard.press("Enter")
+        assert numbers(1) == ["1.63", "2.38", "1.13", "1.88"]
+        polygon.press("Enter")
+        page.keyboard.press("Enter")
+        assert numbers(2) == ["1.63, 1.13; 2.38, 1.13; 2, 1.88"]
+        corners, wrong = page.get_by_label("Corners"), rows.nth(2).locator(".wrong")
+        for text, said in {
+            "1, 1; 2, x; 2, 2": 'Corner 2 is "2, x"',
+            "1, 1; 2": 'Corner 2 is "2"',
+            "1, 1; 2, 2;": "at least 3 corners, and here are 2",
+            "": "at least 3 corners, and here are 0",
+        }.items():
+            corners.fill(text)
+            corners.press("Enter")
+            assert said in wrong.inner_text()
+        corners.fill("0.5, 0.5; 1.5 .5; 1, -1e-1;")
+        corners.press("Enter")
+        assert wrong.inner_text() == ""
+        drawn = page.locator("g.region[data-name=Region2] polygon").get_attribute("points")
+        assert drawn == "0.500,-0.500 1.500,-0.500 1.000,0.100"
+        look(page, "regions")
+
+        polygon.click()
+        floor = Floor(page)
+        for x, y in ((3, 1), (3.5, 1)):
+            floor.click(x, y)
+        page.keyboard.press("Enter")
+        assert polygon.get_attribute("aria-pressed") == "false"
+        page.get_by_text("the one begun had fewer and is forgotten").wait_for()
+        assert rows.count() == 3
+        polygon.click()
+        for x, y in ((3, 1), (3.5, 1), (3.5, 2)):
+            floor.click(x, y)
+        page.keyboard.press("Enter")
+        assert rows.count() == 4
+    assert complaints == []
+
+
+def test_two_fingers_draw_nothing_and_zoom_one_draws(small):
+    with browsing(has_touch=True) as (page, complaints):
+        page.goto(small)
+        page.locator(".walls image").wait_for(state="attached")
+        fingers = page.context.new_cdp_session(page)
+
+        def touch(kind, *points):
+            at = [dict(zip("xy", floor.at(*point), strict=True), id=i) for i, point in enumerate(points)]
+            fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
+        page.get_by_role("button", name="Circle").click()
+        floor = Floor(page)
+        one, other = (1.9, 1.5), (2.1, 1.5)
+        touch("touchStart", one)
+        touch("touchMove", (1.8, 1.5))
+        touch("touchStart", (1.8, 1.5), other)
+        assert page.locator(".draft circle").count() == 0
+        touch("touchMove", (1.5, 1.5), (2.5, 1.5))
+        touch("touchEnd")
+        page.wait_for_function("document.querySelector('svg.closer')")
+        touch("touchStart", (2.0, 1.5))
+        touch("touchMove", (2.2, 1.5))
+        touch("touchCancel")
+        assert page.locator(".draft circle").count() == 0
+        assert page.locator("ul.regions li").count() == 0
+        touch("touchStart", (2.0, 1.5))
+        touch("touchMove", (2.2, 1.5))
+        touch("touchEnd")
+        page.locator("ul.regions li").wait_for()
+        assert page.locator("ul.regions li").count() == 1
+    assert complaints == []
+
+
+@pytest.mark.parametrize(("width", "height"), [(200, 1), (1, 160)])
+def test_a_long_and_narrow_floor_is_drawn_on_once_it_is_near(own, width, height):
+    sent = grid_json()
+    sent["info"] |= {"resolution": 0.5, "width": width, "height": height}
+    sent["data"] = [0] * (width * height)
+    id = httpx.post(f"{own.url}/v1/maps", json=sent, timeout=None).json()["id"]
+    middle = (width / 4, height / 4)
+    with browsing() as (page, complaints):
+        page.goto(f"{own.url}/#/maps/{id}")
+        page.locator(".walls image").wait_for(state="attached")
+        look(page, "narrow")
+        box = page.locator("svg.floor").bounding_box()
+        assert 0.32 < box["width"] / box["height"] < 3.1
+        floor = Floor(page)
+        page.mouse.move(*floor.at(*middle))
+        page.mouse.wheel(0, -5000)
+        page.wait_for_function("document.querySelector('svg.closer')")
+        ground = page.locator(".ground").bounding_box()
+        assert min(ground["width"], ground["height"]) > 100  # [px] across, and it was 4
+        draw(page, floor, "Circle", middle, (middle[0] + 0.2, middle[1]), "Dock")
+        numbers = [float(field.input_value()) for field in page.locator(".numbers input").all()]
+        assert numbers == pytest.approx([*middle, 0.2], abs=0.02)
+        look(page, "narrow-closer")
+    assert complaints == []
+
+
+def test_a_file_that_holds_no_map_is_named(own, tmp_path):
+    with browsing() as (page, complaints):
+        page.goto(f"{own.url}/#/maps")
+        for text, said in {"null": "null", "[1]": "a list", "3": "a number"}.items():
+            (tmp_path / "map.json").write_text(text)
+            page.locator("#files").set_input_files(tmp_path / "map.json")
+            page.get_by_text(f"map.json holds {said}: a map").wait_for()
     assert complaints == []
 
 

@@ -24,7 +24,7 @@ IMPLIES, OR, AND, UNTIL, PREFIX, COMPARISON, SUM, PRODUCT, NEGATION, PRIMARY = r
 
 
 def is_name(text: str) -> bool:
-    """Whether `text` can be a name in a formula: letters, digits and _, no digit in front, no keyword."""
+    """Whether `text` can be a name in a formula: letters a to z, digits and _, no digit first, no keyword."""
     return text.isascii() and text.isidentifier() and text not in KEYWORDS
 
 
@@ -248,6 +248,6 @@ class Until(Windowed):
 def _check_name(name: str) -> None:
     how, region = region_named(name)
     if not (is_name(region) and (how is None or (how in BODY_WORDS and name == body_name(how, region)))):
-        expected = "letters, digits and _, not starting with a digit, and not a keyword"
+        expected = "letters a to z, digits and _, not starting with a digit, and not a keyword"
         problem = f"{name!r} cannot be a name in a formula; expected {expected}"
         raise FormulaError(problem, got=name, expected=expected)

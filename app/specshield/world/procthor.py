@@ -58,7 +58,7 @@ def _polygons(house: Any) -> list[tuple[str, Polygon]]:
     for path, room in _items(house, "rooms", low=1):
         kind = checks.text(checks.member(room, "roomType", path), f"{path}.roomType")
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,63}", kind):
-            raise checks.wrong("name", f"{path}.roomType", kind, "letters and digits, a letter first")
+            raise checks.wrong("name", f"{path}.roomType", kind, "letters a to z and digits, a letter first")
         outline = [(x, z) for x, _, z in _points(room, "floorPolygon", path, 3)]
         try:
             found.append((kind, Polygon(tuple(outline))))

@@ -126,7 +126,7 @@ class Keys:
     async def create(self, name: str, **limits: Any) -> str:
         """The key itself, which cannot be read again. Raises InputError for a name that cannot be had."""
         if not NAME.fullmatch(name):
-            expected = "1 to 64 letters, digits, '_', '.' or '-', the first a letter or digit"
+            expected = "1 to 64 letters a to z, digits, '_', '.' or '-', the first a letter or digit"
             raise InputError("a key cannot have this name", path="name", got=name, expected=expected)
         if await _reached(self._store.hlen(KEYS)) > MOST_KEYS:
             raise LimitReached(f"there are {MOST_KEYS} keys", expected="room for one more: revoke one")

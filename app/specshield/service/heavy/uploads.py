@@ -86,7 +86,7 @@ def add_map(settings: Settings, content_type: str, content: Content, key: Key) -
 def _named(name: Any) -> str | None:
     """The name that an upload asks for. Raises InputError for one that cannot be an id."""
     if name is not None and not (isinstance(name, str) and re.fullmatch(ID, name)):
-        expected = "1 to 64 letters, digits, '_', '.' or '-', the first a letter or digit"
+        expected = "1 to 64 letters a to z, digits, '_', '.' or '-', the first a letter or digit"
         raise InputError("this is no name", path="name", got=name, expected=expected)
     return name
 

@@ -37,7 +37,7 @@ export function makeForm(robots, spec) {
     el("label", {}, "Robot ", robot),
     own,
     el("label", {}, "Method ", el("select", { name: "method" }, methods)),
-    el("label", {}, "Name ", el("input", { name: "name", placeholder: "if you like", pattern: "[A-Za-z0-9][A-Za-z0-9_.\\-]*", maxlength: 64 })),
+    el("label", {}, "Name ", el("input", { name: "name", placeholder: "if you like", pattern: "[A-Za-z0-9][A-Za-z0-9_.\\-]*", maxlength: 64, title: "Letters a to z or A to Z, digits, '_', '.' and '-'; a letter or digit first" })),
     submit,
     told,
   );

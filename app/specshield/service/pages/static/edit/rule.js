@@ -2,6 +2,7 @@
 
 import { ask } from "../lib/api.js";
 import { button, el, later } from "../lib/dom.js";
+import { renamed } from "./names.js";
 import { timeline } from "./timeline.js";
 
 const PATTERNS = [
@@ -11,9 +12,11 @@ const PATTERNS = [
 ];
 
 export class Rule {
-  /** told: called with the server's answer for a rule that is right, with null for one that is not. */
-  constructor(text, map, regions, told) {
-    Object.assign(this, { map, regions, told });
+  /** edited: called with the text at each change. told: called with the server's answer for a rule that is right,
+   *  with null for one that is not.
+   */
+  constructor(text, map, regions, edited, told) {
+    Object.assign(this, { map, regions, edited, told });
     this.under = el("pre", { "aria-hidden": "true", class: "under" });
     this.input = el("textarea", {
       id: "rule", rows: 4, spellcheck: "false", autocomplete: "off", autocapitalize: "off", "aria-describedby": "rule-said",
@@ -42,14 +45,16 @@ export class Rule {
     return this.input.value.trim();
   }
 
+  /** The text is another, or what it is about. */
   changed() {
+    this.edited(this.input.value);
     this.mark(null);
     this.check();
   }
 
-  /** A region is there, or has another name: [from, to]. */
+  /** A region has another name. */
   renamed(from, to) {
-    this.input.value = this.input.value.replace(new RegExp(`\\b${from}\\b`, "g"), to);
+    this.input.value = renamed(this.input.value, from, to);
   }
 
   /** name: of the region that the patterns are about at first; a room may be chosen as well. */

@@ -23,11 +23,15 @@ function mapServer(yaml, image, name) {
 }
 
 async function parsed(file) {
+  let value;
   try {
-    return JSON.parse(await file.text());
+    value = JSON.parse(await file.text());
   } catch (error) {
     throw new Error(`${file.name} is not JSON: ${error.message}`);
   }
+  if (value && typeof value === "object" && !Array.isArray(value)) return value;
+  const kind = value === null ? "null" : Array.isArray(value) ? "a list" : `a ${typeof value}`;
+  throw new Error(`${file.name} holds ${kind}: a map, and a list of asset sizes, is a JSON object with named members.`);
 }
 
 function ready(read) {

@@ -51,9 +51,11 @@ export class Floor {
     );
     const keys = `${label}. Plus and minus zoom, arrows move what is seen.`;
     this.element = svg("svg", { class: "floor", role: "img", "aria-label": keys }, ...Object.values(this.layers));
-    this.zoom = new Zoom(this.element, [...this.at([x0, y1]), x1 - x0, y1 - y0]);
+    const [x, y] = this.at([x0, y1]);
+    this.zoom = new Zoom(this.element, [x, y, x1 - x0, y1 - y0]);
+    this.element.prepend(svg("rect", { class: "ground", x, y, width: x1 - x0, height: y1 - y0 })); // about it, no map
     this.frame = el("div", { class: "frame" }, this.element, this.zoom.buttons); // what a view puts in its place
-    this.frame.style.setProperty("--ratio", String((x1 - x0) / (y1 - y0)));
+    this.frame.style.setProperty("--ratio", String(this.zoom.ratio));
     this.layers.rooms.append(this.text([(x0 + x1) / 2, (y0 + y1) / 2], "The map is read …", "room"));
   }
 
@@ -74,7 +76,7 @@ export class Floor {
   names() {
     if (!this.occupancy) return;
     const taken = Object.values(this.drawn).flatMap((region) => [foot(region), middle(members(region)[0])]);
-    const others = this.rooms.filter(([name]) => !(name in this.drawn)).reverse(); // the small ones come last
+    const others = this.rooms.filter(([name]) => !Object.hasOwn(this.drawn, name)).reverse(); // the small ones come last
     const texts = others.map(([name, room]) => {
       const place = this.roomiest(room, taken);
       taken.push(place);
@@ -133,6 +135,12 @@ export class Floor {
 
   line(points) {
     return points.map((point) => this.at(point).map((value) => value.toFixed(3)).join(",")).join(" ");
+  }
+
+  /** What is seen of the map: its middle, and how long its shorter side is. */
+  seen() {
+    const [x, y] = this.zoom.middle;
+    return { middle: [x + this.from[0], this.from[1] - y], side: Math.min(...this.zoom.seen()) };
   }
 
   /** The point of the map under a pointer. */

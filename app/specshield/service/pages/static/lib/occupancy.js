@@ -66,6 +66,7 @@ export class Occupancy {
       for (let i = 0; i < columns; i++)
         free[j * columns + i] = this.fits([bounds[0] + (i + 0.5) * side, bounds[1] + (j + 0.5) * side], radius);
     const [gi, gj] = place(goal);
+    if (gi < 0 || gj < 0 || gi >= columns || gj >= rows) return () => Infinity;
     found[gj * columns + gi] = 0;
     for (let queue = [[gi, gj]]; queue.length; ) {
       const next = [];

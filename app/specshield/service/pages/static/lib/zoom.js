@@ -3,7 +3,8 @@
 import { button, el } from "./dom.js";
 
 const STEP = 1.4; // from one press of a button or key to the next; chosen by hand
-const MOST = 40; // times
+const MOST = 40; // times, and as many more as a narrow floor needs to be as wide as its frame
+const NARROWEST = 3; // times that a frame is as long as it is wide, however narrow the floor is
 const FINE = 1.0015; // a pixel of the wheel
 const SLIPPED = 4; // [px] that a click may move
 const UNIT = [5, 7]; // [px] the least and the most that `--unit`, a hundredth of the picture, becomes on the screen
@@ -11,7 +12,11 @@ const UNIT = [5, 7]; // [px] the least and the most that `--unit`, a hundredth o
 export class Zoom {
   /** svg: the picture; bounds: [x0, y0, wide, high] of all of it, in its own units. */
   constructor(svg, bounds) {
-    Object.assign(this, { svg, bounds, times: 1, middle: [bounds[0] + bounds[2] / 2, bounds[1] + bounds[3] / 2] });
+    const [x0, y0, wide, high] = bounds;
+    Object.assign(this, { svg, bounds, times: 1, middle: [x0 + wide / 2, y0 + high / 2] });
+    this.ratio = Math.min(NARROWEST, Math.max(1 / NARROWEST, wide / high)); // of the frame, wide to high
+    this.whole = [Math.max(wide, high * this.ratio), Math.max(high, wide / this.ratio)]; // the frame, when all is seen
+    this.most = Math.max(MOST, this.whole[0] / wide, this.whole[1] / high);
     this.fingers = new Map();
     const press = (name, sign, work) => button(sign, work, { "aria-label": name, title: name });
     this.buttons = el(
@@ -33,7 +38,7 @@ export class Zoom {
 
   /** Closer by a factor, 0 for all of the floor; `at` stays where it is on the screen. */
   by(factor, at = this.middle) {
-    const times = factor && Math.min(MOST, Math.max(1, this.times * factor));
+    const times = factor && Math.min(this.most, Math.max(1, this.times * factor));
     const kept = this.times / (times || 1);
     this.middle = this.middle.map((m, k) => at[k] + (m - at[k]) * kept);
     this.times = times || 1;
@@ -47,16 +52,22 @@ export class Zoom {
 
   show() {
     const [x0, y0, wide, high] = this.bounds;
-    const [w, h] = [wide / this.times, high / this.times];
-    const within = (value, low, size, seen) => Math.min(low + size - seen / 2, Math.max(low + seen / 2, value));
+    const [w, h] = this.whole.map((side) => side / this.times);
+    const within = (value, low, size, seen) =>
+      seen >= size ? low + size / 2 : Math.min(low + size - seen / 2, Math.max(low + seen / 2, value));
     this.middle = [within(this.middle[0], x0, wide, w), within(this.middle[1], y0, high, h)];
     this.svg.setAttribute("viewBox", `${this.middle[0] - w / 2} ${this.middle[1] - h / 2} ${w} ${h}`);
     const { width, height } = this.svg.getBoundingClientRect();
-    const pixels = Math.min(width / wide, height / high) || 1; // of a unit of the picture, when all of it is seen
-    const unit = Math.min(UNIT[1], Math.max(UNIT[0], (pixels * Math.max(wide, high)) / 100));
+    const pixels = Math.min(width / this.whole[0], height / this.whole[1]) || 1; // of a unit of the picture, when all is seen
+    const unit = Math.min(UNIT[1], Math.max(UNIT[0], (pixels * Math.max(...this.whole)) / 100));
     this.svg.style.setProperty("--unit", `${unit / pixels / this.times}px`);
     this.svg.classList.toggle("closer", this.times > 1);
     this.all.disabled = this.times === 1;
+  }
+
+  /** How wide and how high a part of the picture is seen. */
+  seen() {
+    return [0, 1].map((k) => Math.min(this.bounds[2 + k], this.whole[k] / this.times));
   }
 
   /** A point of the screen in the units of the picture. */
@@ -76,10 +87,11 @@ export class Zoom {
     return { clientX, clientY, slipped: 0 };
   }
 
-  /** One finger or the mouse moves what is seen, two fingers zoom; not while something is drawn. */
+  /** Two fingers zoom; one finger or the mouse moves what is seen, where it does not draw. */
   drag(event) {
     const before = this.fingers.get(event.pointerId);
-    if (!before || this.svg.classList.contains("drawing")) return;
+    if (!before) return;
+    if (!event.buttons) return this.fingers.delete(event.pointerId); // it was let go outside the picture
     const slipped = before.slipped + Math.hypot(event.clientX - before.clientX, event.clientY - before.clientY);
     const [was, is] = [this.point(before), this.point(event)];
     const other = [...this.fingers].find(([id]) => id !== event.pointerId)?.[1];
@@ -88,12 +100,12 @@ export class Zoom {
       const fixed = this.point(other);
       const far = (p) => Math.hypot(p[0] - fixed[0], p[1] - fixed[1]);
       if (far(was) > 0) this.by(far(is) / far(was), fixed);
-    } else if (this.times > 1 && slipped > SLIPPED) this.moved(was[0] - is[0], was[1] - is[1]);
+    } else if (this.times > 1 && slipped > SLIPPED && !this.svg.classList.contains("drawing")) this.moved(was[0] - is[0], was[1] - is[1]);
   }
 
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const far = this.bounds[2] / this.times / 10;
+    const far = this.whole[0] / this.times / 10;
     const moves = { ArrowLeft: [-far, 0], ArrowRight: [far, 0], ArrowUp: [0, -far], ArrowDown: [0, far] };
     const zooms = { "+": STEP, "=": STEP, "-": 1 / STEP, 0: 0 };
     if (event.key in zooms) this.by(zooms[event.key]);

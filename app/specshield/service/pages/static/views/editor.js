@@ -14,13 +14,13 @@ export async function show(place, { id, signal }) {
   const draft = restored(map.id);
   const rooms = Object.keys(map.rooms);
   let drawn = null; // what the constructors below call before it is there
-  const rule = new Rule(draft.formula, map, draft.regions, (answer) => {
+  const keep = (formula) => sessionStorage.setItem(`draft-${map.id}`, JSON.stringify({ formula, regions: draft.regions }));
+  const rule = new Rule(draft.formula, map, draft.regions, keep, (answer) => {
     form?.allow(answer !== null);
     if (drawn) {
       drawn.avoided = answer?.avoided ?? [];
       drawn.redraw(false);
     }
-    keep();
   });
   const regions = new Regions(floor, draft.regions, rooms, (name, renamed) => {
     if (renamed) rule.renamed(...renamed);
@@ -30,7 +30,6 @@ export async function show(place, { id, signal }) {
   drawn = regions;
   const spec = () => ({ map_id: map.id, spec: { formula: rule.text, regions: draft.regions } });
   const form = makeForm(robots, spec);
-  const keep = () => sessionStorage.setItem(`draft-${map.id}`, JSON.stringify({ formula: rule.input.value, regions: draft.regions }));
   place.append(
     el("h1", {}, called(map)),
     el(
@@ -43,14 +42,15 @@ export async function show(place, { id, signal }) {
   await floor.load(signal);
 }
 
+/** The draft that this tab keeps of a map. Its regions inherit nothing, so that any name can be one. */
 function restored(id) {
+  let kept = null;
   try {
-    const kept = JSON.parse(sessionStorage.getItem(`draft-${id}`));
-    if (kept?.regions) return kept;
+    kept = JSON.parse(sessionStorage.getItem(`draft-${id}`));
   } catch {
     // a draft that cannot be read is none
   }
-  return { formula: "", regions: {} };
+  return { formula: kept?.formula ?? "", regions: Object.assign(Object.create(null), kept?.regions) };
 }
 
 function about(map, rooms) {

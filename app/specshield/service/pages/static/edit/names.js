@@ -1,0 +1,27 @@
+// Names of regions: what can be one, and how one is changed in the text of a rule.
+
+const LONGEST = 64; // characters
+const OPERATORS = ["F", "G", "U", "not", "always", "eventually", "until", "and", "or", "implies", "abs"];
+const BODY = ["touches", "inside"]; // operators where a parenthesis follows; else the server reads them as names
+const POSE = ["x", "y", "theta"];
+const WORDS = /(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[A-Za-z_]\w*/g; // the numbers and words of a rule
+
+/** Why this cannot be the name of a region, as the end of a sentence; empty where it can. taken: by others. */
+export function unfit(name, taken) {
+  if (name === "") return "is empty: write at least one letter";
+  if (name.length > LONGEST) return `has ${name.length} characters: at most ${LONGEST} are allowed`;
+  if (!/^\w+$/.test(name)) return "cannot be a name: only letters a to z or A to Z, digits and _ are allowed";
+  if (/^\d/.test(name)) return "cannot be a name: it begins with a digit; begin with a letter or _";
+  if (OPERATORS.includes(name) || BODY.includes(name)) return "is a word of the language of rules: choose another name";
+  if (POSE.includes(name)) return "stands for the robot's own pose in rules: choose another name";
+  return taken.includes(name) ? "is the name of another region: choose another name" : "";
+}
+
+/** The text of a rule in which a region has another name. Operators and numbers stay as they are. */
+export function renamed(text, from, to) {
+  if (OPERATORS.includes(from)) return text; // as an operator it stands there, and never as a name
+  return text.replace(WORDS, (word, at) => {
+    const operator = BODY.includes(word) && /^\s*\(/.test(text.slice(at + word.length));
+    return word === from && !operator ? to : word;
+  });
+}
