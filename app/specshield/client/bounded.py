@@ -176,16 +176,12 @@ class Transport(httpx.HTTPTransport):
 
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
-        self._url, self._process = url, os.getpid()
-        self._connect()
-
-    def _connect(self) -> None:
-        _connect_by(self, self._url, Network(), httpcore.ConnectionPool, httpcore.HTTPProxy)
+        self._url, self._process = url, 0
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         if self._process != os.getpid():
+            _connect_by(self, self._url, Network(), httpcore.ConnectionPool, httpcore.HTTPProxy)
             self._process = os.getpid()
-            self._connect()
         return super().handle_request(request)
 
 

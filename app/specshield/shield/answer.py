@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Floats
 from specshield.portable import exp
-from specshield.quick import quick
 from specshield.shield import shaping
 from specshield.shield.caution import threshold
 from specshield.shield.decision import Mode, Reason, Shield
 from specshield.shield.judgement import Judged
 
 
-@quick
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """conditional [A]: the model's log-probabilities given that it does not end, None where it does."""
 
     distribution: Floats

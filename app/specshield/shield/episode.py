@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from hashlib import blake2b
 from itertools import accumulate
 
@@ -176,7 +175,7 @@ def decide(
             left = left_of(shield, carry, chance)
         answer = answer_of(shield, log_prior, judged, main_task_done, weights, chance, left)
         if spec_status == "violated":
-            answer = replace(answer, mode="violated")
+            answer = answer._replace(mode="violated")
 
     action = _draw(answer.distribution, shield.config.seed, t)
     moved = judged.completion if judged is not None and robot.terminal[action] else action

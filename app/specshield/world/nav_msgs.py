@@ -33,13 +33,14 @@ def from_occupancy_grid(info: Any, data: Any) -> OccupancyGrid:
         values = np.array(data)
     except (ValueError, OverflowError):
         values = np.array(None)
-    if values.dtype.kind != "i" or values.ndim != 1:
-        i = next((i for i, value in enumerate(data) if type(value) is not int or abs(value) > 100), 0)
+    whole = values.dtype.kind == "i" and values.ndim == 1
+    if whole:
+        wrong = (values < UNKNOWN) | (values > 100)
+    else:
+        wrong = np.array([type(value) is not int or abs(value) > 100 for value in data])
+    if not whole or wrong.any():
+        i = int(np.argmax(wrong))
         raise checks.wrong("occupancy", f"data[{i}]", data[i], "an integer from -1 (unknown) to 100")
-    wrong = np.flatnonzero((values < UNKNOWN) | (values > 100))
-    if wrong.size:
-        i = int(wrong[0])
-        raise checks.wrong("occupancy", f"data[{i}]", int(values[i]), "an integer from -1 (unknown) to 100")
     return from_values(values.reshape(height, width), resolution, (x, y, yaw))
 
 
