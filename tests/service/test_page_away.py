@@ -120,10 +120,11 @@ def test_a_trial_lasts_through_lost_answers_and_is_closed_when_it_is_left(server
                 route.continue_()
 
         page.route("**/steps", lose)
-        for n in (1, 2):
-            step.click()
+        for _ in range(2):
+            with page.expect_event("requestfailed"):
+                step.click()
             page.get_by_text("the server does not answer. Step or Run sends this step again.").wait_for()
-            wait_for(lambda n=n: len(sent) == n or page.wait_for_timeout(10))
+        assert len(sent) == 2
         step.click()
         page.get_by_role("heading", name="Step 1").wait_for()
         page.wait_for_function("document.querySelector('.controls .hint').textContent === ''")
@@ -133,8 +134,8 @@ def test_a_trial_lasts_through_lost_answers_and_is_closed_when_it_is_left(server
         page.get_by_role("heading", name="Step 2").wait_for()
         assert "occupied" not in json.loads(sent[3])
         assert hint.inner_text() == ""
-        page.close(run_before_unload=False)
-    wait_for(lambda: set(under_way()) <= before)
+        page.goto("about:blank")  # as a tab that is closed, but the browser lives to send what is left to say
+        wait_for(lambda: set(under_way()) <= before)
     assert [text for text in complaints if "ERR_" not in text] == []
 
 
