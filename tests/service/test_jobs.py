@@ -12,7 +12,7 @@ from rq.exceptions import DequeueTimeout
 
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.service.training.jobs import Jobs
+from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs
 from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
 from tests.serving import serving, wait_for
@@ -170,6 +170,16 @@ def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, cli
     wait_for(lambda: read(client, policy)["status"] == "failed")
     assert "worker is gone" in read(client, policy)["error"]
     reach(client, ask(client, seed=4), "ready")
+
+
+def test_a_run_that_gets_no_time_of_the_processor_is_not_taken_for_dead(server, client):
+    policy = ask(client, options=LONG, seed=5)
+    reach(client, policy, "training")
+    ((run, _),) = children(learner_of(server))
+    os.kill(run, signal.SIGSTOP)
+    time.sleep(SIGN_OF_LIFE + 2.0)  # its last sign of its own has passed
+    assert read(client, policy)["status"] == "training"
+    os.kill(run, signal.SIGCONT)
 
 
 def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait(server, client):

@@ -18,7 +18,7 @@ from rq.serializers import JSONSerializer
 from specshield.policy.methods import METHODS
 from specshield.service.library.claims import reached
 from specshield.service.settings import Settings
-from specshield.service.storage.connect import connect
+from specshield.service.storage.connect import connect, reaching
 from specshield.service.watch import logs
 
 ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
@@ -63,12 +63,9 @@ class Jobs:
         """Queue a run for this policy."""
         attempt = secrets.token_hex(8)
         state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
-
-        def enqueue() -> None:
+        with reaching():
             self.redis.hset(_key(id), mapping=state)
             self._enqueue(id, attempt, method)
-
-        reached(enqueue)
         logs.tell("policy queued", policy_id=id, method=method)
 
     def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
@@ -147,12 +144,9 @@ class Jobs:
 
     def worker_lives(self, methods: Sequence[str]) -> None:
         """Says that a worker for these methods is alive."""
-
-        def live() -> None:
+        with reaching():
             for method in methods:
                 self.redis.set(_worker(method), 1, ex=SIGN_OF_LIFE)
-
-        reached(live)
 
 
 def learns(method: str) -> bool:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
 from rq import Worker, get_current_job
@@ -122,8 +122,11 @@ class _Worker(Worker):
         self._running: Any = None
 
     def execute_job(self, job: Job, queue: Any) -> None:
+        # The worker gives signs of life too: on a busy machine the run itself may get no time for them.
+        signs = _regularly(lambda: self._jobs.sign_of_life(*job.args))
         self._running = job
-        super().execute_job(job, queue)
+        with signs if job.origin in self._training else nullcontext():
+            super().execute_job(job, queue)
         self._running = None
 
     def request_stop(self, signum: int, frame: Any) -> None:
