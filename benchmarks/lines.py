@@ -2,8 +2,8 @@
 
     python -m benchmarks.lines        # the table, and what breaks a bound; exit status 1 if something does
 
-Lines are those of the code as ruff formats it by itself, without what is kept from it by `fmt: skip`: so only
-less code makes it shorter, never another layout. The bounds keep the part that has to be right for the
+Lines are counted as ruff would format the code if no `fmt: skip` kept it from that. So only less code makes
+the count smaller, and another layout does not. The bounds keep the part that has to be right for the
 guarantee small enough to read in an afternoon, and every other part small enough to find one's way in.
 """
 
@@ -23,7 +23,7 @@ PACKAGE = APP / "specshield"
 TRUSTED = ("stl", "world", "robot", "task.py", "rule", "shield")  # what the guarantee rests on
 MOST_TRUSTED = 7_852  # lines of the trusted core
 AIM = 17_000  # lines of app/ that the project wants to come down to
-MOST = 38_462
+MOST = 38_459
 LONGEST = 350  # lines of one module
 FULLEST = 14  # files in one folder, at one level
 

@@ -30,8 +30,6 @@ NEEDS_SERVER = """\
 This command needs the server's parts: pip install 'specshield[server]'
 What is installed here is the client, for Python: from specshield.client import ShieldClient"""
 
-# [s] after which a worker that says nothing is replaced: on a busy machine its imports take long
-STARTS_WITHIN = 60
 NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
 
 

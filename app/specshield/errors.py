@@ -86,7 +86,7 @@ class SpecshieldError(Exception):
         shown = "" if self.got is None else repr(self.got)
         got = f"; got {shown if len(shown) <= SHOWN else shown[:SHOWN] + '…'}" if shown else ""
         expected = f"; expected {self.expected}" if self.expected else ""
-        message = self.message.removesuffix(expected)  # some say themselves what is expected
+        message = self.message.removesuffix(expected)  # some messages say it already
         return f"{where}{message}{got}{expected}"
 
     def at(self, path: str) -> SpecshieldError:

@@ -122,8 +122,8 @@ def look_up(host: str, port: int, by: float) -> list[str]:
 
 
 def in_thread(function: Callable[[], T], by: float) -> Future[T]:
-    """What the function gives, for which nothing can limit the time; not done where it is not there by then.
-    The interpreter does not wait for the thread, as it would for an executor's.
+    """Runs a function in a thread, and waits until `by` (time.monotonic() [s]) for its future to be done. The
+    interpreter does not wait for the thread at its exit, as it would for an executor's.
     """
     given = Future[T]()
 
@@ -170,18 +170,22 @@ class AsyncNetwork(httpcore.AnyIOBackend):
 class Transport(httpx.HTTPTransport):
     """httpx's own transport with the network above; an HTTP proxy of the environment is used.
 
-    A forked process has its parent's connections too, and what one of the two sends there the other answers
-    to: so it opens its own.
+    A forked process shares its parent's connections, and requests that both send over one of them get mixed
+    up. So a forked process opens its own.
     """
 
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
-        self._url, self._process = url, 0
+        self._url = url
+        self._connect()
+
+    def _connect(self) -> None:
+        self._process = os.getpid()
+        _connect_by(self, self._url, Network(), httpcore.ConnectionPool, httpcore.HTTPProxy)
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         if self._process != os.getpid():
-            _connect_by(self, self._url, Network(), httpcore.ConnectionPool, httpcore.HTTPProxy)
-            self._process = os.getpid()
+            self._connect()
         return super().handle_request(request)
 
 

@@ -1,4 +1,4 @@
-"""The distribution that answers a step, by what futures say of its actions (Algorithm 1, steps 4 to 6)."""
+"""The distribution that answers a step, given what its futures say of each action (Algorithm 1)."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def decide(
         if judged.vain and judged.some:
             said = (
                 *said,
-                "only ways by a motion that has led nowhere from here are left, so it is tried again",
+                "every way that is left uses a motion that led nowhere from here before; it is tried again",
             )
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             known = shield.preference.begin() if memory is None else memory

@@ -75,8 +75,8 @@ class Crowd:
         return moment
 
     def back_since(self, moment: float) -> list[float]:
-        """For each robot, the seconds from then to the first good answer to a request that it sent later. One
-        that asked nothing just then has waited since it asked.
+        """For each robot, the seconds from then to the first good answer to a request that it sent later. A
+        robot that was not asking at that moment has waited since its next request.
         """
         answered, asked = [0.0] * len(self.robots), [math.inf] * len(self.robots)
         looked = [max(0, len(robot.tries) - 50) for robot in self.robots]

@@ -25,7 +25,7 @@ from specshield.service.heavy.child import LENGTH, LIMITS
 from specshield.service.heavy.queue import Turns
 
 # Chosen by hand; `python -m benchmarks.attacks` shows what they come to.
-STARTS_WITHIN = 60.0  # [s] that a template may take to import everything on a busy machine
+STARTS_WITHIN = 60  # [s] that a process may take to import everything on a busy machine
 MAY_GROW = 64 << 20  # [bytes] a child holds more than at its start when it is let go after a call
 
 

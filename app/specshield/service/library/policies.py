@@ -199,9 +199,7 @@ class Policies(Claimed):
         stored = asdict(replace(record, card=None))
         del stored["card"]
         content, folder = {"policy.json": files.to_json(stored), **(trained or {})}, self._folder / record.id
-        size = max(
-            sum(map(len, content.values())), files.weight_of(folder)
-        )  # all of it, if it is trained already
+        size = max(sum(map(len, content.values())), files.weight_of(folder))  # all, if it is trained already
         with self._claims.adding("policies", record.id, key, size, self._own_map(record.about)):
             if not folder.is_dir():
                 files.write_folder(folder, content)

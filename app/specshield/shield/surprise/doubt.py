@@ -101,7 +101,7 @@ def recovered(
         ways = futures(prefix, free.body, free.proposers, None, (0.0,))
         first, _, lacks, helps = most_kept(free, judged.part, ways)
         first = first if helps else ways.preferred
-        said = ("no way is left by what was run into, so that is set aside for this action", *lacks)
+        said = ("what was marked after contacts leaves no way, so it is ignored for this action", *lacks)
     tried = replace(tried, warnings=(*tried.warnings, *said))
     return replace(judged, tried=tried, completion=int(shield.task.robot.representative[first]))
 

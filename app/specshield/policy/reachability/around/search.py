@@ -138,7 +138,7 @@ def _reach(
     turns_matter = reads_heading(rules.programs, rules.regions)
     put(tree, 0, pose[0], pose[1], pose[2], 0, -1, -1)
     copy_progress(scratch.status, scratch.run, tree.status[0], tree.run[0])
-    # In places that are narrower than their lattice, tables know no way out: from there they bound nothing.
+    # The tables know no way out of places narrower than their lattice: they do not bound a search from there.
     bounded = slack_at(guide, pose[0], pose[1], pose[2], t, scratch, scratch.ahead, UNKNOWN) >= BAND
     count, size = 1, push(tree.heap, 0, 0, 0.0)
     while size > 0:
