@@ -102,6 +102,7 @@ def serve(
     """Serve. Settings come from the environment: SPECSHIELD_DATA_DIR, REDIS_URL, SPECSHIELD_API_KEY, ..."""
     import uvicorn
 
+    from specshield.service.heavy.pool import STARTS_WITHIN
     from specshield.service.leaving import GRACE
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
@@ -134,6 +135,7 @@ def serve(
         "log_config": logs.config(settings.log_format, settings.log_level),
         "http": "specshield.service.bounds.protocol:BoundedProtocol",
         "timeout_keep_alive": settings.keep_alive_timeout,
+        "timeout_worker_healthcheck": STARTS_WITHIN,
     }
     # uvicorn raises the signal that stopped it again: nothing after it would be cleaned up.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))

@@ -41,9 +41,7 @@ class Settings(BaseSettings):
         validation_alias=AliasChoices("redis_url", "REDIS_URL"),
         description="The store, as storage/connect.py says; unset, the server starts its own.",
     )
-    store_timeout: float = Field(
-        2.0, gt=0, le=LONGEST, description="Longest wait for one answer of the store [s]."
-    )
+    store_timeout: float = Field(2.0, gt=0, le=LONGEST, description="Longest wait for the store [s].")
     store_replicas: int = Field(
         0,
         ge=0,
