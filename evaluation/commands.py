@@ -82,6 +82,7 @@ def worlds(
     slack: Annotated[
         int, typer.Option(help="Steps that every F keeps, in place of what the session learns.", min=-1)
     ] = -1,
+    robot: Annotated[str, typer.Option(help="Some of stretch, locobot, trailing, arcs.")] = "stretch",
     out: Annotated[Path | None, typer.Option(help="Folder to keep runs in and to take them up from.")] = None,
     processes: Annotated[int, typer.Option(help="Processes; 0: one a core.", min=0)] = 0,
 ) -> None:
@@ -90,7 +91,8 @@ def worlds(
     from evaluation.worlds.runs import Trial
 
     trials = [
-        Trial(each, name, senses, seed, slack < 0, max(slack, 0))
+        Trial(each, name, senses, seed, slack < 0, max(slack, 0), robot=body)
+        for body in robot.split(",")
         for each in case.split(",")
         for name in world.split(",")
         for senses in sensing.split(",")

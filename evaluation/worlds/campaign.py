@@ -16,8 +16,8 @@ from evaluation.statistics import clopper_pearson
 from evaluation.worlds.runs import Outcome, Trial, run
 
 HEAD = (
-    "| case | world | senses | kept of what the oracle can keep | 95 % interval | oracle | "
-    "changed the map, p50 / p99 [ms] | KL | slack |\n|---|---|---|---|---|---|---|--:|--:|"
+    "| robot | case | world | senses | kept of what the oracle can keep | 95 % interval | oracle | "
+    "changed the map, p50 / p99 [ms] | KL | slack |\n|---|---|---|---|---|---|---|---|--:|--:|"
 )
 
 
@@ -82,7 +82,8 @@ def row(trial: Trial, found: Sequence[Outcome]) -> str:
     got = figures(found)
     slack = "learned" if trial.uncertain else str(trial.slack)
     return (
-        f"| {trial.case} | {trial.world} | {trial.sensing} | {got['kept']} of {got['could']} | "
-        f"{100 * got['low']:.1f} to {100 * got['high']:.1f} % | {got['could']} of {got['runs']} | "
+        f"| {trial.robot} | {trial.case} | {trial.world} | {trial.sensing} | "
+        f"{got['kept']} of {got['could']} | {100 * got['low']:.1f} to {100 * got['high']:.1f} % | "
+        f"{got['could']} of {got['runs']} | "
         f"{got['p50']} / {got['p99']} | {got['kl']:.0f} | {slack} |"
     )

@@ -13,6 +13,7 @@ from evaluation.disturbance import believed
 from evaluation.houses import load_house_case
 from evaluation.models import named
 from evaluation.worlds.oracle import can_keep
+from evaluation.worlds.robots import ROBOTS
 from evaluation.worlds.world import STAYS, World, look, make_world
 from specshield.errors import InfeasibleStart, PoseError
 from specshield.policy.dqn.environment import free_poses
@@ -38,7 +39,8 @@ class Trial:
 
     case: case1, case2, or a house as in evaluation/houses.py. world, sensing: of WORLDS and SENSING.
     uncertain: whether the session learns how exact its robot is, as by default. margin [m], slack [steps]:
-    the least that are kept.
+    the least that are kept. robot: of ROBOTS. The learned model is the Stretch's; others have the
+    goal-seeker.
     """
 
     case: str
@@ -48,6 +50,7 @@ class Trial:
     uncertain: bool = True
     slack: int = 0
     margin: float = 0.0
+    robot: str = "stretch"
 
     @property
     def config(self) -> Config:
@@ -79,11 +82,12 @@ class Outcome:
 
 
 @lru_cache(maxsize=4)
-def prepared(case: str, collider: bool) -> tuple[Case, Shield]:
+def prepared(case: str, collider: bool, robot: str) -> tuple[Case, Shield]:
     """A case, and the shield as it is told, with the paper's settings; kernels are loaded, as in a server."""
     for part in PARTS:
         warm_up(part)
     found = load_case(case) if case in case_names() else load_house_case(case)
+    found = replace(found, task=replace(found.task, robot=ROBOTS[robot]))
     task = believed("collider" if collider else "none", found.task)
     return found, make_shield([synthesise(task)])
 
@@ -91,7 +95,7 @@ def prepared(case: str, collider: bool) -> tuple[Case, Shield]:
 def run(trial: Trial, i: int) -> Outcome:
     """Run i. Its start, model, draws and world follow from the seed and i alone, whatever is sensed."""
     own = int(np.random.SeedSequence([trial.seed, i]).generate_state(1)[0])
-    case, plain = prepared(trial.case, trial.world == "collider")
+    case, plain = prepared(trial.case, trial.world == "collider", trial.robot)
     shield = replace(plain, config=replace(trial.config, seed=own))
     world, pose = _begin(trial, case, plain, own)
     could = can_keep(world, pose)
@@ -125,7 +129,8 @@ def certified_way(shield: Shield, pose: Pose) -> np.ndarray:
 def _drive(
     trial: Trial, i: int, own: int, case: Case, shield: Shield, world: World, pose: Pose, could: bool
 ) -> Outcome:
-    model, robot = named("learned").make(case), SimulatedRobot(world.case, pose)
+    model = named("learned" if trial.robot == "stretch" else "goal-seeker").make(case)
+    robot = SimulatedRobot(world.case, pose)
     terminal = case.task.robot.terminal
     poses = np.empty((MAX_STEPS + 1, 3))
     carry: Carry | None = None

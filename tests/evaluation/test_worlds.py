@@ -1,4 +1,4 @@
-"""Worlds that are not as told: a run that a session once lost."""
+"""Worlds that are not as told: runs that a session once lost."""
 
 from evaluation.worlds.runs import Trial, run
 
@@ -6,5 +6,12 @@ from evaluation.worlds.runs import Trial, run
 def test_a_robot_with_another_footprint_than_told_does_not_go_round_in_a_circle():
     """It turned away from what stopped it, back, and tried again, until no time was left."""
     outcome = run(Trial("case2", "collider", "scan"), 72)
+    assert outcome.could
+    assert outcome.kept
+
+
+def test_a_robot_that_cannot_drive_backwards_does_not_get_stuck_where_walls_are_5_cm_off():
+    """Without room beside its way it drove into a corner where it only just fits on the map."""
+    outcome = run(Trial("case1", "shift", "contact", robot="trailing"), 5)
     assert outcome.could
     assert outcome.kept

@@ -407,11 +407,9 @@ def test_who_was_held_for_too_long_is_driven_on_all_the_same(uncertainty):
 
 @pytest.mark.parametrize("learn_map", [False, True])
 def test_ways_for_the_slack_are_asked_for_on_the_way_by_robots_that_may_be_inexact(learn_map):
-    uncertain, exact = (Config(learn_map=learn_map, uncertainty=u) for u in (Uncertainty(), None))
-    assert [wary(uncertain, Care(0.0, 0), Taught(), on_way).on_way for on_way in (True, False)] == [
-        True,
-        False,
-    ]
+    uncertain, exact = (shield_of(learn_map=learn_map, uncertainty=u) for u in (Uncertainty(), None))
+    found = [wary(uncertain, Care(0.0, 0), Taught(), on_way).on_way for on_way in (True, False)]
+    assert found == [True, False]
     assert not wary(exact, Care(0.0, 3), Taught(), True).on_way
 
 

@@ -12,7 +12,7 @@ from specshield.shield.caution.experience import learn
 from specshield.shield.caution.threshold import MOST_SLIPS, _in_time, chances
 from specshield.shield.episode import Config, close, decide, make_shield
 from specshield.shield.feasibility import prefix_of
-from specshield.shield.judgement import judge
+from specshield.shield.judgement import Situation, judge
 from specshield.shield.proposal import Proposal
 from specshield.shield.uncertainty import Noise, Uncertainty
 from tests.oracles.cells import WAIT, Cells, ways
@@ -49,7 +49,7 @@ def test_v_is_never_above_what_the_best_policy_has(formula, make):
         slip = vector["slip"]
         sure = care.noise._replace(lost=max(1e9 * slip, 1e-9), kept=1e9 * (1.0 - slip))  # as Storm is told it
         care = replace(care, noise=sure)
-        judged = judge(shield, prefix, None, False, care)
+        judged = judge(shield, Situation(prefix, None, "pending", care))
         found.append(
             (
                 chances(shield, care, prefix, judged, np.zeros(len(shield.task.robot.motions), bool))[:4],
@@ -108,7 +108,7 @@ def test_v_is_never_above_what_was_computed_by_hand(formula, forward, wait):
     prefix = prefix_of(cells.task, cells.task.formula, shield.view, poses, {})
     _, care = learn(shield, None, poses)
     care = replace(care, noise=care.noise._replace(lost=2e8, kept=8e8))
-    judged = judge(shield, prefix, None, False, care)
+    judged = judge(shield, Situation(prefix, None, "pending", care))
     values = chances(shield, care, prefix, judged, np.zeros(len(shield.task.robot.motions), bool))
     assert values[0] <= forward + 1e-6
     assert values[WAIT] <= wait + 1e-6
@@ -139,7 +139,7 @@ def test_being_in_time_is_as_likely_as_in_simulation(blocks, moves, waits, free,
     late at most. The rate of slips is drawn from Beta(lost, kept), once a run.
     """
     motions, size = np.array(([0] * moves + [WAIT] * waits) * blocks), moves + waits
-    due = np.array([size * (i + 1) for i in range(blocks) if each or i == blocks - 1])
+    due = [size * (i + 1) for i in range(blocks) if each or i == blocks - 1]
     random, runs, kept_runs = np.random.default_rng(0), 4000, 0
     for rate in random.beta(lost, kept, runs):
         late, in_time = 0, True
@@ -148,7 +148,7 @@ def test_being_in_time_is_as_likely_as_in_simulation(blocks, moves, waits, free,
             in_time = in_time and not (n in due and late > free)
         kept_runs += in_time
     noise, scratch = Noise(0.0, 0.0, 1.0, lost, kept), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
-    same = np.full(len(due), free), np.full(len(due), len(motions))
-    found = _in_time(noise, 0.0, True, due, *same, motions, WAIT, 0, scratch)
+    deadlines = np.array([(n, free, len(motions)) for n in due])
+    found = _in_time(noise, 0.0, True, deadlines, motions, WAIT, 0, scratch)
     share = kept_runs / runs
     assert abs(found - share) <= 3.0 * np.sqrt(max(share * (1.0 - share), 1.0 / runs) / runs) + 0.002

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from specshield.arrays import Bools, Bytes, Codes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.progress import Rules
+from specshield.policy.progress.values import fill_place, fill_signals, region_count
 from specshield.policy.shape import heading_count, side_of
 from specshield.robot.dynamics import (
     TOUCH,
@@ -30,7 +31,7 @@ from specshield.robot.dynamics import (
     swing_radius,
     unhindered,
 )
-from specshield.rule.values import HEADING, REGIONS, fill_place, fill_signals, region_count
+from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import STACK_SIZE, VALUE, Programs, evaluate_packed
 from specshield.world.regions import PackedRegions, turns_with_robot
 

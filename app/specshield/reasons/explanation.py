@@ -21,6 +21,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.reasons.lateness import in_words, late_by, samples_of, steps, values_of
 from specshield.reasons.still_open import still_open
 from specshield.robot.dynamics import motion_count, step
+from specshield.robot.room import ROOM
 from specshield.rule.residual import again, left_over
 from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix
@@ -173,8 +174,14 @@ class _Motion:
                 "the rule could still be kept, but only by what led nowhere before, or by an obstacle that "
                 "would have to stop the robot in time"
             )
+        judged, own = self.judged, self.judged.tried.motions[:, 0] == self.motion
+        if judged.tried.rho[own].max(initial=0.0) > SATISFIED_ABOVE >= judged.kept[own].max(initial=0.0):
+            return (
+                f"the rule could still be kept, but only by ways that lead closer than {ROOM:g} m to an "
+                "obstacle, where a robot that cannot drive backwards may get stuck"
+            )
         told = "a way is known that keeps the rule, but the policies did not find it"
-        margin, slack = self.judged.margin, self.judged.slack
+        margin, slack = judged.margin, judged.slack
         if not margin and not slack:
             return told
         return (

@@ -30,22 +30,12 @@ def regions_of(task: Task) -> PackedRegions:
     return pack_areas(list(task.areas.values()))
 
 
-def initial_signals(task: Task) -> Floats:
-    """The values that the signals hold before their first samples, shape (S,)."""
-    return np.array(list(task.signals.values()), np.float64)
-
-
 def signal_rows(task: Task, signals: Mapping[str, Floats], n: int) -> Floats:
     """The signals' first n samples in the order of the task, shape (n, S). signals {name: [..n]}."""
     rows = np.empty((n, len(task.signals)))
     for i, name in enumerate(task.signals):
         rows[:, i] = task.signal(name, signals, n)
     return rows
-
-
-@inlined
-def region_count(regions: PackedRegions) -> int:
-    return int(regions.starts.shape[0] - 1)
 
 
 @inlined
@@ -59,19 +49,3 @@ def fill_region(regions: PackedRegions, r: int, values: Floats) -> None:
     # The heading is not a parameter: LLVM would then take its cosine before each loop over the areas, also
     # where none of them turns with the robot, which took a third of the time in which futures are judged.
     values[REGIONS + r] = region_distance(regions, r, values[0], values[1], values[HEADING])
-
-
-@inlined
-def fill_place(regions: PackedRegions, x: float, y: float, theta: float, values: Floats) -> None:
-    """The pose and every region; the signals are left as they are."""
-    fill_pose(x, y, theta, values)
-    for r in range(region_count(regions)):
-        fill_region(regions, r, values)
-
-
-@inlined
-def fill_signals(regions: PackedRegions, signals: Floats, values: Floats) -> None:
-    """signals (S,)."""
-    first = REGIONS + region_count(regions)
-    for s in range(signals.shape[0]):
-        values[first + s] = signals[s]

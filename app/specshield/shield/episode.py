@@ -28,6 +28,7 @@ from specshield.shield.decision import Carry, Config, Decision, Explanation, Shi
 from specshield.shield.feasibility import Prefix, futures, prefix_of
 from specshield.shield.judgement import (
     Judged,
+    Situation,
     as_actions,
     feasible_mass_of,
     j_values_of,
@@ -142,7 +143,7 @@ def decide(
     chance, left = None, shield.config.threshold
     seen, care = learn(shield, carry, poses, taught.contact)
     foreseen = residual is not None and max(residual) <= SAME_POSE
-    care = wary(shield.config, care, taught, shield is not before or (foreseen and tail is not None))
+    care = wary(shield, care, taught, shield is not before or (foreseen and tail is not None))
     prefix = prefix_of(task, task.formula, shield.view, poses, signals)
     spec_status = verdict_between(prefix.low, prefix.high)
     asked = SATISFIED_ABOVE + care.margin
@@ -153,14 +154,16 @@ def decide(
         judged = None
         answer = unmodified(shield, log_prior)
     else:
-        shield, prefix, judged, withstands = judged_by_signals(shield, prefix, tail, spec_status, care)
-        believed = tried_again(told, taught, judged, prefix, tail, spec_status, care)
+        now = Situation(prefix, tail, spec_status, care)
+        shield, now, judged, withstands = judged_by_signals(shield, now)
+        believed = tried_again(told, taught, judged, now)
         if believed is not None:
-            taught, (shield, prefix, judged, withstands) = believed
+            taught, (shield, now, judged, withstands) = believed
             said = (*said, "no other way was left, so what was run into is tried again")
             touches = _look_around(shield.body, poses[-1], nexts)
+        prefix = now.prefix
         doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)
-        judged = recovered(told, shield, taught, judged, prefix, tail, spec_status, care)
+        judged = recovered(told, shield, taught, judged, now)
         judged = without(judged, shield, doubts, risky)
         if judged.vain and judged.some:
             said = (

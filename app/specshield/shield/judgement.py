@@ -13,6 +13,7 @@ from specshield.arrays import Bools, Bytes, Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.quick import quick
 from specshield.robot.barred import in_vain
+from specshield.robot.room import has_room, widened
 from specshield.rule.residual import again, joined, left_over
 from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
@@ -22,9 +23,24 @@ from specshield.shield.feasibility import Best, Futures, Prefix, best_of, future
 from specshield.shield.proposal import adapted, ask
 from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
-from specshield.stl import SATISFIED_ABOVE, Always, Formula, robustness
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict, robustness
 
 LESS = 4  # [steps] of slack, down to which V has ways asked for. Chosen by hand.
+
+
+@quick
+@dataclass(frozen=True)
+class Situation:
+    """What the actions at one step are judged by.
+
+    prefix: as the whole formula sees it. tail: the witness that the robot follows, one motion a byte. status:
+    what the prefix decides. care: what J asks for beyond satisfaction.
+    """
+
+    prefix: Prefix
+    tail: bytes | None
+    status: Verdict
+    care: Care
 
 
 @quick
@@ -53,13 +69,14 @@ class Judged:
         return True in self.feasible.tolist()
 
 
-def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, care: Care) -> Judged:
-    """Tries the futures from x_t, and judges each motion by the best of its futures.
-
-    prefix: as the whole formula sees it; tail: the witness the robot follows, one motion a byte; violated:
-    whether the prefix decides so; care: what J asks for beyond satisfaction.
-    """
-    robot, asked = shield.task.robot, care.margin
+def judge(shield: Shield, now: Situation) -> Judged:
+    """Tries the futures from x_t, and judges each motion by the best of its futures."""
+    prefix, tail, care, violated = now.prefix, now.tail, now.care, now.status == "violated"
+    robot, asked, roomy = shield.task.robot, care.margin, care.room and not violated
+    if roomy:
+        both = ((each, adapted(each, "keeping_clear")) for each in shield.proposers)
+        clear = tuple(policy for each, policy in both if policy is not each)
+        shield = replace(shield, proposers=(*shield.proposers, *clear))
     motions = len(robot.motions)
     tried = futures(prefix, shield.body, shield.proposers, tail, (asked, 0.0))
     kept, leaves = tried.rho, tried.leaves
@@ -75,6 +92,11 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
             without_it = best_of(tried, others, motions)
             left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
             kept, best = others, without_it
+    if roomy:
+        apart = _with_room(shield, prefix, tried, kept)
+        roomy = apart.max() > SATISFIED_ABOVE
+        kept = apart if roomy else kept
+        best = best_of(tried, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and _some(best)):
@@ -92,6 +114,7 @@ def judge(shield: Shield, prefix: Prefix, tail: bytes | None, violated: bool, ca
                 kept = tried.rho
                 if care.barred is not None and not vain:
                     kept = _aside(shield, care.barred, prefix, tried, kept)
+                kept = _with_room(shield, prefix, tried, kept) if roomy else kept
                 aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, aimed)
                 values = best_of(tried, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
@@ -114,6 +137,12 @@ def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept:
     whole = any(hasattr(proposer, "avoiding") for proposer in shield.proposers)
     goes = in_vain(barred, prefix.poses[-1], tried.motions, tried.poses, whole)
     return np.where(goes, -np.inf, kept)
+
+
+def _with_room(shield: Shield, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:
+    """`kept` [N], and -inf for the futures that come too near to something for a larger robot."""
+    room = has_room(widened(shield.body), prefix.poses[-1], tried.motions, tried.poses)
+    return np.where(room, kept, -np.inf)
 
 
 def _in_time(

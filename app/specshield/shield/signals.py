@@ -16,24 +16,22 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Prefix, prefix_of
-from specshield.shield.judgement import Judged, judge
+from specshield.shield.feasibility import prefix_of
+from specshield.shield.judgement import Judged, Situation, judge
 from specshield.shield.proposal import adapted
 from specshield.shield.uncertainty import Care
-from specshield.stl import SATISFIED_ABOVE, Verdict
+from specshield.stl import SATISFIED_ABOVE
 
 
-def judged_by_signals(
-    shield: Shield, prefix: Prefix, tail: bytes | None, status: Verdict, care: Care
-) -> tuple[Shield, Prefix, Judged, bool]:
-    """What the futures say of each action, the shield and the prefix as they were judged, and whether what is
-    feasible is so whatever the signals do. Where nothing is, they are taken to stay as they are.
+def judged_by_signals(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged, bool]:
+    """What the futures say of each action, the shield and the situation as they were judged, and whether
+    what is feasible is so whatever the signals do. Where nothing is, they are taken to stay as they are.
     """
-    if shield.config.any_signal and status == "pending":
-        found = _judged_at_worst(shield, prefix, tail, care)
+    if shield.config.any_signal and now.status == "pending":
+        found = _judged_at_worst(shield, now)
         if found is not None:
             return *found, True
-    return shield, prefix, judge(shield, prefix, tail, status == "violated", care), False
+    return shield, now, judge(shield, now), False
 
 
 def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | None = None) -> bool | None:
@@ -55,17 +53,15 @@ def any_signal(shield: Shield, poses: Floats, signals: Mapping[str, Floats] | No
     prefix = prefix_of(task, task.formula, shield.view, poses, seen)
     if prefix.low > SATISFIED_ABOVE or prefix.high <= SATISFIED_ABOVE or prefix.steps <= 0:
         return prefix.low > SATISFIED_ABOVE
-    return _judged_at_worst(shield, prefix, None, Care(0.0, 0)) is not None
+    return _judged_at_worst(shield, Situation(prefix, None, "pending", Care(0.0, 0))) is not None
 
 
-def _judged_at_worst(
-    shield: Shield, prefix: Prefix, tail: bytes | None, care: Care
-) -> tuple[Shield, Prefix, Judged] | None:
+def _judged_at_worst(shield: Shield, now: Situation) -> tuple[Shield, Situation, Judged] | None:
     """None where no action is feasible. A proposer that has `foreseeing` plans for the signals at worst."""
     held = worst_signals(shield.task)
     if held is None:
         return None
     proposers = tuple(adapted(p, "foreseeing", held[0]) for p in shield.proposers)
-    shield, prefix = replace(shield, proposers=proposers), replace(prefix, held=held)
-    judged = judge(shield, prefix, tail, False, care)
-    return (shield, prefix, judged) if judged.some else None
+    shield, now = replace(shield, proposers=proposers), replace(now, prefix=replace(now.prefix, held=held))
+    judged = judge(shield, now)
+    return (shield, now, judged) if judged.some else None

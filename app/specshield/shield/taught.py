@@ -22,8 +22,9 @@ from specshield.compiled import kernel, leaf
 from specshield.quick import quick
 from specshield.robot.barred import NOTHING_BARRED, is_barred
 from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
+from specshield.robot.room import goes_back
 from specshield.shield.caution.experience import SELDOM, chance_of, was_stopped, went_on, within_noise
-from specshield.shield.decision import Carry, Config, Shield, Stuck
+from specshield.shield.decision import Carry, Shield, Stuck
 from specshield.shield.feasibility import Prefix
 from specshield.shield.proposal import adapted
 from specshield.shield.surprise.contact import (
@@ -192,15 +193,16 @@ def _goes_as_told(body: Body, before: Floats, foreseen: Floats, after: Floats) -
     return not half and not whole
 
 
-def wary(config: Config, care: Care, taught: Taught, on_way: bool) -> Care:
-    """What J asks for where the map may be wrong: time for a way around, and not by what led nowhere. on_way:
-    as `Care` has it.
+def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
+    """What J asks for where the map may be wrong: time for a way around, room beside it, and not by what led
+    nowhere. on_way: as `Care` has it.
     """
+    config, room = shield.config, False
     least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
     if config.learn_map and config.uncertainty is not None:
-        least = max(least, AROUND)
+        least, room = max(least, AROUND), not goes_back(shield.body)
     on_way = on_way and config.uncertainty is not None
-    return Care(care.margin, least, care.noise, care.stride, care.chance, barred, on_way)
+    return Care(care.margin, least, care.noise, care.stride, care.chance, barred, on_way, room)
 
 
 def changes_map(learned: bytes | None) -> bool:

@@ -81,6 +81,7 @@ class Care:
     stride: the robot's longest move [m]. chance: that the slack of one deadline does not suffice. barred
     [n, 6]: what no future goes by where another keeps the rule (robot/barred.py); None where nothing is.
     on_way: whether the robot is where the last answer had it, on a way that keeps what was asked for then.
+    room: whether to go where a larger robot could too, where another future with room keeps the rule.
     """
 
     margin: float
@@ -90,6 +91,7 @@ class Care:
     chance: float = CHANCE
     barred: Floats | None = None
     on_way: bool = False
+    room: bool = False
 
     @property
     def has_slack(self) -> bool:

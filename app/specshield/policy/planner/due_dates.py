@@ -15,7 +15,7 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.compiled import kernel, leaf
 from specshield.policy.planner.literals import LAST, PREDICATE, SIDE, PackedLiterals
-from specshield.rule.values import fill_place
+from specshield.policy.progress.values import fill_place
 from specshield.stl.program import evaluate_packed
 from specshield.stl.tree import tree_bounds
 

@@ -12,9 +12,10 @@ from specshield.policy.planner.due_dates import foresee, is_open, make_bounds, r
 from specshield.policy.planner.exact import search_exactly
 from specshield.policy.planner.search import MAX_DEPTH, Nodes, search, value
 from specshield.policy.planner.way import Way, World, move, read_at, stay
+from specshield.policy.progress.values import fill_signals, region_count
 from specshield.policy.undo import IMPOSSIBLE, undo_motion
 from specshield.robot.dynamics import motion_count
-from specshield.rule.values import REGIONS, fill_signals, region_count
+from specshield.rule.values import REGIONS
 from specshield.stl.program import STACK_SIZE
 
 # The share of one plan's effort that a first motion may cost which the plan does not begin with; chosen by

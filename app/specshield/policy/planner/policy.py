@@ -41,12 +41,13 @@ from specshield.policy.planner.literals import Literal, PackedLiterals, literals
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
 from specshield.policy.progress.recall import residuals
+from specshield.policy.progress.values import initial_signals
 from specshield.policy.reachability.sight import BESIDE, about
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turns_in_place
-from specshield.rule.values import REGIONS, initial_signals, places, regions_of, signal_rows
+from specshield.rule.values import REGIONS, places, regions_of, signal_rows
 from specshield.rule.view import look
 from specshield.rule.worst import worst_signals
 from specshield.shield.proposal import Proposal, joined

@@ -14,7 +14,8 @@ from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.errors import FragmentError
 from specshield.policy.progress.obligations import obligations
-from specshield.rule.values import REGIONS, fill_place, fill_signals, initial_signals, places, regions_of
+from specshield.policy.progress.values import fill_place, fill_signals, initial_signals
+from specshield.rule.values import REGIONS, places, regions_of
 from specshield.stl.program import STACK_SIZE, Programs, compile_predicates, evaluate_packed
 from specshield.task import Task
 from specshield.world.regions import PackedRegions

@@ -18,8 +18,9 @@ from specshield.policy.progress import (
     value_count,
 )
 from specshield.policy.progress.recall import recall
+from specshield.policy.progress.values import region_count
 from specshield.policy.reachability.tables import Guide, Scratch, Tables, goals_settled, slack
-from specshield.rule.values import REGIONS, fill_pose, fill_region, region_count
+from specshield.rule.values import REGIONS, fill_pose, fill_region
 from specshield.stl.program import VALUE, evaluate_packed
 
 # [steps] of slack: how late an earlier deadline may seem for a way to be looked for. Of 8,200 first motions

@@ -22,6 +22,7 @@ from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattic
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.progress import Rules, make_rules
 from specshield.policy.progress.recall import pasts
+from specshield.policy.progress.values import initial_signals
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import HURRIED, hurried, share_with_slack
@@ -36,7 +37,8 @@ from specshield.policy.reachability.tables import Guide, Tables
 from specshield.policy.shape import lattice_shape
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, make_body, simulate
-from specshield.rule.values import initial_signals, signal_rows
+from specshield.robot.room import goes_back, widened
+from specshield.rule.values import signal_rows
 from specshield.rule.view import look, rate, view_of
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE
@@ -53,12 +55,14 @@ FINE_ENTRIES = 1_000_000  # a lattice three times finer is used where it needs n
 class ReachabilityPolicy(Carded):
     """Proposes what the tables (tables.py) lead to (search.py).
 
-    narrow [K]: the obligations whose predicates the lattice can hardly see (sight.py).
+    narrow [K]: the obligations whose predicates the lattice can hardly see (sight.py). wide: the tables for
+    ways with room beside them (robot/room.py), None for a robot that goes back.
     """
 
     settings: Settings
     tables: Tables
     narrow: Bools
+    wide: Tables | None = None
     told: bool = True  # whether the tables were made for the map that the policy goes by
     guess: bool = False  # whether that is one of several maps that one decision tries
     barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
@@ -87,6 +91,14 @@ class ReachabilityPolicy(Carded):
         """
         return self._but(self._body, early=steps, wanted=wanted)
 
+    def keeping_clear(self) -> ReachabilityPolicy:
+        """The policy for ways with room beside them (robot/room.py)."""
+        return self._with_room
+
+    @cached_property
+    def _with_room(self) -> ReachabilityPolicy:
+        return self if self.wide is None else self._but(widened(self._body), tables=self.wide)
+
     def _but(self, body: Body, **changed: Any) -> ReachabilityPolicy:
         """The policy with these fields changed, on this map."""
         other = replace(self, **changed)
@@ -104,7 +116,7 @@ class ReachabilityPolicy(Carded):
 
     @property
     def _fields(self) -> Floats:
-        found = next((fields for body, fields in list(self._far) if body is self._body), None)
+        found = next((fields for body, fields in list(self._far) if _is_same(body, self._body)), None)
         if found is None:
             found = distances(self._body, self._goals)
             self._far.append((self._body, found))
@@ -120,7 +132,7 @@ class ReachabilityPolicy(Carded):
     def remade(self, grid: OccupancyGrid) -> ReachabilityPolicy:
         """The policy with tables for another map of the same size."""
         made = synthesise(replace(self.task, grid=grid), self.settings)
-        return replace(self, tables=made.tables, narrow=made.narrow)
+        return replace(self, tables=made.tables, narrow=made.narrow, wide=made.wide)
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A continuation after each first motion."""
@@ -172,7 +184,7 @@ class ReachabilityPolicy(Carded):
 
     def weights(self) -> bytes:
         """The safetensors file."""
-        return stored(self.tables, self.narrow, self.settings.pitch)
+        return stored(self.tables, self.wide, self.narrow, self.settings.pitch)
 
     def feasible_start(self) -> float:
         """The share of poses drawn over free space (the same each time) from which the rule can be kept.
@@ -205,6 +217,11 @@ class ReachabilityPolicy(Carded):
         return bool(rho.max() > SATISFIED_ABOVE)
 
 
+def _is_same(one: Body, other: Body) -> bool:
+    """Whether two bodies are of one robot on one map."""
+    return one.clearance is other.clearance and one.radius == other.radius
+
+
 def synthesise(
     task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
 ) -> ReachabilityPolicy:
@@ -215,31 +232,35 @@ def synthesise(
     settings = settings or Settings()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     pitch, cells = _extent(task, body, rules, settings)
-    lattice = make_lattice(body, pitch, cells)
-    holds, narrow = look_closely(body, rules, lattice, holds_at(body, rules, lattice))
-    if task.robot.wait_motion < 0:
-        cell = number_cells(np.any(lattice.valid, axis=2))
-        bits = feasible_steps(lattice, rules, holds, task.horizon, cell)
-        tables = step_tables(rules, task.horizon, cell, bits, pitch)
-    else:
-        masks, phases = masks_of(rules), phases_of(rules, task.horizon)
-        latest, valid = latest_times(lattice, rules, holds, masks, phases)
-        tables = pack_times(latest, valid, masks, phases, rules, pitch)
-    policy = ReachabilityPolicy(task, {}, settings, tables, narrow)
+    tables, narrow = _tables(task, body, rules, pitch, cells)
+    wide = None if goes_back(body) else _tables(task, widened(body), rules, pitch, cells)[0]
+    policy = ReachabilityPolicy(task, {}, settings, tables, narrow, wide)
     metrics = {
         "feasible_start": round(policy.feasible_start(), 4),
-        "size_bytes": int(tables.code.nbytes + tables.bits.nbytes + tables.cell.nbytes),
+        "size_bytes": sum(t.code.nbytes + t.bits.nbytes + t.cell.nbytes for t in (tables, wide) if t),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
     card = make_card(task, "reachability", options_to_json(settings), 0, metrics, spec)
     return replace(policy, card=card)
 
 
+def _tables(task: Task, body: Body, rules: Rules, pitch: float, cells: Bools | None) -> tuple[Tables, Bools]:
+    """The tables for a body; the obligations they hardly see [K]. pitch, cells: as `_extent` has them."""
+    lattice = make_lattice(body, pitch, cells)
+    holds, narrow = look_closely(body, rules, lattice, holds_at(body, rules, lattice))
+    if task.robot.wait_motion < 0:
+        cell = number_cells(np.any(lattice.valid, axis=2))
+        bits = feasible_steps(lattice, rules, holds, task.horizon, cell)
+        return step_tables(rules, task.horizon, cell, bits, pitch), narrow
+    masks, phases = masks_of(rules), phases_of(rules, task.horizon)
+    latest, valid = latest_times(lattice, rules, holds, masks, phases)
+    return pack_times(latest, valid, masks, phases, rules, pitch), narrow
+
+
 def load_reachability(weights: bytes | Path, card: Card, task: Task) -> ReachabilityPolicy:
     """A policy from its two files. Raises PolicyError where they do not fit the task."""
     settings = read_options(Settings, card.get("options", {}))
-    tables, narrow = read_tables(weights, task, settings.pitch)
-    return ReachabilityPolicy(task, card, settings, tables, narrow)
+    return ReachabilityPolicy(task, card, settings, *read_tables(weights, task, settings.pitch))
 
 
 def check(task: Task, settings: Settings) -> None:

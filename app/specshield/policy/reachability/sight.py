@@ -18,8 +18,9 @@ from specshield.arrays import Bools, Bytes, Floats
 from specshield.compiled import kernel
 from specshield.policy.lattice import Lattice, pose_of
 from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, value_count
+from specshield.policy.progress.values import region_count
 from specshield.robot.dynamics import Body
-from specshield.rule.values import HEADING, REGIONS, region_count
+from specshield.rule.values import HEADING, REGIONS
 from specshield.stl.program import VALUE
 
 # Chosen by hand. A crossing is at most 0.71 cells from any place.

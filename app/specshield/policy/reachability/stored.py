@@ -13,7 +13,7 @@ from safetensors.numpy import save as save_tensors
 from specshield.arrays import Bools, Int32s
 from specshield.errors import PolicyError
 from specshield.policy.extent import COARSEST
-from specshield.policy.progress import goals_of, make_rules
+from specshield.policy.progress import Rules, goals_of, make_rules
 from specshield.policy.reachability.latest import phases_of, time_tables
 from specshield.policy.reachability.stepwise import state_count, step_tables
 from specshield.policy.reachability.tables import Tables
@@ -21,11 +21,15 @@ from specshield.policy.shape import MAX_HEADINGS, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.task import Task
 
+WIDE = "wide_"  # begins the names of the arrays of the tables for ways with room
 
-def stored(tables: Tables, narrow: Bools, asked: float) -> bytes:
-    """The file. narrow [K] as a policy has it; asked: the pitch that its options ask for [m]."""
+
+def stored(tables: Tables, wide: Tables | None, narrow: Bools, asked: float) -> bytes:
+    """The file. wide, narrow [K] as a policy has them; asked: the pitch that its options ask for [m]."""
     names = ("cell", "bits") if len(tables.bits) else ("cell", "code", "table")
     tensors: dict[str, NDArray[Any]] = {name: getattr(tables, name) for name in names}
+    if wide is not None:
+        tensors |= {WIDE + name: getattr(wide, name) for name in names}
     if narrow.any():
         tensors["narrow"] = narrow.astype(np.uint8)
     if tables.pitch > asked:
@@ -33,18 +37,26 @@ def stored(tables: Tables, narrow: Bools, asked: float) -> bytes:
     return save_tensors(tensors)
 
 
-def read_tables(weights: bytes | Path, task: Task, asked: float) -> tuple[Tables, Bools]:
-    """What `stored` wrote, `asked` for the same pitch. Raises PolicyError where it does not fit the task."""
-    rules = make_rules(task)
-    sets, tensors = 1 << len(goals_of(rules)), read_tensors(weights)
+def read_tables(weights: bytes | Path, task: Task, asked: float) -> tuple[Tables, Bools, Tables | None]:
+    """What `stored` wrote: tables, narrow and wide; `asked` for the same pitch. Raises PolicyError where it
+    does not fit the task.
+    """
+    rules, tensors = make_rules(task), read_tensors(weights)
+    wide = {name[len(WIDE) :]: tensors.pop(name) for name in list(tensors) if name.startswith(WIDE)}
     narrow = _narrow_of(tensors.pop("narrow", None), len(rules.kind))
     pitch = _pitch_of(tensors, task, asked)
+    tables = _tables_of(tensors, task, rules, pitch)
+    return tables, narrow, _tables_of(wide, task, rules, pitch) if wide else None
+
+
+def _tables_of(tensors: dict[str, NDArray[Any]], task: Task, rules: Rules, pitch: float) -> Tables:
+    sets = 1 << len(goals_of(rules))
     if task.robot.wait_motion < 0:
         cell, bits = named_arrays(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
         headings = _checked_headings(bits.shape[2])
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
         _check_fit(cell, side_of(task.grid, pitch), bits.shape[1], bits.shape == size, f"bits {list(size)}")
-        return step_tables(rules, task.horizon, cell, bits, pitch), narrow
+        return step_tables(rules, task.horizon, cell, bits, pitch)
     cell, code, table = named_arrays(
         tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
     )
@@ -52,7 +64,7 @@ def read_tables(weights: bytes | Path, task: Task, asked: float) -> tuple[Tables
     fits = table.shape == (len(phases), sets) and table.min() >= -1 and table.max() < code.shape[0]
     wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {sets}]"
     _check_fit(cell, side_of(task.grid, pitch), code.shape[1], fits, wanted)
-    return time_tables(rules, phases, cell, code, table, pitch), narrow
+    return time_tables(rules, phases, cell, code, table, pitch)
 
 
 def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, asked: float) -> float:

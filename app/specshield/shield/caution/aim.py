@@ -8,6 +8,7 @@ to the most steps with which the margin can be had, and then the margin.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,28 +61,12 @@ def aim(
     if formula is not prefix.formula:  # it is written as a plain conjunction, and may have other leaves
         prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried)
-    asked = np.zeros(len(parts.kind), np.int64)
-    still = np.empty(len(asked), np.bool_)
-    next_due, high = _ask(
-        parts, prefix.known, prefix.t, care.noise, care.stride, care.least, care.chance, still, asked
-    )
+    still = Open(parts, np.empty(len(parts.kind), np.bool_), np.zeros(len(parts.kind), np.int64), prefix.t)
+    next_due, high = _ask(still, prefix.known, care.noise, care.stride, care.least, care.chance)
 
     def at(most: int) -> tuple[Best, bool]:
         rows, robustness = np.empty(motions, np.int64), np.empty(motions)
-        highest = _best_open(
-            parts,
-            still,
-            prefix.t,
-            asked,
-            most,
-            leaves,
-            whole,
-            tried.motions,
-            follows,
-            margin,
-            rows,
-            robustness,
-        )
+        highest = _best_open(still, most, leaves, whole, tried.motions, follows, margin, rows, robustness)
         return Best(robustness, rows), highest > margin
 
     motions = len(task.robot.motions)
@@ -109,21 +94,21 @@ def aim(
     return Aimed(best, best.robustness > margin, care.margin, slack, lowered, low)
 
 
+class Open(NamedTuple):
+    """The conjuncts at step t: which are still open (K,), and how early each F is asked for (K,) [steps]."""
+
+    parts: Conjuncts
+    still: Bools
+    asked: Ints
+    t: int
+
+
 @kernel
-def _ask(
-    parts: Conjuncts,
-    known: Floats,
-    t: int,
-    noise: Noise,
-    stride: float,
-    least: int,
-    chance: float,
-    still: Bools,
-    asked: Ints,
-) -> tuple[int, int]:
-    """Writes which conjuncts (K,) are open, and how many steps early each F of them is asked for. The steps
-    of the F whose deadline is next, and the most of any. A window keeps at least half its length.
+def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chance: float) -> tuple[int, int]:
+    """Fills `now`, whose `asked` is 0. The steps of the F whose deadline is next, and the most of any. A
+    window keeps at least half its length.
     """
+    parts, still, asked, t = now
     find_open(parts, known, t, still)
     soonest, first = -1, 0
     for k in range(still.shape[0]):
@@ -138,10 +123,7 @@ def _ask(
 
 @kernel
 def _best_open(
-    parts: Conjuncts,
-    still: Bools,
-    t: int,
-    asked: Ints,
+    now: Open,
     most: int,
     leaves: Floats,
     whole: Floats,
@@ -157,7 +139,7 @@ def _best_open(
     be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
     """
     rho, stays = np.empty(whole.shape[0]), -1
-    rate_open(parts, still, t, np.minimum(asked, most), leaves, rho)
+    rate_open(now.parts, now.still, now.t, np.minimum(now.asked, most), leaves, rho)
     rows[:] = -1
     robustness[:] = -np.inf
     for f in range(whole.shape[0]):

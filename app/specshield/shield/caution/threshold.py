@@ -54,7 +54,6 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     later = still & (parts.kind == ALWAYS) & (begins > prefix.t)
     if later.any() and (noise.slips > 0.0 or noise.move > 0.0 or noise.turn > 0.0):
         parts, leaves = _from_now_on(parts, leaves, prefix, tried)
-    sigma = math.hypot(noise.move, care.stride * noise.turn)
     _chances(
         parts,
         begins,
@@ -62,7 +61,6 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         prefix.t,
         noise,
         care.stride,
-        sigma,
         care.margin,
         leaves,
         tried.rho,
@@ -109,7 +107,6 @@ def _chances(
     t: int,
     noise: Noise,
     stride: float,
-    sigma: float,
     margin: float,
     leaves: Floats,
     rho: Floats,
@@ -121,8 +118,9 @@ def _chances(
     of each conjunct's window; a G of `parts` may begin before it.
     """
     count, spread = still.shape[0], spread_of(noise, stride)
+    sigma = math.hypot(noise.move, stride * noise.turn)
     buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
-    due, free, within = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
+    due = np.empty((count, 3), np.int64)
     for f in range(rho.shape[0]):
         if not rho[f] > SATISFIED_ABOVE:
             continue
@@ -130,12 +128,12 @@ def _chances(
         tree_value(parts.below, buffer)
         chance, dwells = 1.0, 0
         for k in range(count):
-            due[k] = 0
+            due[k, 0] = 0
             if not still[k]:
                 continue
-            due[k], free[k], within[k] = _deadline(parts, begins[k], k, t, margin, buffer)
+            due[k, 0], due[k, 1], due[k, 2] = _deadline(parts, begins[k], k, t, margin, buffer)
             if parts.kind[k] == EVENTUALLY and parts.horizon[k] > 0:
-                dwells = max(dwells, due[k])
+                dwells = max(dwells, due[k, 0])
             if not parts.plain[k] and (noise.slips > 0.0 or spread > 0.0):
                 chance = 0.0
             if sigma > 0.0 and parts.kind[k] == ALWAYS:
@@ -143,8 +141,8 @@ def _chances(
                     deep = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
                     chance *= 1.0 - math.exp(-0.5 * (deep / sigma) ** 2)
         if chance > 0.0 and (noise.slips > 0.0 or spread > 0.0):
-            never = _in_time(noise, spread, False, due, free, within, motions[f], wait, dwells, late)
-            slips = _in_time(noise, spread, True, due, free, within, motions[f], wait, dwells, late)
+            never = _in_time(noise, spread, False, due, motions[f], wait, dwells, late)
+            slips = _in_time(noise, spread, True, due, motions[f], wait, dwells, late)
             chance *= (1.0 - noise.slips) * never + noise.slips * slips
         values[motions[f, 0]] = max(values[motions[f, 0]], chance)
 
@@ -181,20 +179,11 @@ def _deadline(
 
 @leaf
 def _in_time(
-    noise: Noise,
-    spread: float,
-    slips: bool,
-    due: Ints,
-    free: Ints,
-    within: Ints,
-    motions: Ints,
-    wait: int,
-    dwells: int,
-    late: Floats,
+    noise: Noise, spread: float, slips: bool, due: Ints, motions: Ints, wait: int, dwells: int, late: Floats
 ) -> float:
     """The probability that a robot which keeps to a future's motions (T - t,) is in time for all that is due.
 
-    due, free, within (K,): of `_deadline`. slips: whether motions slip. dwells: no wait among the first so
+    due (K, 3): of `_deadline`. slips: whether motions slip. dwells: no wait among the first so
     many motions is left out. late (MOST_SLIPS + 1, MOST_SLIPS + 2): scratch; how likely it is that so many
     motions slipped, and the robot is so many steps late and was in time for all that was due before. It
     repeats what was not executed, and leaves out waits where it is late. More slips, and what is less likely
@@ -202,7 +191,7 @@ def _in_time(
     """
     last, made, top = 0, 0, 0  # top: the most slips that are likely
     for c in range(due.shape[0]):
-        last = max(last, due[c])
+        last = max(last, due[c, 0])
     late[0, :] = 0.0
     late[0, 0] = 1.0
     for n in range(1, last + 1):
@@ -229,10 +218,10 @@ def _in_time(
                 s += 1
             made += 1
         for c in range(due.shape[0]):
-            if due[c] == n:
+            if due[c, 0] == n:
                 for s in range(top + 1):
                     for k in range(s + 1):
-                        late[s, k] *= 1.0 - above(free[c] - k, spread * math.sqrt(within[c]))
+                        late[s, k] *= 1.0 - above(due[c, 1] - k, spread * math.sqrt(due[c, 2]))
     sure = 0.0
     for s in range(top + 1):
         for k in range(s + 1):

@@ -12,13 +12,11 @@ import numpy as np
 
 from specshield.robot.dynamics import step
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Futures, Prefix, futures
-from specshield.shield.judgement import Judged
+from specshield.shield.feasibility import Futures, futures
+from specshield.shield.judgement import Judged, Situation
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.recovery import most_kept, recovers
 from specshield.shield.taught import Taught, on_map
-from specshield.shield.uncertainty import Care
-from specshield.stl import Verdict
 from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
@@ -26,14 +24,8 @@ DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else
 
 
 def tried_again(
-    told: Shield,
-    taught: Taught,
-    judged: Judged,
-    prefix: Prefix,
-    tail: bytes | None,
-    status: Verdict,
-    care: Care,
-) -> tuple[Taught, tuple[Shield, Prefix, Judged, bool]] | None:
+    told: Shield, taught: Taught, judged: Judged, now: Situation
+) -> tuple[Taught, tuple[Shield, Situation, Judged, bool]] | None:
     """The first guess that leaves a way without what was tried in vain, else, where all the marks leave none,
     the first that leaves any, and how it was judged. None where no guess is needed, or none leaves a way.
     told: the shield on the policy's map; judged: where all the marks are believed.
@@ -41,9 +33,9 @@ def tried_again(
     if judged.some and not judged.vain:
         return None
     vain = None
-    for guess in doubted(taught, prefix.t):
+    for guess in doubted(taught, now.prefix.t):
         other = on_map(told, guess.map, True, taught.barred)
-        found = judged_by_signals(other, prefix, tail, status, care)
+        found = judged_by_signals(other, now)
         if found[2].some and not found[2].vain:
             return guess, found
         if found[2].some and vain is None and not judged.some:
@@ -72,16 +64,7 @@ def doubted(taught: Taught, t: int) -> Iterator[Taught]:
         yield replace(taught, map=revised(known, forget(known, ~(seen | young))))
 
 
-def recovered(
-    told: Shield,
-    shield: Shield,
-    taught: Taught,
-    judged: Judged,
-    prefix: Prefix,
-    tail: bytes | None,
-    status: Verdict,
-    care: Care,
-) -> Judged:
+def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now: Situation) -> Judged:
     """Where no motion is feasible, what keeps most of the rule, and what that gives up, in words. If what is
     in the way may go again, it is waited for, as long as that gives up no more. Where no future is better
     than to stand for ever, contacts and what led nowhere are set aside: they may be why.
@@ -92,13 +75,13 @@ def recovered(
         return judged
     tried = judged.tried
     first, lost, said, helps = most_kept(shield, judged.part, tried)
-    awaited = _awaited(told, shield, taught, prefix, tail, status, care)
+    awaited = _awaited(told, shield, taught, now)
     if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
     elif not helps:  # what is believed of contacts may be why
         known = taught.map
         free = on_map(told, revised(known, forget(known, known.occupied & (known.by != SENT))))
-        ways = futures(prefix, free.body, free.proposers, None, (0.0,))
+        ways = futures(now.prefix, free.body, free.proposers, None, (0.0,))
         first, _, lacks, helps = most_kept(free, judged.part, ways)
         first = first if helps else ways.preferred
         said = ("what was marked after contacts leaves no way, so it is ignored for this action", *lacks)
@@ -114,15 +97,7 @@ def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
     return replace(tried, motions=motions, poses=np.empty((len(motions), *tried.poses.shape[1:])))
 
 
-def _awaited(
-    told: Shield,
-    shield: Shield,
-    taught: Taught,
-    prefix: Prefix,
-    tail: bytes | None,
-    status: Verdict,
-    care: Care,
-) -> int | None:
+def _awaited(told: Shield, shield: Shield, taught: Taught, now: Situation) -> int | None:
     """The first motion of the way that there would be if all that came in the way were gone; the one that
     waits where something known hinders that motion. None where there is no such way, or no such motion.
     """
@@ -130,9 +105,9 @@ def _awaited(
     if not known.occupied.any() or wait < 0:
         return None
     gone = on_map(told, revised(known, forget(known, known.occupied)), True, taught.barred)
-    gone, _, judged, _ = judged_by_signals(gone, prefix, tail, status, care)
+    gone, _, judged, _ = judged_by_signals(gone, now)
     if not judged.some or judged.vain:
         return None
-    motion, (x, y, theta) = int(told.task.robot.motion_of[judged.completion]), prefix.poses[-1]
+    motion, (x, y, theta) = int(told.task.robot.motion_of[judged.completion]), now.prefix.poses[-1]
     ends = [step(body, x, y, theta, motion) for body in (gone.body, shield.body)]
     return motion if ends[0] == ends[1] else wait
