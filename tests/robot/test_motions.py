@@ -16,7 +16,7 @@ from specshield.robot.dynamics import (
     make_body,
     motion_count,
     swing_radius,
-    turns_in_place,
+    turning_motion,
 )
 from specshield.world.occupancy import OccupancyGrid
 
@@ -64,8 +64,8 @@ def test_which_motion_stands_still_or_comes_nearest():
 
 
 def test_which_robots_turn_in_place():
-    assert turns_in_place(body_of(GO, LEFT))
-    assert not turns_in_place(body_of(GO, ARC, WAIT))
+    assert turning_motion(body_of(GO, LEFT)) == 1
+    assert turning_motion(body_of(GO, ARC, WAIT)) == -1
 
 
 def test_a_turn_by_an_angle_does_nothing_else():

@@ -86,9 +86,13 @@ def swing_radius(body: Body) -> float:
     return float(body.radius + math.hypot(body.offset_x, body.offset_y))
 
 
-def turns_in_place(body: Body) -> bool:
-    """Whether some motion turns the robot and leaves it where it is."""
-    return bool(np.any((body.translate == 0.0) & (body.rotate != 0.0)))
+@leaf
+def turning_motion(body: Body) -> int:
+    """The first motion that turns the robot and leaves it where it is, -1 where there is none."""
+    for motion in range(body.translate.shape[0]):
+        if body.translate[motion] == 0.0 and body.rotate[motion] != 0.0:
+            return motion
+    return -1
 
 
 def calmest_motion(body: Body) -> int:

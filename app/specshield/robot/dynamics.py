@@ -10,7 +10,7 @@ its dynamics knows what each of them does. A dynamics offers:
     free_distance, swing_radius    how much room a place has, and how much the robot needs to turn there
     motion_count, displacement,    how many motions there are, where they lead from, and how far
     displacements, longest_motions
-    turns_in_place, calmest_motion whether it can turn on the spot, and what comes nearest to standing still
+    turning_motion, calmest_motion what turns it on the spot, and what comes nearest to standing still
 
 Which motions take another one back (policy/undo.py) follows from the displacements.
 
@@ -27,7 +27,7 @@ from specshield.robot.body import (
     make_body,
     motion_count,
     swing_radius,
-    turns_in_place,
+    turning_motion,
     wrap,
 )
 from specshield.robot.contact import TOUCH, free_distance, in_collision, overlap

@@ -109,22 +109,26 @@ WEST = {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 3.0]}
 EAST = {"type": "rectangle", "min": [3.0, 1.0], "max": [3.9, 2.0]}
 
 
-def two_rooms(formula):
+RESTLESS = replace(STRETCH, name="restless", actions=STRETCH.actions[:4])  # ahead, right, left, back
+
+
+def two_rooms(formula, robot=STRETCH):
     """4 x 3 m, and the robot on the same map with the door in the middle shut."""
     grid = OccupancyGrid(TWO_DOORS, 0.1)
-    task = make_task(grid, STRETCH, formula, {"West": WEST, "East": EAST})
+    task = make_task(grid, robot, formula, {"West": WEST, "East": EAST})
     shut = TWO_DOORS.copy()
     shut[10:20, 20] = True
-    return task, make_body(STRETCH, replace(grid, occupied=shut))
+    return task, make_body(robot, replace(grid, occupied=shut))
 
 
-def test_where_a_robot_stands_is_no_use_while_another_goal_is_due_before():
+@pytest.mark.parametrize(("robot", "guess"), [(STRETCH, False), (RESTLESS, False), (RESTLESS, True)])
+def test_where_a_robot_stands_is_no_use_while_another_goal_is_due_before(robot, guess):
     """It begins where it has to be from step 60 on, and has to be elsewhere by then. Neither there nor on its
-    way back may it wait before the door that is shut.
+    way back may it wait before the door that is shut. A robot that cannot wait turns on the spot meanwhile.
     """
-    task, body = two_rooms("F[0,60] East and F[60,110] West")
+    task, body = two_rooms("F[0,60] East and F[60,110] West", robot)
     pose = np.array([0.7, 1.5, 0.0])
-    ways = synthesise(task).on_body(body).propose(pose[None], {}, 0.0).motions
+    ways = synthesise(task).on_body(body, guess).propose(pose[None], {}, 0.0).motions
     best = -np.inf
     for motions in ways:
         poses = np.empty((len(motions), 3))

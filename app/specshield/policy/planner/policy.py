@@ -46,7 +46,7 @@ from specshield.policy.reachability.sight import BESIDE, about
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.reasons.still_open import bounds_after, still_open
-from specshield.robot.dynamics import Body, calmest_motion, make_body, turns_in_place
+from specshield.robot.dynamics import Body, calmest_motion, make_body, turning_motion
 from specshield.rule.values import REGIONS, places, regions_of, signal_rows
 from specshield.rule.view import look
 from specshield.rule.worst import worst_signals
@@ -108,7 +108,7 @@ class PlannerPolicy(Carded):
                 field[k] = self.chosen[i]
         pad, stands = calmest_motion(self._body), self.task.robot.wait_motion >= 0
         # Without a turn in place the lattice has few of the ways that there are: its fields rule out nothing.
-        band = BAND if turns_in_place(self._body) else 2.0 * OUT_OF_REACH
+        band = BAND if turning_motion(self._body) >= 0 else 2.0 * OUT_OF_REACH
         return World(self._body, self.fields, packed, field, band, pad, stands, cost_of(packed.formula.tree))
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:

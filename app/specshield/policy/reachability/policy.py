@@ -36,7 +36,7 @@ from specshield.policy.reachability.stored import read_tables, stored
 from specshield.policy.reachability.tables import Guide, Tables
 from specshield.policy.shape import lattice_shape
 from specshield.robot.barred import NOTHING_BARRED, in_vain
-from specshield.robot.dynamics import Body, make_body, simulate
+from specshield.robot.dynamics import Body, calmest_motion, make_body, simulate
 from specshield.robot.room import goes_back, widened
 from specshield.rule.values import signal_rows
 from specshield.rule.view import look, rate, view_of
@@ -159,10 +159,12 @@ class ReachabilityPolicy(Carded):
             motions, ways, poses = np.empty(shape, np.int64), np.empty(shape, np.int64), np.empty((*shape, 3))
             around = NO_WAY
             if self.guess:
-                around = go_around(guide, past, history, rows, NO_FIELDS, poses, ways, FEWER)
+                fields = self._fields if guide.wait < 0 else NO_FIELDS
+                around = go_around(guide, past, history, rows, fields, poses, ways, FEWER)
             if around == GAVE_UP:
-                ways[:], ways[:, 0] = guide.wait, np.arange(len(ways))
-                proposals.append(Proposal(ways, guide.wait))
+                still = calmest_motion(self._body)
+                ways[:], ways[:, 0] = still, np.arange(len(ways))
+                proposals.append(Proposal(ways, still))
                 continue
             if guide.wait >= 0 and True in self.narrow.tolist():
                 preferred = continue_narrow(
@@ -176,7 +178,7 @@ class ReachabilityPolicy(Carded):
                 proposals.append(Proposal(motions[chosen], int(preferred)))
             if not self.guess and self.wanted is None and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
-                if guide.wait >= 0 and not is_known(guide, past, history, rows, free):
+                if not is_known(guide, past, history, rows, free):
                     around = go_around(guide, past, history, rows, self._fields, poses, ways, POSES)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))

@@ -5,6 +5,9 @@ into it, and a beam that keeps the poses of most slack stays there. Where cells 
 tables still bound what can be had, so this is A* (Hart, Nilsson and Raphael, 1968): the pose of most slack
 goes first, whatever way it lies on. A pose farther on its way goes before one that is a little better, which
 keeps the search from filling all of the free space (weighted A*, Pohl 1970).
+
+A robot that cannot wait turns on the spot where another one would wait. Its tables tell step by step what is
+feasible, and not how much there is to spare: so the distances alone say which pose goes first.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import numpy as np
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
+from specshield.policy.detour import join
 from specshield.policy.heap import pop, push
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
@@ -38,10 +42,19 @@ from specshield.policy.reachability.tables import (
     is_broken,
     slack_at,
 )
-from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, climb
+from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, STUCK, climb
 from specshield.policy.tree import Tree, first_slot, make_tree, put, trace
+from specshield.policy.undo import IMPOSSIBLE
 from specshield.robot.barred import is_barred
-from specshield.robot.dynamics import around, longest_motions, motion_count, simulate, step_from
+from specshield.robot.dynamics import (
+    around,
+    longest_motions,
+    motion_count,
+    simulate,
+    step,
+    step_from,
+    turning_motion,
+)
 
 # Chosen by hand; python -m evaluation worlds says what comes of them.
 POSES = 16_384  # that one search may come to, in some 10 ms
@@ -84,7 +97,7 @@ def go_around(
 ) -> int:
     """Searches for a way from x_t to every goal. Returns its first motion; then motions (M, T - t) hold it,
     and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the search came to `most`
-    poses. The robot has to be one that can wait.
+    poses. A robot that cannot wait needs `fields`.
 
     fields [K, ny, nx]: the distances to the goals (field.py), or none. poses (M, T - t, 3): overwritten. The
     other arguments are those of `continue_all`.
@@ -107,7 +120,12 @@ def go_around(
         copy_progress(tree.status[found], tree.run[found], scratch.status, scratch.run)
         if n == 0:
             return NO_WAY
-        outcome, n = climb(guide, t, n, way, led, scratch, False)
+        if guide.wait < 0:
+            outcome, n = _linger(guide, t, n, way, led, scratch)
+            if outcome == STUCK:
+                continue
+        else:
+            outcome, n = climb(guide, t, n, way, led, scratch, False)
         if outcome == SETTLED_ALL:
             break
         if outcome == FAILED:
@@ -119,10 +137,38 @@ def go_around(
         if m == way[0]:
             for i in range(steps):
                 motions[m, i] = way[i]
+        elif guide.wait < 0:
+            motions[m, 1:] = m
+            if starts.turn[m] != IMPOSSIBLE:
+                join(starts.turn[m], starts.move[m], way, 0, guide.wait, motions[m])
         else:
             motions[m, 1:] = guide.wait
             go_back(guide, t, m, way, led, starts, scratch)
     return int(way[0])
+
+
+@leaf
+def _linger(guide: Guide, t: int, n: int, way: Ints, led: Floats, scratch: Scratch) -> tuple[int, int]:
+    """Turns on the spot after way[:n] while some goal holds there that is still to be settled, and to the
+    horizon where every goal is settled. STUCK where another goal is next; how many motions there are then.
+    """
+    rules, turning = guide.rules, turning_motion(guide.body)
+    x, y, theta = led[n - 1, 0], led[n - 1, 1], led[n - 1, 2]
+    while turning >= 0 and n < way.shape[0]:
+        holds = goals_settled(rules, scratch.status)
+        for k in range(rules.kind.shape[0]):
+            if rules.kind[k] != ALWAYS and scratch.status[k] == PENDING:
+                holds = holds or predicate_at(rules, k, x, y, theta, scratch) > rules.margin
+        if not holds or is_broken(scratch.status):
+            break
+        x, y, theta = step(guide.body, x, y, theta, turning)
+        way[n], led[n, 0], led[n, 1], led[n, 2] = turning, x, y, theta
+        n += 1
+        update_progress(rules, t + n, x, y, theta, scratch)
+    if goals_settled(rules, scratch.status):
+        way[n:] = max(turning, 0)
+        return SETTLED_ALL, n
+    return (FAILED if is_broken(scratch.status) or n == way.shape[0] else STUCK), n
 
 
 @leaf
@@ -179,7 +225,7 @@ def _reach(
             if ahead < BAND and bounded:
                 tree.table[slot] = -1  # the end of its chain; its row goes to the next pose
                 continue
-            ahead = max(ahead, BAND)
+            ahead = max(ahead, BAND) if guide.wait >= 0 else SAFE
             spare = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
             size = push(tree.heap, size, count, -(min(ahead, spare) + ONWARD * (s + 1)))
             count += 1
