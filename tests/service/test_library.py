@@ -190,12 +190,12 @@ def test_nobody_begins_to_use_what_is_being_deleted(claims, monkeypatch):
 
 
 def test_what_cannot_be_written_is_not_claimed(claims):
-    before = claims._store.hgetall("specshield:{library}:sums")
+    before = claims._store().hgetall("specshield:{library}:sums")
     for _ in range(2):
         with pytest.raises(Exception, match="disk is full"), claims.adding("maps", "1" * 64, OPEN, 10):
             raise OSError(28, "No space left on device", "/secret/path")
     assert claims.ids("maps", "") == []
-    after = claims._store.hgetall("specshield:{library}:sums")
+    after = claims._store().hgetall("specshield:{library}:sums")
     assert {k: v for k, v in after.items() if v != b"0"} == {k: v for k, v in before.items() if v != b"0"}
 
 
@@ -204,7 +204,7 @@ def library(claims, tmp_path):
     """An empty one of a server's own."""
     settings = Settings(data_dir=tmp_path)
     maps = Maps(settings, claims)
-    return Policies(settings, maps, claims), maps
+    return Policies(settings, maps), maps
 
 
 ANN, BEN = Key("ann", ""), Key("ben", "")
@@ -226,7 +226,7 @@ def erase(policies, claims, record, owner):
 
 
 def sums(claims):
-    found = claims._store.hgetall("specshield:{library}:sums")
+    found = claims._store().hgetall("specshield:{library}:sums")
     return {name: bytes for name, bytes in found.items() if bytes != b"0"}
 
 
@@ -325,7 +325,7 @@ def test_maps_are_compressed_and_old_folders_are_read(claims, tmp_path):
 def test_maps_of_a_time_before_owners_are_the_operators(claims, tmp_path):
     settings = Settings(data_dir=tmp_path)
     id = Maps(settings, claims).add(OccupancyGrid(np.zeros((5, 7), bool), 0.3), {}, OPEN).id
-    claims._store.delete("specshield:{library}:maps:", f"specshield:{{library}}:owners:maps:{id}")
+    claims._store().delete("specshield:{library}:maps:", f"specshield:{{library}}:owners:maps:{id}")
     maps = Maps(settings, claims)
     assert id not in [item["id"] for item in maps.page("", None, 1000)[0]]
     maps.adopt()

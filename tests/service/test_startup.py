@@ -14,7 +14,7 @@ import pytest
 from specshield import compiled
 from specshield.client import ShieldClient
 from specshield.errors import Starting, TransportError
-from specshield.service.startup import mark_of_kernels
+from specshield.service.startup import READY
 from tests.serving import serving, wait_for
 
 
@@ -28,7 +28,7 @@ def held(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
     monkeypatch.setattr(compiled.config, "CPU_NAME", "generic")
     kernels.mkdir()
-    lock = os.open(kernels / f"{mark_of_kernels().name}.lock", os.O_RDWR | os.O_CREAT)
+    lock = os.open(kernels / f"{compiled.mark(READY).name}.lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_EX)
     yield kernels, lock
     os.close(lock)

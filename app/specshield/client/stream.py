@@ -112,17 +112,16 @@ class SyncStreams(Streams):
             connection = connection or self._connected(exchange)
             connection.send(message)
             reply = self._read(exchange, connection.recv(max(exchange.ends - time.monotonic(), 0.0)))
+            if reply is not None:
+                self._open[path] = connection
+                return reply
+            failed: Reply | Failure = exchange.failure(httpx.ReadError(STALE))
         except TimeoutError:
-            leave(connection)
-            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+            failed = exchange.failure(httpx.ReadTimeout("the time of this try is over"))
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
-            leave(connection)
-            return _failed(exchange, error)
-        if reply is None:
-            leave(connection)
-            return exchange.failure(httpx.ReadError(STALE))
-        self._open[path] = connection
-        return reply
+            failed = _failed(exchange, error)
+        leave(connection)
+        return failed
 
     def _connected(self, exchange: Exchange) -> Socket:
         """In a thread, since nothing can limit the time in which a name is looked up."""

@@ -112,9 +112,9 @@ def _parts() -> Iterator[Finding]:
 
 def _kernels() -> Iterator[Finding]:
     from specshield import compiled
-    from specshield.service.startup import TAKES, mark_of_kernels
+    from specshield.service.startup import READY, TAKES
 
-    mark = mark_of_kernels()
+    mark = compiled.mark(READY)
     if mark is None:
         yield Finding(
             "note",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -40,7 +39,7 @@ def policy(
     check_writable(out, "--out")
     status = StatusLine()
     places = {} if regions is None else _read(regions, "--regions")
-    machine = _robot(robot)
+    machine = _read(Path(robot), "--robot") if Path(robot).suffix else robot  # else a preset's name
     with client_of(url, status, worker=True) as client:
         world = _map(client, map, assets)
         spec = client.specs.validate(rule, places, map_id=world.id)
@@ -102,12 +101,6 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
         got=sorted(content)[:8],
         expected="a ROS map's YAML beside its image, a ProcTHOR house, or a nav_msgs/OccupancyGrid as JSON",
     )
-
-
-def _robot(robot: str) -> str | Mapping[str, Any]:
-    """A preset's name, or a robot of one's own from a file."""
-    path = Path(robot)
-    return _read(path, "--robot") if path.suffix else robot
 
 
 def _read(path: Path, option: str) -> dict[str, Any]:

@@ -18,8 +18,9 @@ from PIL import Image
 
 from specshield.arrays import Floats
 from specshield.drawing.colors import is_avoided
+from specshield.drawing.outline import outlines
 from specshield.task import Task
-from specshield.world.regions import Circle, Polygon, Rectangle, Region, Union
+from specshield.world.regions import Circle, Region, Union
 
 # Widths are in thousandths of the longer side of the map, so that every map looks alike.
 STYLE = """
@@ -144,7 +145,7 @@ class Plan:
         if isinstance(region, Circle):
             x, y = self._at(*region.center)
             return f'<circle cx="{x:g}" cy="{y:g}" r="{region.radius:g}"/>'
-        return f'<polygon points="{self._points(_corners(region), "g")}"/>'
+        return f'<polygon points="{self._points(outlines(region)[0][:-1].tolist(), "g")}"/>'
 
     def _text(self, x: float, y: float, said: str, size: float, kind: str, anchor: str) -> str:
         return (
@@ -167,18 +168,10 @@ def _members(region: Region) -> Sequence[Region]:
     return region.members if isinstance(region, Union) else (region,)
 
 
-def _corners(region: Region) -> list[tuple[float, float]]:
-    if isinstance(region, Rectangle):
-        (x0, y0), (x1, y1) = region.min, region.max
-        return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-    assert isinstance(region, Polygon)
-    return [(x, y) for x, y in region.vertices]
-
-
 def _below(region: Region) -> tuple[float, float]:
     """The lowest point of a region's first part, at the middle of its width."""
     first = _members(region)[0]
     if isinstance(first, Circle):
         return first.center[0], first.center[1] - first.radius
-    xs, ys = zip(*_corners(first), strict=True)
-    return (min(xs) + max(xs)) / 2, min(ys)
+    (left, low), (right, _) = (end(outlines(first)[0], axis=0).tolist() for end in (np.min, np.max))
+    return (left + right) / 2, low

@@ -17,7 +17,7 @@ from foxglove import messages as fox
 from foxglove.channels import GridChannel, PoseInFrameChannel, SceneUpdateChannel
 
 from specshield.arrays import Floats
-from specshield.recordings.outline import outlines
+from specshield.drawing.outline import outlines
 from specshield.recordings.recording import Recording
 from specshield.world.occupancy import OccupancyGrid
 

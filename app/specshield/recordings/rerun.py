@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import rerun
 
-from specshield.recordings.outline import outlines
+from specshield.drawing.outline import outlines
 from specshield.recordings.recording import Recording
 
 

@@ -21,14 +21,8 @@ def rows(recording: Recording) -> list[dict[str, Any]]:
     """
     found = []
     for item in recording.items:
-        x, y, theta = item.pose
-        row: dict[str, Any] = {
-            "t": item.t,
-            "seconds": recording.seconds(item.t),
-            "x": x,
-            "y": y,
-            "theta": theta,
-        }
+        row: dict[str, Any] = {"t": item.t, "seconds": recording.seconds(item.t)}
+        row |= zip(("x", "y", "theta"), item.pose, strict=True)
         row |= {f"signal_{name}": value for name, value in item.signals.items()}
         told = item.decision or {}
         row |= {name: told.get(name) for name in TOLD}

@@ -113,9 +113,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     archive, replicas = Archive(open_objects(f"{settings.files_at}/archive")), settings.store_replicas
     store = ArchivingStore(url, settings.store_timeout, settings.session_ttl, archive, replicas)
     mover, jobs = Mover(store, settings), Jobs(url, settings)
-    claims = Claims(lambda: jobs.redis, settings)
-    library = Maps(settings, claims)
-    known = Policies(settings, library, claims)
+    library = Maps(settings, Claims(lambda: jobs.redis, settings))
+    known = Policies(settings, library)
     trains = settings.redis_url is None if settings.worker is None else settings.worker
     worker = TrainingWorker(settings) if trains else None
     heavy, startup = Heavy(settings), Startup()
@@ -132,19 +131,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     own = None if settings.api_key is None else settings.api_key.get_secret_value()
     keys, gauges = Keys(store.redis, own), Gauges(store, jobs)
     server = Server(
-        settings,
-        store,
-        library,
-        known,
-        sessions,
-        jobs,
-        gauges,
-        watchers,
-        worker,
-        startup,
-        heavy,
-        keys,
-        claims,
+        settings, store, library, known, sessions, jobs, gauges, watchers, worker, startup, heavy, keys
     )
     body.clear(settings.data_dir / "incoming")
     app.state.server = server

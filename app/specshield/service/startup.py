@@ -24,6 +24,7 @@ from specshield import compiled
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
+READY = "ready"  # the file of this name (`compiled.mark`) says that every kernel of a start is on the disk
 KERNELS = 243  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 34  # [s] that a first start took on two quiet cores: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
@@ -72,11 +73,6 @@ class Startup:
         return min(compiled.on_disk() - (self.before or 0), KERNELS)
 
 
-def mark_of_kernels() -> Path | None:
-    """The file that says that every kernel of a start is on the disk."""
-    return compiled.mark("ready")
-
-
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
     """Returns when the server is ready, or cannot become it.
 
@@ -85,14 +81,17 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
     gc.freeze()  # 300,000 objects that stay: looking at them makes a collection take 0.2 s
     gc.enable()
     try:
-        mark = mark_of_kernels()
+        mark = compiled.mark(READY)
         if mark is not None and not mark.exists():
             await _compile(startup, mark)
         for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here
             await asyncio.to_thread(warmup.warm_up, part)
         gc.freeze()  # what the kernels brought stays too
         gc.set_threshold(YOUNG, 10, 10)
-        while not await asyncio.to_thread(_passes, check):
+        while True:
+            with contextlib.suppress(StoreError):  # /readyz says that it is away
+                await asyncio.to_thread(check)
+                break
             await asyncio.sleep(CHECK_EVERY)
         startup.ready = True
         log.info("ready")
@@ -104,14 +103,6 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         startup.failure = (
             f"the kernels cannot be compiled: {type(error).__name__}; the server's log says more"
         )
-
-
-def _passes(check: Callable[[], object]) -> bool:
-    try:
-        check()
-    except StoreError:  # /readyz says that it is away
-        return False
-    return True
 
 
 async def _compile(startup: Startup, mark: Path) -> None:
@@ -161,11 +152,10 @@ async def _one_at_a_time(path: Path) -> AsyncIterator[None]:
     lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         while True:
-            try:
+            with contextlib.suppress(BlockingIOError):
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
-            except BlockingIOError:
-                await asyncio.sleep(CHECK_EVERY)
+            await asyncio.sleep(CHECK_EVERY)
         yield
     finally:
         os.close(lock)

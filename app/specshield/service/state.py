@@ -10,7 +10,6 @@ from fastapi import Depends, Query, Request
 from specshield.service.access.keys import Keys
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.leaving import Streams
-from specshield.service.library.claims import Claims
 from specshield.service.library.files import Recent
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
@@ -49,7 +48,6 @@ class Server:
     startup: Startup
     heavy: Heavy
     keys: Keys
-    claims: Claims
     pictures: Recent[bytes] = field(default_factory=lambda: Recent[bytes](PICTURES))  # of policies, by id
     streams: Streams = field(default_factory=Streams)
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from specshield.recordings.outline import outlines
+from specshield.drawing.outline import outlines
 from specshield.world.regions import Region
 from specshield_ros.logic import Told
 

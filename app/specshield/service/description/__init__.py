@@ -44,11 +44,8 @@ def _read(name: str) -> Any:
 
 # By operation: what the requests of `examples` were answered, as tests/service/test_docs.py records it
 ANSWERS = _read("answers.json")
-USUAL = {  # the problem of a status where its description names none
-    "401": "unauthorized", "403": "cross-site", "404": "not-found", "408": "request-timeout",
-    "413": "body-too-large", "415": "unsupported-media-type", "421": "misdirected-request",
-    "422": "invalid-input", "429": "limit-reached", "503": "store-unavailable", "507": "insufficient-storage",
-}  # fmt: skip
+# The problem of a status where its description names none: the last one in the table.
+USUAL = {str(status): kind.type for kind, status in problems.STATUS.items()}
 WRONG = {  # what of bad input an operation has of its own
     "specifications_validate": ["invalid-formula"],
     "maps_create": ["invalid-map"],

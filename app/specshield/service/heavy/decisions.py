@@ -26,8 +26,8 @@ def step(settings: Settings, session: Session, request: StepBody) -> tuple[steps
 
 
 def begin(settings: Settings, request: SessionRequest, config: Config, owner: str) -> sessions.Begun:
-    return sessions.begin(policies_of(settings), _shields(settings), request, config, None, owner)
+    return sessions.begin(_shields(settings), request, config, None, owner)
 
 
 def switched(settings: Settings, wanted: Wanted, most_steps: int) -> Session:
-    return switch.switched(policies_of(settings), _shields(settings), wanted, most_steps)
+    return switch.switched(_shields(settings), wanted, most_steps)

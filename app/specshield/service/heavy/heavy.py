@@ -6,6 +6,7 @@ import asyncio
 import os
 import time
 from collections.abc import Hashable
+from functools import partial
 from typing import Any
 
 from fastapi import Request
@@ -27,23 +28,10 @@ class Heavy:
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._template = settings, Template()
-        self.tasks = Pool(
-            self._template,
-            size=2,
-            memory=settings.heavy_memory,
-            nice=TASKS_NICE,
-            waiting=WAITING,
-            idle=IDLE,
-            unused=self._unused,
-        )
-        self.decisions = Pool(
-            self._template,
-            size=max(os.cpu_count() or 1, 2),
-            memory=DECISION_MEMORY,
-            nice=DECISIONS_NICE,
-            waiting=1000,
-            idle=10 * IDLE,
-            unused=self._unused,
+        pool, size = partial(Pool, self._template, unused=self._unused), max(os.cpu_count() or 1, 2)
+        self.tasks = pool(size=2, memory=settings.heavy_memory, nice=TASKS_NICE, waiting=WAITING, idle=IDLE)
+        self.decisions = pool(
+            size=size, memory=DECISION_MEMORY, nice=DECISIONS_NICE, waiting=1000, idle=10 * IDLE
         )
 
     async def run(self, request: Request, function: str, *arguments: Any) -> Any:
@@ -52,7 +40,6 @@ class Heavy:
 
         Raises ClientGone, and ends the work, when the caller closes its connection.
         """
-        owner = str(request.scope["state"].get("owner", ""))
         module, _, name = function.rpartition(":")
         work = asyncio.ensure_future(
             self.tasks.run(
@@ -60,7 +47,7 @@ class Heavy:
                 self._settings,
                 *arguments,
                 seconds=self._settings.heavy_timeout,
-                owner=owner,
+                owner=str(request.scope["state"].get("owner", "")),
             )
         )
         gone = asyncio.ensure_future(_gone(request))

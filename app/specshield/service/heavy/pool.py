@@ -168,15 +168,13 @@ class Pool:
             self.children -= 1
             raise
 
-    async def _start(self) -> _Child:
-        try:
-            return await self._fork()
-        except (OSError, asyncio.IncompleteReadError):  # an old template may have died since the last child
-            self._template.stop()
+    async def _start(self, again: bool = True) -> _Child:
         try:
             return await self._fork()
         except (OSError, asyncio.IncompleteReadError) as error:
             self._template.stop()
+            if again:  # an old template may have died since the last child
+                return await self._start(again=False)
             raise ServerError(
                 "a process that this needs does not start; the server's log says more"
             ) from error

@@ -55,19 +55,13 @@ Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))  # loads numba's compiler, once fo
 
 @cache
 def policies_of(settings: Settings) -> Policies:
-    return Policies(settings, _maps(settings), _claims(settings))
+    return Policies(settings, _maps(settings))
 
 
 @cache
 def _maps(settings: Settings) -> Maps:
-    return Maps(settings, _claims(settings))
-
-
-@cache
-def _claims(settings: Settings) -> Claims:
-    url = settings.redis_url or EmbeddedStore(settings.data_dir).url
-    jobs = Jobs(url, settings)
-    return Claims(lambda: jobs.redis, settings)
+    jobs = Jobs(settings.redis_url or EmbeddedStore(settings.data_dir).url, settings)
+    return Maps(settings, Claims(lambda: jobs.redis, settings))
 
 
 def add_map(settings: Settings, content_type: str, content: Content, key: Key) -> dict[str, Any]:

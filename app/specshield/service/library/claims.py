@@ -34,26 +34,22 @@ class Claims:
         """connected: gives a blocking connection of redis. It is first asked when a claim is: the store may
         be away before.
         """
-        self._connected, self._settings = connected, settings
-
-    @property
-    def _store(self) -> Any:
-        return self._connected()
+        self._store, self._settings = connected, settings
 
     @cached_property
     def _script(self) -> Any:
-        return self._store.register_script(SCRIPT)
+        return self._store().register_script(SCRIPT)
 
     def ids(self, kind: str, owner: str) -> list[str]:
-        return sorted(id.decode() for id in reached(lambda: self._store.hkeys(_key(kind, owner))))
+        return sorted(id.decode() for id in reached(lambda: self._store().hkeys(_key(kind, owner))))
 
     def holds(self, kind: str, id: str, owner: str) -> bool:
-        return bool(reached(lambda: self._store.hexists(_key(kind, owner), id)))
+        return bool(reached(lambda: self._store().hexists(_key(kind, owner), id)))
 
     def settled(self, kind: str, id: str, owner: str) -> bool:
         """Whether the owner holds it, once no deletion of it is under way."""
         deadline = time.monotonic() + PATIENCE
-        while reached(lambda: self._store.exists(_key("mark", kind, id))):
+        while reached(lambda: self._store().exists(_key("mark", kind, id))):
             if time.monotonic() > deadline:
                 return False
             time.sleep(WAIT)
@@ -67,12 +63,12 @@ class Claims:
         return self._text(_key("named", kind, owner), id)
 
     def _text(self, key: str, field: str) -> str | None:
-        found = reached(lambda: self._store.hget(key, field))
+        found = reached(lambda: self._store().hget(key, field))
         return None if found is None else str(found.decode())
 
     def names(self, kind: str, owner: str) -> dict[str, str]:
         """{id: name} of everything that this owner has named."""
-        found = reached(lambda: self._store.hgetall(_key("named", kind, owner)))
+        found = reached(lambda: self._store().hgetall(_key("named", kind, owner)))
         return {id.decode(): name.decode() for id, name in found.items()}
 
     def name(self, kind: str, id: str, owner: str, name: str) -> None:
@@ -122,9 +118,7 @@ class Claims:
         """Begins a deletion: from now on nobody begins to use it. The policy that uses a map, if one does."""
         said = self._patiently("mark", kind, id, owner, token)
         if said == "none":
-            what = "map" if kind == "maps" else "policy"
-            expected = f"an id from /v1/{kind}"
-            raise NotFound(f"there is no {what} {id!r}", path=f"{what}_id", got=id, expected=expected)
+            raise missing(kind, id, "an id")
         return None if said == "marked" else said
 
     def free(self, kind: str, id: str, owner: str, token: str, map_id: str = "") -> bool:
@@ -139,15 +133,15 @@ class Claims:
 
     def weigh(self, kind: str, id: str, size: int) -> None:
         """Notes what was written after the claim was made."""
-        for owner in reached(lambda: self._store.smembers(_key("owners", kind, id))):
+        for owner in reached(lambda: self._store().smembers(_key("owners", kind, id))):
             self._run("weigh", kind, id, owner.decode(), "", size)
 
     def shared(self, kind: str, id: str) -> bool:
         """Whether several owners hold it."""
-        return bool(reached(lambda: self._store.scard(_key("owners", kind, id))) > 1)
+        return bool(reached(lambda: self._store().scard(_key("owners", kind, id))) > 1)
 
     def unowned(self, kind: str, id: str) -> bool:
-        return not reached(lambda: self._store.exists(_key("owners", kind, id)))
+        return not reached(lambda: self._store().exists(_key("owners", kind, id)))
 
     def _give_back(self, kind: str, id: str, owner: str, map_id: str) -> None:
         token = secrets.token_hex(8)
@@ -182,15 +176,15 @@ class Claimed:
     """What maps and policies share. claims: whose they are; needed to find, add and delete."""
 
     def __init__(self, kind: str, claims: Claims | None, settings: Settings) -> None:
-        self._kind, self._given, self._folder = kind, claims, files.kept(settings, kind)
+        self._kind, self.given, self._folder = kind, claims, files.kept(settings, kind)
         self._named: Mapping[str, Any] = {}  # what came with the server
 
     def adopt(self) -> None:
         """Gives what nobody has, of a time before owners, to the owner without a name."""
         for id in files.ids(self._folder):
-            if self._claims.unowned(self._kind, id):
+            if self.claims.unowned(self._kind, id):
                 size = files.weight_of(self._folder / id)
-                with self._claims.adding(self._kind, id, OPEN, size, self._map_of(id)):
+                with self.claims.adding(self._kind, id, OPEN, size, self._map_of(id)):
                     pass
 
     def _map_of(self, id: str) -> str:
@@ -209,27 +203,26 @@ class Claimed:
                 got=name,
                 expected="a name that does not look like an id, for what did not come with the server",
             )
-        bearer = shipped.get(name) or self._claims.named(self._kind, name, owner)
+        bearer = shipped.get(name) or self.claims.named(self._kind, name, owner)
         if bearer not in (None, id):
             raise taken(name, str(bearer))
 
     @property
-    def _claims(self) -> Claims:
-        assert self._given is not None
-        return self._given
+    def claims(self) -> Claims:
+        assert self.given is not None
+        return self.given
 
     def _id_of(self, key: str, owner: str) -> str:
         """The id of what an owner calls `key`; `key` itself where that is no name of theirs."""
-        return key if files.HASH.fullmatch(key) else self._claims.named(self._kind, key, owner) or key
+        return key if files.HASH.fullmatch(key) else self.claims.named(self._kind, key, owner) or key
 
 
 def _key(*parts: str) -> str:
     return ":".join(("specshield:{library}", *parts))
 
 
-def missing(kind: str, key: str) -> NotFound:
-    what = "map" if kind == "maps" else "policy"
-    expected = f"an id or name from /v1/{kind}"
+def missing(kind: str, key: str, asked: str = "an id or name") -> NotFound:
+    what, expected = "map" if kind == "maps" else "policy", f"{asked} from /v1/{kind}"
     return NotFound(f"there is no {what} {key!r}", path=f"{what}_id", got=key, expected=expected)
 
 

@@ -93,7 +93,7 @@ class Maps(Claimed):
             return found
         key = self._id_of(key, owner)
         if files.HASH.fullmatch(key):
-            if self._claims.holds("maps", key, owner):
+            if self.claims.holds("maps", key, owner):
                 return self.get(key)
             for id in self._own(owner):
                 with suppress(NotFound):  # deleted at this moment
@@ -106,8 +106,8 @@ class Maps(Claimed):
         if self.shipped(key) is not None:
             return self.find(key, owner).to_json()
         id = self._id_of(key, owner)
-        shown = self._shown(id) if self._claims.holds("maps", id, owner) else self.find(id, owner).to_json()
-        return {**shown, "name": self._claims.name_of("maps", shown["id"], owner)}
+        shown = self._shown(id) if self.claims.holds("maps", id, owner) else self.find(id, owner).to_json()
+        return {**shown, "name": self.claims.name_of("maps", shown["id"], owner)}
 
     def add(self, grid: OccupancyGrid, rooms: Mapping[str, Region], key: Key, name: str | None = None) -> Map:
         """Keeps a map for an owner, its content once, under a name if one is given. Raises MapError for rooms
@@ -129,13 +129,13 @@ class Maps(Claimed):
         made, folder = Map(id, grid, rooms), self._folder / id
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
         content = {"map.yaml": dump_map(grid)[0].encode(), "map.png": made.png(), "map.json": meta}
-        with self._claims.adding("maps", id, key, sum(map(len, content.values()))):
+        with self.claims.adding("maps", id, key, sum(map(len, content.values()))):
             if not files.there(folder):
                 files.write_folder(folder, content)
         if name is not None:
-            self._claims.name("maps", id, key.name, name)
+            self.claims.name("maps", id, key.name, name)
         kept = self._recent.get(id, lambda: made)
-        return replace(kept, name=self._claims.name_of("maps", id, key.name))
+        return replace(kept, name=self.claims.name_of("maps", id, key.name))
 
     def delete(self, key: str, owner: str) -> None:
         """Takes an owner's map; its content goes with the last owner. Raises NotFound, InUse and Conflict."""
@@ -148,7 +148,7 @@ class Maps(Claimed):
                 expected="a map that was sent here",
             )
         key, token = self._id_of(key, owner), secrets.token_hex(8)
-        user = self._claims.mark("maps", key, owner, token)
+        user = self.claims.mark("maps", key, owner, token)
         if user is not None:
             raise InUse(
                 f"policy {user!r} is for this map",
@@ -158,11 +158,11 @@ class Maps(Claimed):
                 policy_id=user,
             )
         try:
-            if self._claims.free("maps", key, owner, token):
+            if self.claims.free("maps", key, owner, token):
                 self._recent.drop(key)
                 files.remove_folder(self._folder / key)
         finally:
-            self._claims.unmark("maps", key, token)
+            self.claims.unmark("maps", key, token)
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
         """One page of an owner's maps and those of all, as JSON, had without reading the cells."""
@@ -172,7 +172,7 @@ class Maps(Claimed):
             limit,
             lambda key: files.size(self._folder / key / "map.json"),
         )
-        names, shown = self._claims.names("maps", owner), []
+        names, shown = self.claims.names("maps", owner), []
         for key in keys:
             with suppress(NotFound):  # deleted at this moment
                 shown.append(self._shown(key) | ({"name": names[key]} if key in names else {}))
@@ -180,7 +180,7 @@ class Maps(Claimed):
 
     def _own(self, owner: str) -> list[str]:
         """Ids that the owner has; one whose files are not there was not written to the end."""
-        return [id for id in self._claims.ids("maps", owner) if files.there(self._folder / id)]
+        return [id for id in self.claims.ids("maps", owner) if files.there(self._folder / id)]
 
     def _shown(self, key: str) -> dict[str, Any]:
         if key in self._named:

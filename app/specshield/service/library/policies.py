@@ -20,7 +20,7 @@ from specshield.policy.options import read_options
 from specshield.robot import robot_from_json
 from specshield.service.access.keys import Key
 from specshield.service.library import files
-from specshield.service.library.claims import Claimed, Claims, missing
+from specshield.service.library.claims import Claimed, missing
 from specshield.service.library.maps import Maps
 from specshield.service.settings import Settings
 from specshield.shield.proposal import Proposer
@@ -57,8 +57,8 @@ class Record:
 class Policies(Claimed):
     """The calls block on files. A key is an id, or the name of a policy that came with the server."""
 
-    def __init__(self, settings: Settings, maps: Maps, claims: Claims | None = None) -> None:
-        super().__init__("policies", claims, settings)
+    def __init__(self, settings: Settings, maps: Maps) -> None:
+        super().__init__("policies", maps.given, settings)
         self._maps, self._models = maps, settings.models_dir
         self._max_horizon, self._max_spec = settings.max_horizon, settings.max_spec_bytes
         self._recent = files.Recent[Proposer](KEPT_IN_MEMORY)
@@ -80,7 +80,7 @@ class Policies(Claimed):
     def find(self, key: str, owner: str) -> Record:
         """One that this owner may see. Raises NotFound."""
         found = self.record(key if key in self._named else self._id_of(key, owner))
-        if found.name is None and not self._claims.holds("policies", found.id, owner):
+        if found.name is None and not self.claims.holds("policies", found.id, owner):
             raise missing("policies", key)
         return found
 
@@ -88,7 +88,7 @@ class Policies(Claimed):
         """Raises NotFound where a policy is gone: asked once whoever deletes it can see that it is used."""
         shipped = {record.id for record in self._named.values()}
         for id in ids:
-            if id not in shipped and not self._claims.settled("policies", id, owner):
+            if id not in shipped and not self.claims.settled("policies", id, owner):
                 raise missing("policies", id)
 
     def task(self, about: Description) -> Task:
@@ -150,10 +150,10 @@ class Policies(Claimed):
     def name(self, record: Record, owner: str, name: str) -> None:
         """Names an owner's policy. Raises NameTaken."""
         if record.name is None:
-            self._claims.name("policies", record.id, owner, name)
+            self.claims.name("policies", record.id, owner, name)
 
     def name_of(self, record: Record, owner: str) -> str | None:
-        return record.name or self._claims.name_of("policies", record.id, owner)
+        return record.name or self.claims.name_of("policies", record.id, owner)
 
     def made_here(self, id: str) -> Record | None:
         """The policy of this id, if anybody asked for it."""
@@ -200,7 +200,7 @@ class Policies(Claimed):
         del stored["card"]
         content, folder = {"policy.json": files.to_json(stored), **(trained or {})}, self._folder / record.id
         size = max(sum(map(len, content.values())), files.weight_of(folder))  # all, if it is trained already
-        with self._claims.adding("policies", record.id, key, size, self._own_map(record.about)):
+        with self.claims.adding("policies", record.id, key, size, self._own_map(record.about)):
             if not folder.is_dir():
                 files.write_folder(folder, content)
         return self.record(record.id)
@@ -228,8 +228,8 @@ class Policies(Claimed):
         with files.full_disk():
             files.write_file(folder / "policy.safetensors", weights)
             files.write_file(folder / "card.json", files.to_json({**card, "id": id}))
-        if self._given is not None:
-            self._claims.weigh("policies", id, files.weight_of(folder))
+        if self.given is not None:
+            self.claims.weigh("policies", id, files.weight_of(folder))
 
     def checkpoints(self, id: str) -> Path:
         return self._folder / id / "checkpoint"
@@ -238,7 +238,7 @@ class Policies(Claimed):
         """Takes the claim of an owner who has marked the deletion by this token. True where the policy went
         with it. Raises Conflict where the marking is too long ago.
         """
-        last = self._claims.free("policies", record.id, owner, token, self._own_map(record.about))
+        last = self.claims.free("policies", record.id, owner, token, self._own_map(record.about))
         if last:
             self._recent.drop(record.id)
             files.remove_folder(self._folder / record.id)
@@ -246,7 +246,7 @@ class Policies(Claimed):
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[Record], str | None]:
         """One page of an owner's policies and those of all."""
-        own = (id for id in self._claims.ids("policies", owner) if (self._folder / id).is_dir())
+        own = (id for id in self.claims.ids("policies", owner) if (self._folder / id).is_dir())
         keys, following = files.page(
             [*self._named, *own],
             after,

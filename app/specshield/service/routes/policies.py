@@ -117,23 +117,14 @@ def _show(server: Server, record: Record, owner: str) -> dict[str, Any]:
 
 
 def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
-    training, about = _training(server, record), record.about
     return {
+        **vars(_training(server, record)),
+        **vars(record.about),
         "id": record.id,
         "name": name,
-        "status": training.status,
-        "progress": training.progress,
-        "eta_s": training.eta_s,
-        "error": training.error,
         "metrics": (record.card or {}).get("metrics", {}),
         "warnings": _warnings(record),
-        "map_id": about.map_id,
-        "robot": about.robot,
-        "spec": about.spec,
         "horizon": record.horizon,
-        "method": about.method,
-        "seed": about.seed,
-        "options": about.options,
         "created_at": record.created_at,
     }
 
@@ -148,7 +139,7 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
 
     def show() -> dict[str, Any]:
         found, following = server.policies.page(owner, cursor, limit)
-        names = server.claims.names("policies", owner)
+        names = server.policies.claims.names("policies", owner)
         return {"items": [_listed(server, record, names) for record in found], "next": following}
 
     return await asyncio.to_thread(show)
@@ -187,7 +178,7 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
             got=policy_id,
             expected="a policy that was made or sent here",
         )
-    claims, token = server.claims, secrets.token_hex(8)
+    claims, token = server.policies.claims, secrets.token_hex(8)
     training = await asyncio.to_thread(_training, server, record)
     if training.status in ("queued", "training") and not await asyncio.to_thread(
         claims.shared, "policies", record.id

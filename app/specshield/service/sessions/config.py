@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,10 @@ from specshield.shield.decision import Config
 from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task
 
-# The settings that are stored by the names that `Config` has for them.
-ALIKE = (
-    "seed", "threshold", "margin", "slack", "evaluation", "max_steps", "threshold_over", "learn_map",
-    "map_memory",
-)  # fmt: skip
+# The settings that are asked for and stored as `Config` has them; an uncertainty is told in another form.
+ALIKE = [
+    each.name for each in fields(Config) if each.name in SessionRequest.model_fields.keys() - {"uncertainty"}
+]
 ANY_SIGNAL = "any_signal"  # is not asked for by itself: it goes with what is taken of the world
 
 

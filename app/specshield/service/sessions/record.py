@@ -17,6 +17,7 @@ import hashlib
 import math
 import struct
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import msgspec
@@ -116,6 +117,16 @@ def _points(sent: bytes | None) -> Floats | None:
     return None if sent is None else np.frombuffer(sent, "<f8").reshape(-1, 2)
 
 
+# The members that a decision, its record and its answer hold in one form, and those that they do not.
+OTHERWISE = {"distribution", "residual", "witness", "witnesses", "any_signal", "explanations"}
+ALIKE = [name for name in StepRecord.__struct_fields__ if name in {*StepAnswer.__struct_fields__} - OTHERWISE]
+_values = attrgetter(*ALIKE)
+
+
+def _alike(made: Decision | StepRecord) -> dict[str, Any]:
+    return dict(zip(ALIKE, _values(made), strict=True))
+
+
 _encoder = msgspec.msgpack.Encoder()
 decode = msgspec.msgpack.Decoder(StepRecord).decode
 
@@ -160,24 +171,28 @@ def make(
     actions[:, 2:] = decision.next_poses
     rows, table, pool = pack_table(actions, row)
     return StepRecord(
-        format=FORMAT, before=before, t=decision.t,
+        format=FORMAT,
+        before=before,
         pose=None if sent == row[:3].tobytes() else sent,
-        logits=None if logits is None else sparse(logits, -math.inf, True), main_task_done=main_task_done,
-        signals=sum(1 << i for i, name in enumerate(names) if name in signals), all_witnesses=all_witnesses,
-        mode=decision.mode, distribution=sparse(decision.distribution, 0.0, False),
-        rows=rows, table=table, pool=pool,
-        action=decision.action, completion_action=decision.completion_action,
-        spec_status=decision.spec_status, feasible_mass=decision.feasible_mass, kl=decision.kl,
-        reason=decision.reason, finished=decision.finished,
-        residual=decision.residual, in_collision=decision.in_collision,
+        logits=None if logits is None else sparse(logits, -math.inf, True),
+        main_task_done=main_task_done,
+        signals=sum(1 << i for i, name in enumerate(names) if name in signals),
+        all_witnesses=all_witnesses,
+        distribution=sparse(decision.distribution, 0.0, False),
+        rows=rows,
+        table=table,
+        pool=pool,
+        residual=decision.residual,
         witness=None if decision.witness is None else bytes(decision.witness),
         witnesses=tuple(None if w is None else bytes(w) for w in decision.witnesses),
-        warnings=decision.warnings, margin=decision.margin, slack=decision.slack,
-        threshold_left=decision.threshold_left, map_revision=decision.map_revision,
         occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
         free=None if free is None else free.astype("<f8").tobytes(),
-        explain=explain, explanations=_explained(decision), tables=tables, any_signal=decision.any_signal,
-    )  # fmt: skip
+        explain=explain,
+        explanations=_explained(decision),
+        tables=tables,
+        any_signal=decision.any_signal,
+        **_alike(decision),
+    )
 
 
 def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
@@ -236,10 +251,8 @@ def _answer(
     if all_witnesses:
         own["witnesses"] = tuple(None if w is None else list(w) for w in made.witnesses)
     return StepAnswer(
-        t=made.t, mode=made.mode, action=made.action, completion_action=made.completion_action,
-        spec_status=made.spec_status, feasible_mass=made.feasible_mass, kl=made.kl, reason=made.reason,
-        finished=made.finished, residual=None if made.residual is None else Residual(*made.residual),
-        in_collision=made.in_collision, witness=None if made.witness is None else list(made.witness),
-        warnings=made.warnings, margin=made.margin, slack=made.slack, threshold_left=made.threshold_left,
-        map_revision=made.map_revision, **own,
-    )  # fmt: skip
+        residual=None if made.residual is None else Residual(*made.residual),
+        witness=None if made.witness is None else list(made.witness),
+        **_alike(made),
+        **own,
+    )

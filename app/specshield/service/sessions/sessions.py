@@ -42,7 +42,7 @@ from specshield.service.sessions.session import (
     pack,
     there,
 )
-from specshield.service.sessions.shields import Shields, prepared
+from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State, pack_carry
 from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
@@ -70,7 +70,7 @@ class Sessions:
         self._shields = Shields(policies, settings.shield_cache)
         self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
-        self.switches = Switches(store, policies, self._shields, self._run, heavy, settings)
+        self.switches = Switches(store, self._shields, self._run, heavy, settings)
         self._heavy = heavy
 
     async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
@@ -83,7 +83,7 @@ class Sessions:
         preference = None
         if request.shaping != PROJECTION:
             asked = request.shaping, request.policies, request.initial_pose, key.name
-            preference = await prepared(self._run, self._shields, *asked)
+            preference = await self._shields.prepared(self._run, *asked)
         ids = await self._run(lambda: [self._policies.find(id, key.name).id for id in request.policies])
         try:
             begun: Begun  # in another process where the policies' decisions take long, else in a thread
@@ -92,8 +92,7 @@ class Sessions:
                     "begin", request, settings, key.name, session=",".join(ids), key=tuple(ids)
                 )
             else:
-                made_of = self._policies, self._shields, request, settings, preference, key.name
-                begun = await self._run(begin, *made_of)
+                begun = await self._run(begin, self._shields, request, settings, preference, key.name)
         except Exception:  # whatever was wrong with a policy that has been deleted meanwhile, it is not there
             await self._run(self._policies.still_there, ids, key.name)
             raise
@@ -243,15 +242,10 @@ class Sessions:
 
 
 def begin(
-    policies: Policies,
-    shields: Shields,
-    request: SessionRequest,
-    settings: Config,
-    preference: Preference | None,
-    owner: str,
+    shields: Shields, request: SessionRequest, settings: Config, preference: Preference | None, owner: str
 ) -> Begun:
     """As `Begun` has it."""
-    records = [policies.find(key, owner) for key in request.policies]
+    records = [shields.policies.find(key, owner) for key in request.policies]
     ids = [record.id for record in records]
     shield = replace(shields.get(ids, settings), preference=preference)
     feasible, way = refusal.begin(shield, request.initial_pose, request.allow_infeasible)

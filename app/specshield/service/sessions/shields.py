@@ -28,6 +28,7 @@ from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
 
 Bounds = tuple[float, float]
+Run = Callable[..., Awaitable[Any]]  # calls a function in a thread
 QUICK = ("reachability", "dqn")  # methods whose decisions take a millisecond; of others nothing is known
 
 
@@ -37,7 +38,7 @@ class Shields:
     """
 
     def __init__(self, policies: Policies, room: int) -> None:
-        self._policies, self._shields = policies, files.Recent[Shield](room)
+        self.policies, self._shields = policies, files.Recent[Shield](room)
         self._judges = files.Recent[Shield](room)  # without policies, by the digests of what was asked
         self._slow = files.Recent[bool](1000)
         self._preferences = files.Recent[Future[Preference]](AHEADS)
@@ -54,7 +55,7 @@ class Shields:
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
         key = tuple(policy_ids)
         return self._slow.get(
-            key, lambda: any(self._policies.record(id).about.method not in QUICK for id in key)
+            key, lambda: any(self.policies.record(id).about.method not in QUICK for id in key)
         )
 
     def note_slow(self, session: Session) -> None:
@@ -63,7 +64,7 @@ class Shields:
 
     def get(self, policy_ids: Sequence[str], config: Config) -> Shield:
         def make() -> Shield:
-            return make_shield([self._policies.policy(self._policies.record(id)) for id in policy_ids])
+            return make_shield([self.policies.policy(self.policies.record(id)) for id in policy_ids])
 
         return replace(self._shields.get(tuple(policy_ids), make), config=config)
 
@@ -74,12 +75,27 @@ class Shields:
             return shield
         return replace(shield, preference=self._preference_at_hand(shield, session))
 
-    def preparing(
-        self, name: str, keys: Sequence[str], pose: Sequence[float], owner: str
-    ) -> Future[Preference]:
-        """The preference that a session with these policies asks for, or will be."""
-        ids = [self._policies.find(key, owner).id for key in keys]
-        return self._prepare(name, ids, self.get(ids, Config()), pose)
+    async def prepared(
+        self, run: Run, shaping: str, keys: Sequence[str], pose: Sequence[float], owner: str
+    ) -> Preference:
+        """The preference that a session with these policies asks for, once it can be used. Raises
+        FragmentError where it cannot be prepared for the formula.
+        """
+
+        def begin() -> Future[Preference]:
+            ids = [self.policies.find(key, owner).id for key in keys]
+            return self._prepare(shaping, ids, self.get(ids, Config()), pose)
+
+        try:
+            preference: Preference = await asyncio.shield(asyncio.wrap_future(await run(begin)))
+            return preference
+        except FragmentError as error:
+            raise FragmentError(
+                f"{shaping!r} cannot be had for this formula: {error.message}",
+                path="shaping",
+                got=shaping,
+                expected="'projection', or a formula that 'reachability' takes",
+            ) from None
 
     def verdict(self, config: Mapping[str, Any], rows: Floats, names: Sequence[str]) -> tuple[str, Bounds]:
         """Of a rule on a session's rows [t + 1, 3 + signals], and the bounds on its robustness.
@@ -95,7 +111,7 @@ class Shields:
 
     def _judge(self, map_id: str, robot: str | dict[str, Any], spec: dict[str, Any]) -> Shield:
         """A task made anew for each verdict would stay for as long as what is prepared of it (`view_of`)."""
-        task = self._policies.task(Description(map_id, robot, spec, "", 0, {}))
+        task = self.policies.task(Description(map_id, robot, spec, "", 0, {}))
         body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
         return Shield(task, (), Config(), body, view, conjunction_of(task, task.formula))
 
@@ -130,27 +146,3 @@ class Shields:
         if found is None and (self._latest is None or self._latest.done()):
             found = self._prepare(name, ids, shield, session.poses[-1])
         return found.result() if found is not None and found.done() and found.exception() is None else None
-
-
-async def prepared(
-    run: Callable[..., Awaitable[Any]],
-    shields: Shields,
-    shaping: str,
-    keys: Sequence[str],
-    pose: Sequence[float],
-    owner: str,
-) -> Preference:
-    """The preference that a session with these policies asks for, once it can be used. run: calls a function
-    in a thread. Raises FragmentError where it cannot be prepared for the formula.
-    """
-    try:
-        preparing = await run(shields.preparing, shaping, keys, pose, owner)
-        preference: Preference = await asyncio.shield(asyncio.wrap_future(preparing))
-        return preference
-    except FragmentError as error:
-        raise FragmentError(
-            f"{shaping!r} cannot be had for this formula: {error.message}",
-            path="shaping",
-            got=shaping,
-            expected="'projection', or a formula that 'reachability' takes",
-        ) from None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,6 @@ from specshield.lookahead.preferences import PROJECTION
 from specshield.reasons import refusal
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
-from specshield.service.library.policies import Policies
 from specshield.service.schemas.sessions import SwitchRequest
 from specshield.service.sessions import history, record, rules
 from specshield.service.sessions.config import asked_by, settings_of
@@ -31,7 +30,7 @@ from specshield.service.sessions.session import (
     pack,
     there,
 )
-from specshield.service.sessions.shields import Shields, prepared
+from specshield.service.sessions.shields import Run, Shields
 from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Change, Store
@@ -41,18 +40,10 @@ from specshield.shield.signals import any_signal
 
 
 class Switches:
-    """Nothing is changed by a switch that is refused. run: calls a function in a thread."""
+    """Nothing is changed by a switch that is refused."""
 
-    def __init__(
-        self,
-        store: Store,
-        policies: Policies,
-        shields: Shields,
-        run: Callable[..., Awaitable[Any]],
-        heavy: Heavy,
-        settings: Settings,
-    ) -> None:
-        self._store, self._policies, self._shields = store, policies, shields
+    def __init__(self, store: Store, shields: Shields, run: Run, heavy: Heavy, settings: Settings) -> None:
+        self._store, self._policies, self._shields = store, shields.policies, shields
         self._run, self._heavy = run, heavy
         self._ttl, self._most = settings.session_ttl, settings.max_steps
 
@@ -94,8 +85,8 @@ class Switches:
             )
             return made
         if shaping != PROJECTION:
-            await prepared(self._run, self._shields, shaping, ids, wanted.row[:3].tolist(), owner)
-        here: Session = await self._run(switched, self._policies, self._shields, wanted, self._most)
+            await self._shields.prepared(self._run, shaping, ids, wanted.row[:3].tolist(), owner)
+        here: Session = await self._run(switched, self._shields, wanted, self._most)
         return here
 
 
@@ -175,10 +166,10 @@ def _foreseen(session: Session, step: bytes) -> Sequence[float]:
     return session.rows[-1, :3].tolist() if action is None else answer.next_poses[action]
 
 
-def switched(policies: Policies, shields: Shields, wanted: Wanted, most_steps: int) -> Session:
+def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
     """The session under its new rule. Raises PoseError, InfeasibleSwitch, InputError."""
     session, t, old = shields.settled(wanted.session), wanted.t, wanted.session.config
-    about = policies.record(wanted.policy_ids[0]).about
+    about = shields.policies.record(wanted.policy_ids[0]).about
     task = shields.get(wanted.policy_ids, Config()).task
     origin = t if wanted.clock == "restart" else rules.origin(old)
     last = origin + task.horizon + 1

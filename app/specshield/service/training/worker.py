@@ -148,9 +148,7 @@ class _Worker(Worker):
         reason = (
             f"the training process ended {how}; ask for it again, and it goes on from its last checkpoint"
         )
-        id, attempt = job.args
-        if self._jobs.report(id, attempt, status="failed", error=reason, eta_s=""):
-            _ended(self._jobs, job, "failed", reason)
+        _end(self._jobs, job, reason)
 
 
 def train(id: str, attempt: str) -> None:
@@ -171,30 +169,30 @@ def train(id: str, attempt: str) -> None:
     logs.tell("making a policy", policy_id=id)
     with _regularly(live):
         os.nice(10)  # this thread and those it starts: below servers and heavy/heavy.py; not signs of life
+        reason = None
         try:
             _train(settings, jobs, id, attempt, cancelled)
-            done: dict[str, Any] = {"status": "ready", "progress": 1, "eta_s": 0}
         except SpecshieldError as error:
-            done = {"status": "failed", "error": str(error), "eta_s": ""}
+            reason = str(error)
         except Exception as error:
             if cancelled.is_set():
                 return
             log.exception("training of %s", id)
             name = type(error).__name__  # its text may tell of the inside: paths, lines of code
-            said = f"an unexpected {name}; the worker's log says more"
-            done = {"status": "failed", "error": said, "eta_s": ""}
-        if jobs.report(id, attempt, **done):  # of no effect once cancelled
-            _ended(jobs, get_current_job(), done["status"], done.get("error"))
+            reason = f"an unexpected {name}; the worker's log says more"
+        _end(jobs, get_current_job(), reason)
 
 
-def _ended(jobs: Jobs, job: Any, state: str, error: str | None) -> None:
-    method = job.origin.removeprefix(queue_of(""))
-    with suppress(StoreError):  # a count that is lost is no reason to fail
-        jobs.ended(method, state)
+def _end(jobs: Jobs, job: Any, error: str | None) -> None:
+    """Notes that a run made its policy, or why it did not; of no effect once it was cancelled."""
+    (id, attempt), method = job.args, job.origin.removeprefix(queue_of(""))
+    state, progress = ("ready", {"progress": 1}) if error is None else ("failed", {})
     told = {} if error is None else {"error": error}
-    logs.tell(
-        "policy made" if error is None else "policy not made", policy_id=job.args[0], method=method, **told
-    )
+    if jobs.report(id, attempt, status=state, eta_s=0 if error is None else "", **progress, **told):
+        with suppress(StoreError):  # a count that is lost is no reason to fail
+            jobs.ended(method, state)
+        said = "policy made" if error is None else "policy not made"
+        logs.tell(said, policy_id=id, method=method, **told)
 
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
@@ -204,8 +202,7 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: thr
     from specshield.service.library.maps import Maps
     from specshield.service.library.policies import Policies
 
-    claims = Claims(lambda: jobs.redis, settings)
-    policies = Policies(settings, Maps(settings, claims), claims)
+    policies = Policies(settings, Maps(settings, Claims(lambda: jobs.redis, settings)))
     about = policies.record(id).about
 
     def on_progress(done: float, seconds_left: float, said: str) -> None:

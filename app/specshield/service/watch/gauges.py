@@ -11,6 +11,7 @@ from specshield.errors import StoreError
 from specshield.service.storage.store import Store
 from specshield.service.training.jobs import Jobs
 
+Kind = type[GaugeMetricFamily] | type[CounterMetricFamily]
 KEPT_FOR = 2.0  # [s] a scrape is answered from the one before; chosen by hand
 
 
@@ -49,12 +50,7 @@ def _up(value: int) -> Metric:
     return GaugeMetricFamily("specshield_store_up", "Whether the store answers.", value)
 
 
-def _by(
-    kind: type[GaugeMetricFamily] | type[CounterMetricFamily],
-    name: str,
-    help: str,
-    counts: dict[tuple[str, str], int],
-) -> Metric:
+def _by(kind: Kind, name: str, help: str, counts: dict[tuple[str, str], int]) -> Metric:
     family = kind(name, help, labels=["method", "state"])
     for labels, count in counts.items():
         family.add_metric(labels, count)

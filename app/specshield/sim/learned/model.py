@@ -89,14 +89,10 @@ def read(folder: Path) -> Shipped:
         raise NotFound(
             "there is no learned model", path="model", got=str(folder), expected=f"{WEIGHTS} and {CARD}"
         )
-    card = json.loads((folder / CARD).read_text())
-    return Shipped(check(read_tensors(path)), _temperature(card), card)
-
-
-def _temperature(card: Any) -> float:
+    card, weights = json.loads((folder / CARD).read_text()), check(read_tensors(path))
     value = card.get("temperature") if isinstance(card, dict) else None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.05 <= value <= 20.0:
         raise PolicyError(
             "not a temperature", path="card.temperature", got=value, expected="a number from 0.05 to 20"
         )
-    return float(value)
+    return Shipped(weights, float(value), card)

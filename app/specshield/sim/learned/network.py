@@ -75,21 +75,16 @@ def decoded(raw: Singles, last: Ints, futile: Ints, temperature: float) -> Float
 
 
 def _shapes() -> dict[str, tuple[int, ...]]:
-    shapes: dict[str, tuple[int, ...]] = {
-        "sense1.w": (FEATURES, 2 * UNITS), "sense1.b": (2 * UNITS,),
-        "sense2.w": (2 * UNITS, UNITS), "sense2.b": (UNITS,),
-        "last": (ACTIONS + 1, UNITS), "kind": (len(KINDS), UNITS),
-        "norm.w": (UNITS,), "norm.b": (UNITS,), "head.w": (UNITS, ACTIONS), "head.b": (ACTIONS,),
-    }  # fmt: skip
+    linear = {"sense1": (FEATURES, 2 * UNITS), "sense2": (2 * UNITS, UNITS), "head": (UNITS, ACTIONS)}
+    norms = ["norm"]
     for i in range(LAYERS):
-        for name, inputs, outputs in (
-            ("qkv", UNITS, 3 * UNITS), ("out", UNITS + 2 * len(SLOPES), UNITS),
-            ("up", UNITS, 4 * UNITS), ("down", 4 * UNITS, UNITS),
-        ):  # fmt: skip
-            shapes[f"{i}.{name}.w"], shapes[f"{i}.{name}.b"] = (inputs, outputs), (outputs,)
-        for name in ("norm1.w", "norm1.b", "norm2.w", "norm2.b"):
-            shapes[f"{i}.{name}"] = (UNITS,)
-    return shapes
+        linear |= {f"{i}.qkv": (UNITS, 3 * UNITS), f"{i}.out": (UNITS + 2 * len(SLOPES), UNITS)}
+        linear |= {f"{i}.up": (UNITS, 4 * UNITS), f"{i}.down": (4 * UNITS, UNITS)}
+        norms += [f"{i}.norm1", f"{i}.norm2"]
+    shapes: dict[str, tuple[int, ...]] = {"last": (ACTIONS + 1, UNITS), "kind": (len(KINDS), UNITS)}
+    for name, (inputs, outputs) in linear.items():
+        shapes |= {f"{name}.w": (inputs, outputs), f"{name}.b": (outputs,)}
+    return shapes | {f"{name}.{part}": (UNITS,) for name in norms for part in "wb"}
 
 
 SHAPES = _shapes()
