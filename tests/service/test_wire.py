@@ -5,7 +5,7 @@ import hiredis
 import pytest
 import redis
 
-from specshield.service.storage.wire import _Link
+from specshield.service.storage.wire import Script, Wire, _Link
 
 
 def test_an_answer_that_comes_too_late_is_nobody_elses():
@@ -55,3 +55,14 @@ def test_a_server_that_can_wait_for_no_replica_any_more_is_left():
         server.close()
 
     asyncio.run(scene())
+
+
+def test_a_server_that_goes_while_a_connection_is_made_cannot_be_reached():
+    """uvloop has no OSError for a write to what the other side has closed by then."""
+
+    async def gone():
+        raise RuntimeError("unable to perform operation on <TCPTransport closed=True>; the handler is closed")
+
+    wire = Wire(SimpleNamespace(make_connection=lambda: SimpleNamespace(connect=gone)), 60.0)
+    with pytest.raises(redis.ConnectionError, match="closed"):
+        asyncio.run(wire.run(Script("return 1"), [], []))

@@ -62,7 +62,10 @@ class Wire:
         async with asyncio.timeout_at(deadline), self._opening:
             if self._link is None or self._link.closed:
                 connection = self._pool.make_connection()
-                await connection.connect()
+                try:
+                    await connection.connect()
+                except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
+                    raise redis.ConnectionError(str(error)) from error
                 self._link = _Link(connection, self._replicas)
             return self._link
 
