@@ -11,7 +11,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from safetensors.numpy import load, save
 
+from specshield.errors import PolicyError
 from specshield.policy.reachability.policy import load_reachability, synthesise
 from specshield.reasons.explanation import explanations
 from specshield.robot import STRETCH, Action
@@ -75,6 +77,7 @@ def test_it_goes_round_by_the_wide_gap():
         (policy(), {"learn_map": False}),  # the map is known to be right
         (policy(BACK), {}),
         (policy(steps=20), {}),  # there is no time to go round
+        (policy(steps=28), {}),  # there is, with 3 steps to spare in place of 14
         (policy(wide=False), {}),
     ],
 )
@@ -113,3 +116,17 @@ def test_tables_for_ways_with_room_come_back_from_a_policy_s_file():
     assert not np.array_equal(kept, made.propose(history, {}, 0.0).motions)
     assert policy(BACK).keeping_clear() is policy(BACK)
     assert load_reachability(policy(BACK).weights(), policy(BACK).card, policy(BACK).task).wide is None
+
+
+def test_a_threshold_for_the_episode_gives_such_an_action_no_mass_either():
+    shield = shield_of(policy(), threshold=1.0, threshold_over="episode")
+    found = decide(shield, [(1.62, 0.75, 0.0)], np.zeros(5))
+    assert found.mode == "shaped"
+    assert found.distribution[ON] == 0.0
+
+
+def test_a_file_that_lacks_some_of_these_tables_says_which():
+    tensors = load(policy().weights())
+    del tensors["wide_code"]
+    with pytest.raises(PolicyError, match="wide_code"):
+        load_reachability(save(tensors), policy().card, policy().task)

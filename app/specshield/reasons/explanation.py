@@ -177,8 +177,8 @@ class _Motion:
         judged, own = self.judged, self.judged.tried.motions[:, 0] == self.motion
         if judged.tried.rho[own].max(initial=0.0) > SATISFIED_ABOVE >= judged.kept[own].max(initial=0.0):
             return (
-                f"the rule could still be kept, but only by ways that lead closer than {ROOM:g} m to an "
-                "obstacle, where a robot that cannot drive backwards may get stuck"
+                f"the rule could still be kept, but every way that was found leads closer than {ROOM:g} m to "
+                "an obstacle, where a robot that cannot drive backwards may get stuck"
             )
         told = "a way is known that keeps the rule, but the policies did not find it"
         margin, slack = judged.margin, judged.slack

@@ -92,15 +92,18 @@ def judge(shield: Shield, now: Situation) -> Judged:
             without_it = best_of(tried, others, motions)
             left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
             kept, best = others, without_it
+    follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
     if roomy:
         apart = _with_room(shield, prefix, tried, kept)
         roomy = apart.max() > SATISFIED_ABOVE
+        if roomy:  # but room is not bought with half of the time that is kept for what is not foreseen
+            room, none = (aim(shield, care, part, tried, each, leaves, follows) for each in (apart, kept))
+            roomy = room.slack >= min(none.slack, care.least // 2)
         kept = apart if roomy else kept
         best = best_of(tried, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and _some(best)):
-        follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
         # With a threshold for the episode all slacks count, not the most alone.

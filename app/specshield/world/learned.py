@@ -29,10 +29,6 @@ SENT, CONTACT, LEFT, RIGHT, BEHIND = range(5)
 FEW_ROWS = 64  # of new cells: with more of them, a clearance made anew takes as long (measured, 10 x 10 m)
 
 
-def _none() -> Ints:
-    return np.empty(0, np.int64)
-
-
 @dataclass(frozen=True, eq=False)
 class LearnedMap:
     """Changed cells, N of them.
@@ -43,10 +39,10 @@ class LearnedMap:
     """
 
     revision: int = 0
-    cell: Ints = field(default_factory=_none)
+    cell: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     occupied: Bools = field(default_factory=lambda: np.empty(0, np.bool_))
-    by: Ints = field(default_factory=_none)
-    step: Ints = field(default_factory=_none)
+    by: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    step: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
     @cached_property
     def digest(self) -> bytes:

@@ -137,6 +137,17 @@ def test_where_a_robot_stands_is_no_use_while_another_goal_is_due_before(robot, 
     assert best > 0.0
 
 
+def test_a_robot_that_cannot_wait_does_not_turn_for_a_later_goal_while_another_is_due():
+    task, body = two_rooms("F[0,30] West and F[60,80] West and F[0,58] East", RESTLESS)
+    pose = np.array([0.7, 1.5, 0.0])
+    best = -np.inf
+    for motions in synthesise(task).on_body(body).propose(pose[None], {}, 0.0).motions:
+        poses = np.empty((len(motions), 3))
+        simulate(body, pose, motions, poses)
+        best = max(best, robustness(task.formula, task.samples(np.concatenate([pose[None], poses]))))
+    assert best > 0.0
+
+
 def test_distances_lead_through_the_door_that_is_open():
     task, body = two_rooms("F[0,60] East and G[0,60] West")
     rules = make_rules(task)

@@ -112,11 +112,12 @@ class ReachabilityPolicy(Carded):
     @cached_property
     def _far(self) -> deque[tuple[Body, Floats]]:
         """The distances to the goals on the maps that were last used: a map changes seldom."""
-        return deque(maxlen=max(1, min(MAPS, MAPS_BYTES // self._body.clearance.nbytes)))
+        return deque(maxlen=max(2, min(MAPS, MAPS_BYTES // self._body.clearance.nbytes)))
 
     @property
     def _fields(self) -> Floats:
-        found = next((fields for body, fields in list(self._far) if _is_same(body, self._body)), None)
+        key = id(self._body.clearance), self._body.radius
+        found = next((far for b, far in list(self._far) if (id(b.clearance), b.radius) == key), None)
         if found is None:
             found = distances(self._body, self._goals)
             self._far.append((self._body, found))
@@ -217,11 +218,6 @@ class ReachabilityPolicy(Carded):
             simulate(self._body, pose, row, led)
         rate(view, known, 0, poses, held, rho, np.empty((len(motions), view.tree.size)))
         return bool(rho.max() > SATISFIED_ABOVE)
-
-
-def _is_same(one: Body, other: Body) -> bool:
-    """Whether two bodies are of one robot on one map."""
-    return one.clearance is other.clearance and one.radius == other.radius
 
 
 def synthesise(

@@ -21,13 +21,14 @@ from specshield.policy.shape import MAX_HEADINGS, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.task import Task
 
+Tensors = dict[str, NDArray[Any]]
 WIDE = "wide_"  # begins the names of the arrays of the tables for ways with room
 
 
 def stored(tables: Tables, wide: Tables | None, narrow: Bools, asked: float) -> bytes:
     """The file. wide, narrow [K] as a policy has them; asked: the pitch that its options ask for [m]."""
     names = ("cell", "bits") if len(tables.bits) else ("cell", "code", "table")
-    tensors: dict[str, NDArray[Any]] = {name: getattr(tables, name) for name in names}
+    tensors: Tensors = {name: getattr(tables, name) for name in names}
     if wide is not None:
         tensors |= {WIDE + name: getattr(wide, name) for name in names}
     if narrow.any():
@@ -42,23 +43,23 @@ def read_tables(weights: bytes | Path, task: Task, asked: float) -> tuple[Tables
     does not fit the task.
     """
     rules, tensors = make_rules(task), read_tensors(weights)
-    wide = {name[len(WIDE) :]: tensors.pop(name) for name in list(tensors) if name.startswith(WIDE)}
+    wide = {name: tensors.pop(name) for name in list(tensors) if name.startswith(WIDE)}
     narrow = _narrow_of(tensors.pop("narrow", None), len(rules.kind))
     pitch = _pitch_of(tensors, task, asked)
     tables = _tables_of(tensors, task, rules, pitch)
-    return tables, narrow, _tables_of(wide, task, rules, pitch) if wide else None
+    return tables, narrow, _tables_of(wide, task, rules, pitch, WIDE) if wide else None
 
 
-def _tables_of(tensors: dict[str, NDArray[Any]], task: Task, rules: Rules, pitch: float) -> Tables:
+def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str = "") -> Tables:
     sets = 1 << len(goals_of(rules))
     if task.robot.wait_motion < 0:
-        cell, bits = named_arrays(tensors, {"cell": (np.int32, 2), "bits": (np.uint8, 4)})
+        cell, bits = named_arrays(tensors, {f"{of}cell": (np.int32, 2), f"{of}bits": (np.uint8, 4)})
         headings = _checked_headings(bits.shape[2])
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
         _check_fit(cell, side_of(task.grid, pitch), bits.shape[1], bits.shape == size, f"bits {list(size)}")
         return step_tables(rules, task.horizon, cell, bits, pitch)
     cell, code, table = named_arrays(
-        tensors, {"cell": (np.int32, 2), "code": (np.uint16, 3), "table": (np.int32, 2)}
+        tensors, {f"{of}cell": (np.int32, 2), f"{of}code": (np.uint16, 3), f"{of}table": (np.int32, 2)}
     )
     phases, headings = phases_of(rules, task.horizon), _checked_headings(code.shape[2])
     fits = table.shape == (len(phases), sets) and table.min() >= -1 and table.max() < code.shape[0]
@@ -67,7 +68,7 @@ def _tables_of(tensors: dict[str, NDArray[Any]], task: Task, rules: Rules, pitch
     return time_tables(rules, phases, cell, code, table, pitch)
 
 
-def _pitch_of(tensors: dict[str, NDArray[Any]], task: Task, asked: float) -> float:
+def _pitch_of(tensors: Tensors, task: Task, asked: float) -> float:
     """The lattice's pitch [m]: one that had to grow is in the file, the others go by the number of cells."""
     kept, cell = tensors.pop("pitch", None), tensors.get("cell")
     if kept is not None:

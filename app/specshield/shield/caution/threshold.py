@@ -48,6 +48,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     if formula is not prefix.formula:
         prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried)
+    rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # what is set aside does not count
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     find_open(parts, prefix.known, prefix.t, still)
     begins, noise = parts.a, care.noise
@@ -63,7 +64,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
         care.stride,
         care.margin,
         leaves,
-        tried.rho,
+        rho,
         tried.motions,
         task.robot.wait_motion,
         values,

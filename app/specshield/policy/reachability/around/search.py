@@ -158,7 +158,8 @@ def _linger(guide: Guide, t: int, n: int, way: Ints, led: Floats, scratch: Scrat
         holds = goals_settled(rules, scratch.status)
         for k in range(rules.kind.shape[0]):
             if rules.kind[k] != ALWAYS and scratch.status[k] == PENDING:
-                holds = holds or predicate_at(rules, k, x, y, theta, scratch) > rules.margin
+                waits = _has_time(rules, t + n, scratch.status, scratch.run, k)
+                holds = holds or (waits and predicate_at(rules, k, x, y, theta, scratch) > rules.margin)
         if not holds or is_broken(scratch.status):
             break
         x, y, theta = step(guide.body, x, y, theta, turning)
@@ -225,8 +226,8 @@ def _reach(
             if ahead < BAND and bounded:
                 tree.table[slot] = -1  # the end of its chain; its row goes to the next pose
                 continue
-            ahead = max(ahead, BAND) if guide.wait >= 0 else SAFE
             spare = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
+            ahead = max(ahead, BAND) if guide.wait >= 0 or ahead >= SAFE or spare == math.inf else spare
             size = push(tree.heap, size, count, -(min(ahead, spare) + ONWARD * (s + 1)))
             count += 1
     return GAVE_UP if count == tree.made.shape[0] else NO_WAY
