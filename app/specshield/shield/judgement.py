@@ -96,7 +96,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
     if roomy:
         apart = _with_room(shield, prefix, tried, kept)
         roomy = apart.max() > SATISFIED_ABOVE
-        if roomy:  # but room is not bought with half of the time that is kept for what is not foreseen
+        if roomy:  # but a way with room may cost half of the slack that is asked for, and no more
             room, none = (aim(shield, care, part, tried, each, leaves, follows) for each in (apart, kept))
             roomy = room.slack >= min(none.slack, care.least // 2)
         kept = apart if roomy else kept

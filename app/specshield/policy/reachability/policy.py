@@ -92,11 +92,7 @@ class ReachabilityPolicy(Carded):
         return self._but(self._body, early=steps, wanted=wanted)
 
     def keeping_clear(self) -> ReachabilityPolicy:
-        """The policy for ways with room beside them (robot/room.py)."""
-        return self._with_room
-
-    @cached_property
-    def _with_room(self) -> ReachabilityPolicy:
+        """The policy for ways with room beside them (robot/room.py); itself where it has no such tables."""
         return self if self.wide is None else self._but(widened(self._body), tables=self.wide)
 
     def _but(self, body: Body, **changed: Any) -> ReachabilityPolicy:

@@ -149,8 +149,9 @@ def go_around(
 
 @leaf
 def _linger(guide: Guide, t: int, n: int, way: Ints, led: Floats, scratch: Scratch) -> tuple[int, int]:
-    """Turns on the spot after way[:n] while some goal holds there that is still to be settled, and to the
-    horizon where every goal is settled. STUCK where another goal is next; how many motions there are then.
+    """Turns on the spot after way[:n] while some goal that is still to be settled holds there, and to the
+    horizon where every goal is settled. Returns STUCK where another goal is next, and how many motions there
+    are then. way (T - t,) and led (T - t, 3), where it leads, are written from n on.
     """
     rules, turning = guide.rules, turning_motion(guide.body)
     x, y, theta = led[n - 1, 0], led[n - 1, 1], led[n - 1, 2]
