@@ -16,7 +16,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +135,7 @@ def digest(decision: Decision) -> str:
 LATER = (
     "carry", "warnings", "margin", "slack", "threshold_left", "map_revision", "any_signal", "explanations",
 )  # fmt: skip
-FIELDS = sorted(each.name for each in fields(Decision) if each.name not in LATER)
+FIELDS = sorted({*Decision._fields} - {*LATER})
 
 
 def _plain(value: Any) -> Any:

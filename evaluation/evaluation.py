@@ -10,7 +10,7 @@ import multiprocessing
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from evaluation import jobs
 from evaluation.experiment import Experiment
 from evaluation.runs import Record, run
 from specshield.errors import InputError
+from specshield.sim.campaign import each_done
 
 ABOUT = "experiment.json"
 Missing = Mapping[int, Sequence[str]]  # {run: methods}
@@ -64,13 +65,10 @@ def _over_processes(experiment: Experiment, missing: Missing, processes: int) ->
     for name in THREADS:  # one thread each: the processes share the cores out
         os.environ.setdefault(name, "1")
     with workers(processes) as pool:
-        under_way: set[Future[list[Record]]] = {
-            pool.submit(run, experiment, i, list(names)) for i, names in missing.items()
-        }
-        while under_way:
-            finished, under_way = wait(under_way, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield future.result()
+        for _, records in each_done(
+            pool.submit(run, experiment, i, [*names]) for i, names in missing.items()
+        ):
+            yield records
 
 
 @contextmanager

@@ -107,7 +107,7 @@ class Shielded:
     def act(self, history: Floats, logits: Floats | None, draw: float) -> Answer:
         decision = decide(self._shield, history, logits, logits is None, carry=self._carry)
         alone = (None,) * len(decision.carry.witnesses)
-        self._carry = decision.carry if self._carries else replace(decision.carry, witnesses=alone)
+        self._carry = decision.carry if self._carries else decision.carry._replace(witnesses=alone)
         distribution, action, mode = self._chosen(decision, logits, draw)
         moves = decision.completion_action if self._shield.task.robot.terminal[action] else action
         return Answer(

@@ -107,6 +107,7 @@ def serve(
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs
+    from specshield.service.workers import notice_killed
 
     settings = _settings()  # what is wrong with them is said here, in one line
     _check_address(host, port)
@@ -144,6 +145,7 @@ def serve(
         return
     with tempfile.TemporaryDirectory(prefix="specshield-metrics-") as folder:
         os.environ["PROMETHEUS_MULTIPROC_DIR"] = folder  # before prometheus_client is imported
+        notice_killed()
         uvicorn.run("specshield.service.app:create_app", factory=True, **options)
     if embedded is not None:
         embedded.leave()

@@ -30,8 +30,7 @@ def carried_over(
     if carry is None:
         return begun(way)
     stays = same_map and same_robot and later == 0
-    return replace(
-        carry,
+    return carry._replace(
         t=carry.t if stays else NEVER,
         next_poses=carry.next_poses if stays else np.empty((0, 3)),
         witnesses=(None,) * len(carry.witnesses) if stays else (),
@@ -50,4 +49,4 @@ def _learned(learned: bytes | None, later: int) -> bytes | None:
     if not learned or not later:
         return learned
     known = Taught.from_bytes(learned)
-    return replace(known, map=replace(known.map, step=known.map.step - later)).to_bytes()
+    return known._replace(map=replace(known.map, step=known.map.step - later)).to_bytes()

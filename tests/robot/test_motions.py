@@ -63,6 +63,12 @@ def test_which_motion_stands_still_or_comes_nearest():
     assert robot_from_json({"footprint": {"radius": 0.1}, "actions": ACTIONS[:5]}).wait_motion == -1
 
 
+def test_which_robots_go_back():
+    assert STRETCH.goes_back
+    forward = {"footprint": {"radius": 0.1}, "actions": [ACTIONS[GO], ACTIONS[ARC]]}
+    assert not robot_from_json(forward).goes_back
+
+
 def test_which_robots_turn_in_place():
     assert turning_motion(body_of(GO, LEFT)) == 1
     assert turning_motion(body_of(GO, ARC, WAIT)) == -1

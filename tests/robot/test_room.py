@@ -8,7 +8,7 @@ import numpy as np
 
 from specshield.robot import STRETCH, Action
 from specshield.robot.dynamics import make_body, simulate
-from specshield.robot.room import ROOM, goes_back, has_room, widened
+from specshield.robot.room import ROOM, has_room, widened
 from specshield.world.occupancy import OccupancyGrid
 
 ON, LEFT, WAIT = range(3)
@@ -37,8 +37,3 @@ def test_what_is_near_at_the_start_may_stay_as_near_and_come_no_nearer():
     assert room_of((1.0, low, np.pi / 2), ON, LEFT) == [True]  # away from it
     assert room_of((1.0, low + 0.02, -np.pi / 4), WAIT, ON) == [True]  # f has it stay, larger or not
     assert room_of((1.0, low + 0.16, -np.pi / 4), WAIT, ON) == [False]  # nearer
-
-
-def test_a_robot_that_has_a_motion_backwards_goes_back():
-    assert not goes_back(BODY)
-    assert goes_back(make_body(STRETCH, OccupancyGrid(np.zeros((20, 40), bool), 0.05)))

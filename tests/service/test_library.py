@@ -254,6 +254,29 @@ def test_a_policy_is_for_its_owners_map_though_anothers_has_the_same_cells(libra
     maps.delete(own, "ben")
 
 
+def test_a_server_lists_what_others_keep_behind_the_same_url_and_copies_weights_only_to_use_them(
+    claims, tmp_path
+):
+    def server(name):
+        settings = Settings(data_dir=tmp_path / name, data_url=f"memory://{tmp_path.name}")
+        maps = Maps(settings, claims)
+        return Policies(settings, maps), maps
+
+    (policies, maps), (others, _) = server("one"), server("other")
+    map_id = maps.add(OccupancyGrid(cells(), RESOLUTION), {}, ANN).id
+    made = policy_files()
+    card = json.loads(made["card"])
+    sent = policies.add_card(describe(card), card, made["weights"], ANN)
+    assert sent in others.page("ann", None, 99)[0]
+    weights = others._folder / sent.id / "policy.safetensors"
+    assert not weights.exists()
+    assert others.policy(others.find(sent.id, "ann")).id == sent.id
+    assert weights.read_bytes() == made["weights"]
+    erase(others, claims, sent, "ann")
+    assert sent.id not in [record.id for record in policies.page("ann", None, 99)[0]]
+    maps.delete(map_id, "ann")
+
+
 def test_policies_that_an_older_version_kept_go_on(library, claims):
     """Their ids did not cover the map, so that one was noted as used on two."""
     policies, maps = library

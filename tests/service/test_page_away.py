@@ -74,6 +74,16 @@ def test_what_watches_a_fleet_lasts_through_a_restart(tmp_path):
     assert [text for text in complaints if "ERR_" not in text and "503" not in text] == []
 
 
+def test_a_view_that_cannot_be_read_is_told_and_the_page_does_not_begin_anew_for_ever(server):
+    with browsing() as (page, _):
+        page.route("**/views/maps.js", lambda route: route.abort())
+        page.goto(f"{server.url}/#/maps")
+        page.get_by_role("heading", name="This cannot be shown").wait_for()
+        page.unroute("**/views/maps.js")
+        page.reload()
+        page.get_by_role("heading", name="Maps").wait_for()
+
+
 def test_a_trial_lasts_through_lost_answers_and_is_closed_when_it_is_left(server, client, policy):
     """A double click before the map is there begins one session. A step whose answer is lost is sent again as
     it was, with the obstacle that it tells of.

@@ -95,7 +95,7 @@ def decisions(draw):
 def expected(decision, every, explain):
     """The answer's members, straight from the decision."""
     residual = decision.residual
-    shown = {name: getattr(decision, name) for name in decision.__dataclass_fields__ if name != "carry"}
+    shown = {name: getattr(decision, name) for name in decision._fields if name != "carry"}
     shown |= {
         "distribution": decision.distribution,
         "next_poses": decision.next_poses,

@@ -122,7 +122,7 @@ def test_no_motion_is_certified_because_a_mere_mark_would_stop_it():
     assert decide(shield, poses, None, True).j_values[AHEAD] == 0.0
     wall = learn(grid, LearnedMap(revision=1), 0, np.arange(15 * 80 + 24, 25 * 80, 80), True, CONTACT)
     marked = Taught(wall)
-    carry = replace(decide(shield, poses, None, True).carry, t=0, learned=marked.to_bytes())
+    carry = decide(shield, poses, None, True).carry._replace(t=0, learned=marked.to_bytes())
     found = decide(shield, [*poses, *poses], None, True, carry=carry)
     ends = on_map(shield, marked.map).body
     assert step(ends, *poses[0], AHEAD)[0] < 1.2
@@ -208,7 +208,7 @@ def test_a_decision_is_the_same_where_the_carry_was_stored_and_the_process_is_an
     shield = shield_of(30, learn_map=True)
     first = decide(shield, [START], None, True, occupied=BOX)
     on_map(shield, Taught.from_bytes(first.carry.learned).map)
-    stored = replace(first.carry, learned=bytes(first.carry.learned))
+    stored = first.carry._replace(learned=bytes(first.carry.learned))
     again = decide(shield_of(30, learn_map=True), [START], None, True, occupied=BOX)
     assert again.carry.learned == stored.learned
     assert again.witness == first.witness
@@ -323,7 +323,7 @@ def test_a_motion_that_goes_on_where_f_stops_it_is_no_noise_and_is_not_relied_on
     decision = decide(shield, [START], None, True, occupied=[(0.725, 1.0)])  # 4.85 cm before the footprint
     foreseen, motion = decision.next_poses[AHEAD], int(STRETCH.motion_of[AHEAD])
     assert START[0] < foreseen[0] < START[0] + 0.05
-    carry = replace(decision.carry, learned=drawn_by(decision.carry.learned, motion))
+    carry = decision.carry._replace(learned=drawn_by(decision.carry.learned, motion))
     on = [(START[0] + 0.12, 1.0, 0.0), tuple(foreseen), (START[0] + 0.2, 1.0, 0.0)]
     found = [decide(shield, [START, pose], None, True, carry=carry) for pose in on]
     assert [len(each.carry.stuck) for each in found] == [1, 0, 1]
@@ -338,7 +338,7 @@ def test_a_motion_that_goes_on_where_f_stops_it_is_no_noise_and_is_not_relied_on
 
 def drawn_by(learned, motion):
     before = Taught.from_bytes(learned)
-    return replace(before, followed=replace(before.followed, drawn=motion)).to_bytes()
+    return before._replace(followed=before.followed._replace(drawn=motion)).to_bytes()
 
 
 @pytest.mark.parametrize(("y", "counts"), [(0.35, False), (1.0, True)])

@@ -48,7 +48,7 @@ def test_v_is_never_above_what_the_best_policy_has(formula, make):
         _, care = learn(shield, None, poses)
         slip = vector["slip"]
         sure = care.noise._replace(lost=max(1e9 * slip, 1e-9), kept=1e9 * (1.0 - slip))  # as Storm is told it
-        care = replace(care, noise=sure)
+        care = care._replace(noise=sure)
         judged = judge(shield, Situation(prefix, None, "pending", care))
         found.append(
             (
@@ -107,7 +107,7 @@ def test_v_is_never_above_what_was_computed_by_hand(formula, forward, wait):
     poses = np.array([cells.pose(0, 0, 0)])
     prefix = prefix_of(cells.task, cells.task.formula, shield.view, poses, {})
     _, care = learn(shield, None, poses)
-    care = replace(care, noise=care.noise._replace(lost=2e8, kept=8e8))
+    care = care._replace(noise=care.noise._replace(lost=2e8, kept=8e8))
     judged = judge(shield, Situation(prefix, None, "pending", care))
     values = chances(shield, care, prefix, judged, np.zeros(len(shield.task.robot.motions), bool))
     assert values[0] <= forward + 1e-6

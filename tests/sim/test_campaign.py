@@ -4,9 +4,11 @@ import dataclasses
 import multiprocessing
 import os
 import re
+import signal
 import sys
+import threading
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from PIL import Image, ImageColor
 
 from specshield.drawing import colors
 from specshield.sim import canvas, picture, report
-from specshield.sim.campaign import robots, run
+from specshield.sim.campaign import each_done, robots, run
 from specshield.stl import parse
 from tests.oracles.judge import margin
 from tests.serving import HUNG, wait_for
@@ -27,6 +29,26 @@ SEED = 0
 def campaign(server, case):
     with robots(server.url) as several:
         yield run(several, case.name, RUNS, seed=SEED)
+
+
+def test_an_interrupt_comes_between_two_results_and_nowhere_else():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        first, second = Future(), Future()
+        second.set_result("b")
+        found = each_done([first, second])
+        assert next(found) == (1, "b")
+        first.set_result("a")
+        signal.raise_signal(signal.SIGINT)  # the program goes on with what it is about
+        assert next(found) == (0, "a")
+        with pytest.raises(KeyboardInterrupt):
+            next(found)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGINT]).start()
+        with pytest.raises(KeyboardInterrupt):
+            next(each_done([Future()]))
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

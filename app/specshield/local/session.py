@@ -130,7 +130,7 @@ class LocalSession:
             None if free is None else np.array(wire.point_values(free, "free")).reshape(-1, 2),
             explanations if explain else None,
         )
-        answer = _answer(replace(made, t=self.t), self.info, over, witnesses, explain)
+        answer = _answer(made._replace(t=self.t), self.info, over, witnesses, explain)
         self._poses.append(x_t)
         self._signals, self._carry, self._decisions[self.t] = held, made.carry, answer
         self.t += 1
@@ -284,7 +284,7 @@ class LocalSession:
 def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool, explain: bool) -> Decision:
     """The decision of the core as the SDK has it."""
     names = {each.name for each in fields(Decision)}
-    values = {name: value for name, value in vars(made).items() if name in names}
+    values = {name: value for name, value in made._asdict().items() if name in names}
     values |= {
         "distribution": tuple(made.distribution.tolist()),
         "next_poses": tuple(map(tuple, made.next_poses.tolist())),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -97,7 +97,7 @@ def switch(
         sure = on_map(shield, forget(known, known.occupied & (known.by != SENT)))  # contacts are guesses
         told = refusal(on_map(shield, known), history, signals or {}, sure.body)
         if told.way is not None:
-            found = begun(told.way) if carry is None else replace(carry, way=told.way)
+            found = begun(told.way) if carry is None else carry._replace(way=told.way)
             with suppress(InfeasibleSwitch):
                 switching.switch(shield, history, signals, found, elsewhere)
                 return told.way

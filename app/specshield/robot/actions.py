@@ -71,6 +71,11 @@ class Robot:
         return self.motions.index((0.0, 0.0)) if (0.0, 0.0) in self.motions else -1
 
     @cached_property
+    def goes_back(self) -> bool:
+        """Whether some motion leads the robot backwards."""
+        return any(translate < 0.0 for translate, _ in self.motions)
+
+    @cached_property
     def representative(self) -> Ints:
         """The lowest action index of each motion. Shape (M,)."""
         return np.array([int(np.argmax(self.motion_of == i)) for i in range(len(self.motions))])

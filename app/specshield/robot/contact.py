@@ -87,8 +87,10 @@ def free_distance(body: Body, u: float, v: float, limit: float) -> float:
 @leaf
 def _depth(body: Body, u: float, v: float) -> float:
     """How far inside occupied space a point lies [m]: to the nearest free square, MAX_DEPTH cells at most."""
-    h = body.resolution
-    height, width = body.occupied.shape
+    h, (height, width) = body.resolution, body.occupied.shape
+    most = MAX_DEPTH * h
+    if max(-u, u - width * h, -v, v - height * h) >= most:  # off the map, as far as that from any square
+        return most
     row, col = _cell(body, u, v)
     half = 4
     while True:  # a window that grows until nothing outside it can be nearer

@@ -10,16 +10,11 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
-from specshield.robot.dynamics import Body, displacements, step
+from specshield.robot.dynamics import Body, step
 
 # [m] how much larger. Chosen by hand: of 23 runs of a robot whose footprint lies 8 cm behind its origin, with
 # walls 5 cm off in case 1, 12 kept the rule without it, and 23 with 0.05. 0.08 and more cost more.
 ROOM = 0.05
-
-
-def goes_back(body: Body) -> bool:
-    """Whether some motion leads the robot backwards."""
-    return bool(np.any(displacements(body)[0] < 0.0))
 
 
 def widened(body: Body) -> Body:

@@ -14,7 +14,6 @@ import os
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -75,7 +74,7 @@ def _decide(task: Task) -> None:
         first = episode.decide(shield, [START], logits)
         record.make(first, record.Asked(START, logits, False), np.array(START), (), b"")
         second = [START, first.next_poses[0].tolist()]
-        carry = replace(first.carry, stuck=((*START, 0),))
+        carry = first.carry._replace(stuck=((*START, 0),))
         episode.decide(shield, second, logits, carry=carry, occupied=[[1.9, 0.5]], explain=explanations)
     refusal(shield, np.array([START]), {})
     _in_trouble(policy, logits)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from specshield.arrays import Floats
 from specshield.errors import InputError, PolicyError
-from specshield.quick import quick
 from specshield.robot.dynamics import Body, make_body
 from specshield.rule.early import Conjuncts, conjunction_of
 from specshield.rule.view import View, view_of
@@ -90,7 +89,6 @@ class Config:
             )
 
 
-@quick
 @dataclass(frozen=True)
 class Shield:
     """A task, the policies that propose futures for it and a session's settings, prepared once.
@@ -159,9 +157,7 @@ def make_shield(
 Stuck = tuple[float, float, float, int]
 
 
-@quick
-@dataclass(frozen=True)
-class Carry:
+class Carry(NamedTuple):
     """What one decision hands to the next: each motion's next pose and its certified continuation.
 
     next_poses [M, 3]. witnesses: one a motion, the T - t - 1 motions that follow it; None: not certified.
@@ -199,9 +195,7 @@ class Explanation:
     detail: str | None = None
 
 
-@quick
-@dataclass(frozen=True)
-class Decision:
+class Decision(NamedTuple):
     """The answer to one step; A actions. The fields are those of the HTTP contract.
 
     distribution [A]: pi*. j_values, robustness: one an action, None where nothing was evaluated; robustness

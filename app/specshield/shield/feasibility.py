@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Floats, Ints, copy_row
 from specshield.compiled import inlined, kernel
-from specshield.quick import quick
 from specshield.robot.dynamics import Body, calmest_motion, motion_count, step
 from specshield.rule.values import signal_rows
 from specshield.rule.view import View, look, rate, read_step, recall_prefix, value_count, view_of
@@ -30,9 +29,7 @@ SLOTS = 8  # remembered motions for each step of a future: enough that few share
 NOT_FINITE = "the formula's arithmetic is not finite along some futures; these certify nothing"
 
 
-@quick
-@dataclass(frozen=True)
-class Prefix:
+class Prefix(NamedTuple):
     """What was driven, and what it says of a formula: rho lies in [low, high] however it goes on.
 
     poses [t + 1, 3], t = len(poses) - 1; signals {name: [..t + 1]}; rows [t + 1, S]: the same as an array.
@@ -62,7 +59,7 @@ class Prefix:
     def of(self, formula: Formula) -> Prefix:
         """The same prefix as another formula sees it, a part of the task's own."""
         seen = prefix_of(self.task, formula, view_of(self.task, formula), self.poses, self.signals)
-        return replace(seen, held=self.held)
+        return seen._replace(held=self.held)
 
     def allows(self, pose: Floats) -> bool:
         """Whether the formula can still be kept if the next pose is this one (3,). False where its arithmetic
@@ -93,9 +90,7 @@ def prefix_of(task: Task, formula: Formula, view: View, poses: Floats, signals: 
     return Prefix(task, formula, poses, signals, rows, view, known, low, high, rows[-1:])
 
 
-@quick
-@dataclass(frozen=True)
-class Futures:
+class Futures(NamedTuple):
     """The futures that were tried at one step, several a motion, as the shield itself simulated them.
 
     motions [N, T - t]: each begins with the motion it is for. poses [N, T - t, 3]: where they lead. rho [N]:
@@ -260,9 +255,7 @@ def _is_pose(pose: Floats, x: float, y: float, theta: float) -> bool:
     return bool(pose[0] == x and pose[1] == y and pose[2] == theta)
 
 
-@quick
-@dataclass(frozen=True)
-class Best:
+class Best(NamedTuple):
     """The most robust future of each motion.
 
     robustness [M]: -inf where no future was proposed. row [M]: its row in `Futures`, -1 where there is none.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Bools, Bytes, Floats, Ints
 from specshield.compiled import kernel, leaf
-from specshield.quick import quick
 from specshield.robot.barred import in_vain
 from specshield.robot.room import has_room, widened
 from specshield.rule.residual import again, joined, left_over
@@ -28,9 +27,7 @@ from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict, robustness
 LESS = 4  # [steps] of slack, down to which V has ways asked for. Chosen by hand.
 
 
-@quick
-@dataclass(frozen=True)
-class Situation:
+class Situation(NamedTuple):
     """What the actions at one step are judged by.
 
     prefix: as the whole formula sees it. tail: the witness that the robot follows, one motion a byte. status:
@@ -43,9 +40,7 @@ class Situation:
     care: Care
 
 
-@quick
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """The actions' futures at one step."""
 
     tried: Futures
@@ -63,7 +58,7 @@ class Judged:
     vain: bool  # whether no future keeps the rule without what led nowhere before
     left_out: Bools  # [M]: only futures with that keep the rule, and others without it do
 
-    @cached_property
+    @property
     def some(self) -> bool:
         """Whether some action is feasible."""
         return True in self.feasible.tolist()
@@ -123,7 +118,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
-        tried = replace(tried, warnings=(*tried.warnings, *given_up(prefix)))
+        tried = tried._replace(warnings=(*tried.warnings, *given_up(prefix)))
     if tail and feasible[tail[0]]:
         first = tail[0]
     elif some and not feasible[first]:
@@ -183,8 +178,8 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
             rho = np.where(keeps.row >= 0, judged.tried.rho[keeps.row], -np.inf)
             robustness = np.append(rho, -np.inf)[robot.motion_of]
             less = shield.config.margin > 0.0 or shield.config.slack > 0
-            judged = replace(
-                judged, best=keeps, robustness=robustness, margin=0.0, slack=0, margin_unattainable=less
+            judged = judged._replace(
+                best=keeps, robustness=robustness, margin=0.0, slack=0, margin_unattainable=less
             )
     if not sure.any() or np.array_equal(sure, judged.feasible_motion):
         return judged
@@ -192,7 +187,7 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
     if not sure[robot.motion_of[completion]]:
         completion = int(robot.representative[np.argmax(np.where(sure, judged.best.robustness, -np.inf))])
     feasible = (robot.motion_of >= 0) & sure[robot.motion_of]
-    return replace(judged, feasible_motion=sure, feasible=feasible, completion=completion)
+    return judged._replace(feasible_motion=sure, feasible=feasible, completion=completion)
 
 
 @kernel

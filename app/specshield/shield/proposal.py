@@ -10,22 +10,19 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel
-from specshield.quick import quick
 from specshield.task import Task
 
 MAX_MOTIONS = 1_000_000  # in one proposal, all rows together: 32 MB while they are simulated
 log = logging.getLogger("specshield")
 
 
-@quick
-@dataclass(frozen=True)
-class Proposal:
+class Proposal(NamedTuple):
     """Futures to the horizon, usually one after each first motion.
 
     motions [N, T - t]: indices into `Robot.motions`; a row is the future of the motion that it begins with.

@@ -62,6 +62,6 @@ def _judged_at_worst(shield: Shield, now: Situation) -> tuple[Shield, Situation,
     if held is None:
         return None
     proposers = tuple(adapted(p, "foreseeing", held[0]) for p in shield.proposers)
-    shield, now = replace(shield, proposers=proposers), replace(now, prefix=replace(now.prefix, held=held))
+    shield, now = replace(shield, proposers=proposers), now._replace(prefix=now.prefix._replace(held=held))
     judged = judge(shield, now)
     return (shield, now, judged) if judged.some else None

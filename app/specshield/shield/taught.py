@@ -10,19 +10,18 @@ import math
 import struct
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from threading import Lock
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from specshield.arrays import Bools, Floats
 from specshield.compiled import kernel, leaf
-from specshield.quick import quick
 from specshield.robot.barred import NOTHING_BARRED, is_barred
 from specshield.robot.dynamics import Body, displacement, displacements, make_body, overlap, successors, wrap
-from specshield.robot.room import goes_back
 from specshield.shield.caution.experience import SELDOM, chance_of, was_stopped, went_on, within_noise
 from specshield.shield.decision import Carry, Shield, Stuck
 from specshield.shield.feasibility import Prefix
@@ -67,9 +66,7 @@ MOST_MET = 255  # contacts at one pose that HEAD can hold
 NEVER_DRAWN = Followed()
 
 
-@quick
-@dataclass(frozen=True)
-class Taught:
+class Taught(NamedTuple):
     """What a session has learned: its map, and how its caller follows what is drawn.
 
     contact: whether the last motion ran into something, or on through it; it is not handed on. stuck: where
@@ -130,7 +127,7 @@ def teach(
         halts = halts_at(stuck, poses[-1], drawn, near)
         motion, followed = contact_of(body, followed, poses[-2], poses[-1], carry.next_poses, near, halts > 0)
         if motion >= 0 and followed.met < 2 and not was_stopped(shield, carry, poses, halts):
-            motion, followed = -1, replace(followed, halted=motion, met=0)
+            motion, followed = -1, followed._replace(halted=motion, met=0)
         if motion < 0 and not (drawn >= 0 and is_near(carry.next_poses[drawn : drawn + 1], poses[-1], near)):
             on = went_on(body, poses[-2], carry.next_poses, poses[-1], near)
         if motion >= 0 or (halts > 0 and came_back and followed.halted == drawn):
@@ -200,7 +197,7 @@ def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
     config, room = shield.config, False
     least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
     if config.learn_map and config.uncertainty is not None:
-        least, room = max(least, AROUND), not goes_back(shield.body)
+        least, room = max(least, AROUND), not shield.task.robot.goes_back
     on_way = on_way and config.uncertainty is not None
     return Care(care.margin, least, care.noise, care.stride, care.chance, barred, on_way, room)
 
@@ -287,12 +284,12 @@ def handed_on(
     """
     if not shield.config.learn_map and not taught.map.revision:
         return None
-    followed = replace(taught.followed, drawn=drawn)
+    followed = taught.followed._replace(drawn=drawn)
     if followed.follows and followed.by_chance >= SELDOM:
         chance = partial(chance_of, shield, distribution, moved, nexts)
         going, standing = chance(nexts[drawn] if drawn >= 0 else pose), chance(pose)
-        followed = replace(followed, going=going, standing=standing)
-    return replace(taught, followed=followed).to_bytes()
+        followed = followed._replace(going=going, standing=standing)
+    return Taught(taught.map, followed).to_bytes()
 
 
 _bodies: OrderedDict[tuple[str, bytes], Body] = OrderedDict()

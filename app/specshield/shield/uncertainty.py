@@ -18,7 +18,6 @@ from typing import NamedTuple
 from specshield.arrays import Floats
 from specshield.compiled import leaf
 from specshield.errors import InputError
-from specshield.quick import quick
 
 MOST_TRANSLATION = 10.0  # [m] a motion that is less certain than this is none. Chosen by hand.
 CHANCE = 0.01  # that margin and slack do not suffice in an episode: half of it for each. Chosen by hand.
@@ -72,9 +71,7 @@ class Noise(NamedTuple):
 EXACT = Noise(0.0, 0.0, 0.0, 1.0, 1.0)
 
 
-@quick
-@dataclass(frozen=True)
-class Care:
+class Care(NamedTuple):
     """What J asks for beyond satisfaction at one step.
 
     margin [m]; least [steps]: the slack of every deadline. noise: because of which more of it is asked for.

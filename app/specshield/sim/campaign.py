@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from multiprocessing import active_children, get_context, parent_process
+from queue import SimpleQueue
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,6 +24,7 @@ from specshield.sim.episodes import Episode, with_shield, without_shield
 from specshield.sim.learned.model import load_learned
 from specshield.sim.robot import Pose
 
+T = TypeVar("T")
 PATIENCE = 60.0  # [s] for one decision: other work may share the machine
 MOST_ROBOTS = 8  # processes at once, of 190 MB each; chosen by hand
 DRAWS = 100  # starts tried for one episode before giving up
@@ -77,12 +80,40 @@ def run(
     named: whether the sessions' ids say what they are, such as `case1-0-shielded` and `case1-0-alone`: for a
     server that has no others.
     """
-    futures = [robots.submit(_pair, case, i, seed, named) for i in range(runs)]
-    for done, finished in enumerate(as_completed(futures), 1):
-        finished.result()
-        on_progress(done)
-    shielded, unshielded, refused = zip(*(future.result() for future in futures), strict=True)
+    pairs = dict[int, tuple[Episode, Episode, int]]()
+    for i, pair in each_done(robots.submit(_pair, case, i, seed, named) for i in range(runs)):
+        pairs[i] = pair
+        on_progress(len(pairs))
+    shielded, unshielded, refused = zip(*(pairs[i] for i in range(runs)), strict=True)
     return Campaign(load_case(case), seed, list(shielded), list(unshielded), sum(refused))
+
+
+def each_done(futures: Iterable[Future[T]]) -> Iterator[tuple[int, T]]:
+    """The number of each future and its result, as they come. An interrupt is raised between two of them.
+
+    Python would raise it wherever the program is. In the midst of taking one of the pool's locks, that leaves
+    the lock held, and the program waits for it for ever when it ends.
+    """
+    done: SimpleQueue[Future[T] | None] = SimpleQueue()  # None: an interrupt came
+    raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    raises = raises and threading.current_thread() is threading.main_thread()
+    if raises:
+        signal.signal(signal.SIGINT, lambda *_: done.put(None))
+    try:
+        number = dict[Future[T], int]()
+        for future in futures:
+            number[future] = len(number)
+            future.add_done_callback(done.put)
+        left = len(number)
+        while left or not done.empty():
+            found = done.get()
+            if found is None:
+                raise KeyboardInterrupt
+            left -= 1
+            yield number[found], found.result()
+    finally:
+        if raises:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 _client: ShieldClient | None = None  # of a process that drives robots

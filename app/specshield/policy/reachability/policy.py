@@ -37,7 +37,7 @@ from specshield.policy.reachability.tables import Guide, Tables
 from specshield.policy.shape import lattice_shape
 from specshield.robot.barred import NOTHING_BARRED, in_vain
 from specshield.robot.dynamics import Body, calmest_motion, make_body, simulate
-from specshield.robot.room import goes_back, widened
+from specshield.robot.room import widened
 from specshield.rule.values import signal_rows
 from specshield.rule.view import look, rate, view_of
 from specshield.shield.proposal import Proposal, joined
@@ -227,7 +227,7 @@ def synthesise(
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     pitch, cells = _extent(task, body, rules, settings)
     tables, narrow = _tables(task, body, rules, pitch, cells)
-    wide = None if goes_back(body) else _tables(task, widened(body), rules, pitch, cells)[0]
+    wide = None if task.robot.goes_back else _tables(task, widened(body), rules, pitch, cells)[0]
     policy = ReachabilityPolicy(task, {}, settings, tables, narrow, wide)
     metrics = {
         "feasible_start": round(policy.feasible_start(), 4),

@@ -43,12 +43,12 @@ def ids(folder: Path) -> list[str]:
     return sorted(name for name in names if HASH.fullmatch(name))
 
 
-def there(folder: Path) -> bool:
-    """Whether a map or policy is there. A copy is brought up to date first."""
+def there(folder: Path, *names: str) -> bool:
+    """Whether a map or policy is there. A copy is brought up to date first: all of it, or these files."""
     mirror = _mirrors.get(folder.parent)
     if mirror is None:
         return folder.is_dir()
-    missing = mirror.missing(folder.name)
+    missing = mirror.missing(folder.name, names)
     if missing is None:
         return False
     if not folder.is_dir():

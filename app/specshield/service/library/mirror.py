@@ -7,6 +7,7 @@ is missing. `MARK`, written last and removed first, says that a folder is there 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 from specshield.service.storage.objects import Objects
@@ -24,15 +25,17 @@ class Mirror:
         found = (path.split("/") for path, _ in self._remote.sizes(self._kind))
         return [parts[1] for parts in found if parts[2:] == [self._mark]]
 
-    def missing(self, id: str) -> dict[str, bytes] | None:
-        """The files that the copy lacks, the mark last; None where there is no such folder, or no more."""
+    def missing(self, id: str, only: Sequence[str] = ()) -> dict[str, bytes] | None:
+        """The files that the copy lacks, or those of `only`, the mark last; None where there is no such
+        folder, or no more.
+        """
         names = self._remote.names(f"{self._kind}/{id}")
         if self._mark not in names:
             shutil.rmtree(self._local / id, ignore_errors=True)
             return None
         found: dict[str, bytes] = {}
         for name in sorted(names, key=self._order):
-            if not (self._local / id / name).exists():
+            if (not only or name in only) and not (self._local / id / name).exists():
                 content = self._remote.read(f"{self._kind}/{id}/{name}")
                 if content is None:  # removed at this moment
                     return None

@@ -27,6 +27,7 @@ from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 
 KEPT_IN_MEMORY = 64
+SMALL = "policy.json", "card.json"  # of the files of a policy, all that a list shows
 log = logging.getLogger("specshield")
 
 
@@ -70,7 +71,7 @@ class Policies(Claimed):
             if key in (found.name, found.id):
                 return found
         folder = self._folder / key
-        there = files.HASH.fullmatch(key) and files.there(folder)
+        there = files.HASH.fullmatch(key) and files.there(folder, *SMALL)
         stored = files.find_json(folder / "policy.json") if there else None
         if stored is None:
             raise missing("policies", key)
@@ -122,6 +123,8 @@ class Policies(Claimed):
                 expected="a policy whose status is `ready`",
             )
         folder = self._models / record.name if record.name else self._folder / record.id
+        if record.name is None and not files.there(folder):
+            raise missing("policies", record.id)
         return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
 
     def resolve(self, about: Description, owner: str) -> Description:
@@ -246,14 +249,13 @@ class Policies(Claimed):
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[Record], str | None]:
         """One page of an owner's policies and those of all."""
-        own = (id for id in self.claims.ids("policies", owner) if (self._folder / id).is_dir())
         keys, following = files.page(
-            [*self._named, *own],
+            [*self._named, *self.claims.ids("policies", owner)],
             after,
             limit,
-            lambda key: sum(files.size(self._folder / key / name) for name in ("policy.json", "card.json")),
+            lambda key: sum(files.size(self._folder / key / name) for name in SMALL),
         )
-        found = [self.made_here(key) for key in keys]  # None: deleted at this moment
+        found = [self.made_here(key) for key in keys]  # None: not written to the end, or deleted by now
         return [record for record in found if record is not None], following
 
     def _map_of(self, id: str) -> str:

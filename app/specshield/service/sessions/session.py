@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
-from specshield.quick import quick
 from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
 from specshield.service.access.owners import shown
@@ -35,9 +33,7 @@ RACES = 10  # writes lost to others before a caller is told so
 OBJECTS, PARSED = 3_000, 10
 
 
-@quick
-@dataclass(frozen=True)
-class Session:
+class Session(NamedTuple):
     """A session as one read saw it. rows [length, 3 + signals]: x, y, theta and the signals held.
 
     rules: the config of each rule that it has had, the one in force last. settings: of that one.
@@ -234,7 +230,7 @@ def decide(
         explanations if asked.explain else None,
     )
     if decision.t != t:  # the rule's clock began after the session
-        decision = replace(decision, t=t)
+        decision = decision._replace(t=t)
     return decision, record.make(decision, asked, since[-1], names, before, tables)
 
 

@@ -124,7 +124,7 @@ class Shields:
             if rules.begins(session.rules[i + 1]) == begins and verdict == "pending":
                 last = session.rows[: begins + 1]
                 verdicts[i], _ = self.verdict(session.rules[i], last, session.signal_names)
-        return replace(session, state=msgspec.structs.replace(session.state, verdicts=tuple(verdicts)))
+        return session._replace(state=msgspec.structs.replace(session.state, verdicts=tuple(verdicts)))
 
     def _prepare(
         self, name: str, policy_ids: Sequence[str], shield: Shield, pose: Sequence[float]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import numpy as np
 
@@ -60,7 +62,8 @@ class PackedCarry(msgspec.Struct, frozen=True, array_like=True):
 
 
 def pack_carry(carry: Carry) -> PackedCarry:
-    t, poses, *rest = vars(carry).values()
+    values: tuple[Any, ...] = carry
+    t, poses, *rest = values
     return PackedCarry(t, poses.astype("<f8", copy=False).tobytes(), *rest)
 
 

@@ -7,15 +7,14 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from operator import attrgetter
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import SpecshieldError
-from specshield.quick import quick
 from specshield.service import metrics
 from specshield.service.heavy.heavy import Heavy
 from specshield.service.library import files
@@ -51,9 +50,7 @@ SEVERAL = 4  # decisions; one or two may be long because kernels are loaded
 Tell = Callable[[str, bytes, bytes, State, Floats, StepRecord, StepAnswer], None]
 
 
-@quick
-@dataclass(frozen=True)
-class Decided:
+class Decided(NamedTuple):
     """A step decided on `session`, before it is written."""
 
     session: Session
@@ -164,7 +161,7 @@ class Steps:
                     self.recent.drop(id)
                 else:
                     held = len(change.state)
-                    self.recent.put(id, replace(decided.session, state=state, version=written, held=held))
+                    self.recent.put(id, decided.session._replace(state=state, version=written, held=held))
                 metrics.decided(decided.decision, told_later, timing)
                 return answer
             self.recent.drop(id)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -203,8 +203,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         "way": "",
     }
     verdict, _ = shields.verdict(old, session.rows, session.signal_names)
-    made = replace(
-        session,
+    made = session._replace(
         rules=[*session.rules, config],
         settings=settings_of(config),
         rows=rules.widened(session.rows, session.signal_names, signals),
@@ -231,4 +230,4 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         verdicts=(*session.state.verdicts, verdict),
         any_signal=any_signal(shield, seen[:, :3], columns(seen, names)),
     )
-    return replace(made, state=state)
+    return made._replace(state=state)

@@ -12,12 +12,11 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import anyio
 
 from specshield.errors import SessionExists
-from specshield.quick import quick
 from specshield.service.access.owners import between, shown
 from specshield.service.storage.connect import FAILURES, away, connect, is_cluster
 from specshield.service.storage.wire import PART, Script, Wire, too_few
@@ -60,9 +59,7 @@ class News:
     steps: list[bytes]
 
 
-@quick
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """What one write adds: `rows` from byte `offset` on, what step `t` left, the state after it. config: the
     one that takes the place of the stored one.
     """

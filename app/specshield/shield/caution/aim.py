@@ -7,7 +7,6 @@ to the most steps with which the margin can be had, and then the margin.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +20,7 @@ from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
 
 
-@dataclass(frozen=True)
-class Aimed:
+class Aimed(NamedTuple):
     """best: the best future of each motion. kept [M]: those that keep as much as can be had of what is asked.
 
     margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
@@ -72,7 +70,7 @@ def aim(
     motions = len(task.robot.motions)
     if before is not None:
         best, _ = at(before.most)
-        return replace(before, best=best, kept=best.robustness > margin)
+        return before._replace(best=best, kept=best.robustness > margin)
     best, had = at(high)
     if had:
         return Aimed(best, best.robustness > margin, care.margin, next_due, False, high)

@@ -9,14 +9,13 @@ was drawn, beyond doubt (`Followed.surely`), and only the second time in a row.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.portable import arctan2
-from specshield.quick import quick
 from specshield.robot.body import centre
 from specshield.robot.dynamics import TOUCH, Body, displacement, wrap
 from specshield.shield.caution.experience import SELDOM
@@ -33,9 +32,7 @@ THING = 0.3  # [m] how wide and deep a thing is taken to be that is on no map; c
 UNDER = 0.03  # [m] a footprint that covers a cell by more than this shows it free: three times the noise
 
 
-@quick
-@dataclass(frozen=True)
-class Followed:
+class Followed(NamedTuple):
     """What is known of how the caller follows: the motion drawn last (-1: none), whether all steps so far can
     be what was drawn, and the drawn motion that did nothing in the step before (-1: none). met: how many
     contacts there were at this very pose. by_chance: the probability that a caller who draws by itself seems
@@ -74,26 +71,26 @@ def contact_of(
     if drawn >= 0 and is_near(foreseen[drawn : drawn + 1], after, near):
         return -1, moved_on(followed, as_drawn=True)
     if is_near(before[None], after, near):  # it stands where it stood
-        followed = replace(followed, by_chance=followed.by_chance * followed.standing)
+        followed = followed._replace(by_chance=followed.by_chance * followed.standing)
         if drawn < 0 or not followed.surely:
-            return -1, replace(followed, halted=-1)
+            return -1, followed._replace(halted=-1)
         if followed.halted == drawn or followed.met or again:  # what stopped it a moment ago does so again
-            return drawn, replace(followed, halted=-1, met=followed.met + 1)
-        return -1, replace(followed, halted=drawn)
+            return drawn, followed._replace(halted=-1, met=followed.met + 1)
+        return -1, followed._replace(halted=drawn)
     if is_near(foreseen, after, near):
-        return -1, replace(followed, follows=False, halted=-1, met=0)
+        return -1, followed._replace(follows=False, halted=-1, met=0)
     short = _short(body, before, after, foreseen, near)
     if not short.any():
         return -1, moved_on(followed)
     motion = drawn if drawn >= 0 and short[drawn] else int(np.argmax(short))
-    return motion, replace(followed, halted=-1, met=1)
+    return motion, followed._replace(halted=-1, met=1)
 
 
 def moved_on(followed: Followed, as_drawn: bool = False) -> Followed:
     """After a motion that met nothing. as_drawn: whether it was the one that was drawn."""
     if as_drawn and followed.by_chance >= SELDOM and followed.going < 1.0:
-        followed = replace(followed, by_chance=followed.by_chance * followed.going)
-    return replace(followed, halted=-1, met=0) if followed.halted >= 0 or followed.met else followed
+        followed = followed._replace(by_chance=followed.by_chance * followed.going)
+    return followed._replace(halted=-1, met=0) if followed.halted >= 0 or followed.met else followed
 
 
 @kernel

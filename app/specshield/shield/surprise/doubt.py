@@ -6,7 +6,6 @@ Of contacts less is believed than is marked, one guess after the other.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -59,9 +58,9 @@ def doubted(taught: Taught, t: int) -> Iterator[Taught]:
     for held in GUESSES[first:] + GUESSES[:first]:
         stays = seen | np.isin(known.by, held)
         if not stays.all() and (~seen & stays).any():
-            yield replace(taught, map=revised(known, forget(known, ~stays)))
+            yield taught._replace(map=revised(known, forget(known, ~stays)))
     if not (seen | young).all():
-        yield replace(taught, map=revised(known, forget(known, ~(seen | young))))
+        yield taught._replace(map=revised(known, forget(known, ~(seen | young))))
 
 
 def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now: Situation) -> Judged:
@@ -85,8 +84,8 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
         first, _, lacks, helps = most_kept(free, judged.part, ways)
         first = first if helps else ways.preferred
         said = ("what was marked after contacts leaves no way, so it is ignored for this action", *lacks)
-    tried = replace(tried, warnings=(*tried.warnings, *said))
-    return replace(judged, tried=tried, completion=int(shield.task.robot.representative[first]))
+    tried = tried._replace(warnings=(*tried.warnings, *said))
+    return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 
 
 def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
@@ -94,7 +93,7 @@ def _that_wait(told: Shield, tried: Futures, first: int) -> Futures:
     still = np.full_like(tried.motions[:1], told.task.robot.wait_motion)
     still[0, 0] = first
     motions = np.concatenate([tried.motions[tried.motions[:, 0] == first], still])
-    return replace(tried, motions=motions, poses=np.empty((len(motions), *tried.poses.shape[1:])))
+    return tried._replace(motions=motions, poses=np.empty((len(motions), *tried.poses.shape[1:])))
 
 
 def _awaited(told: Shield, shield: Shield, taught: Taught, now: Situation) -> int | None:

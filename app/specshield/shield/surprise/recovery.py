@@ -7,8 +7,6 @@ nearest to the first part that is given up: what was not found by a search may s
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from specshield.robot.dynamics import simulate
@@ -33,7 +31,7 @@ def most_kept(
     whole[-1] = prefix.poses[-1]
     for motions, poses in zip(tried.motions, whole[:-1], strict=True):
         simulate(shield.body, prefix.poses[-1], motions, poses)
-    futures = replace(tried, poses=whole, motions=np.append(tried.motions, tried.motions[:1], 0))
+    futures = tried._replace(poses=whole, motions=np.append(tried.motions, tried.motions[:1], 0))
     left, said, lost = np.ones(len(whole), np.bool_), list[str](), list[Formula]()
     nearest = np.zeros(len(whole))
     for part in sorted(conjuncts(prefix.formula), key=_order):

@@ -16,6 +16,7 @@ const VIEWS = [
   [/^\/try\/([^/]+)$/, () => import("./views/trial.js")],
 ];
 
+const ANEW = "specshield.anew"; // in the tab: that the page began anew to read a module
 const main = document.querySelector("main");
 let leaving = new AbortController();
 
@@ -39,7 +40,7 @@ async function show() {
   try {
     await patiently(async () => {
       place.replaceChildren(); // what an attempt before has left
-      await (await module(load)).show(place, shown);
+      await (await module(load, signal)).show(place, shown);
     }, signal);
   } catch (error) {
     if (!signal.aborted) fail(place, error);
@@ -56,13 +57,22 @@ function found(path) {
   }
 }
 
-/** A view's module. That it cannot be read tells nothing of the server, so that the server is asked. */
-async function module(load) {
+/**
+ * A view's module. That it cannot be read tells nothing of the server, so that the server is asked. A browser
+ * does not read a module again that it could not read once, unless the page begins anew.
+ */
+async function module(load, signal) {
   try {
-    return await load();
-  } catch {
+    const loaded = await load();
+    sessionStorage.removeItem(ANEW);
+    return loaded;
+  } catch (error) {
     await fetched("page/main.js", { cache: "no-store" });
-    return load();
+    signal.throwIfAborted();
+    if (sessionStorage.getItem(ANEW)) throw error; // it did, and still cannot
+    sessionStorage.setItem(ANEW, "yes");
+    location.reload();
+    return new Promise(() => {}); // this page is about to go
   }
 }
 
