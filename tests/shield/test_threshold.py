@@ -1,7 +1,6 @@
 """A threshold over the episode: V beside a model checker's best policy, and asked against kept."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
