@@ -95,6 +95,21 @@ def test_each_rule_holds_over_its_own_steps(server, client, begin, step, switch,
     assert "from step 3, windows from step 3: F[0,8] End" in said
 
 
+def test_all_poses_that_are_told_with_a_switch_are_kept(
+    server, client, begin, step, switch, capsys, tmp_path
+):
+    session, poses = begin(), ahead(10)
+    driven(step, session, poses[:3])
+    for _ in range(2):  # the same switch again is the same
+        answer = switch(session, 6, LATER, clock="restart", poses=poses[3:7])
+        assert answer.status_code == 200, answer.text
+    driven(step, session, poses[6:9], since=6)
+    items = client.get(f"/v1/sessions/{session['id']}/trajectory").json()["items"]
+    assert [item["pose"] for item in items] == poses[:9]
+    status, said = told(capsys, tmp_path, record_of(client, session), data_dir=server.data_dir)
+    assert status == 0, said
+
+
 def test_the_state_in_which_a_rule_ends_is_its_last(client, begin, step, switch):
     """x_3 is in the first goal; the server hears of it after the switch, and before."""
     for told_later in (True, False):

@@ -13,6 +13,7 @@ from specshield.errors import InputError
 
 if TYPE_CHECKING:  # every command line reads this module
     from specshield.sim.cases import Case
+    from specshield.world.occupancy import OccupancyGrid
 
 
 def run_policy(
@@ -72,16 +73,24 @@ def _case(id: str, name: str, target: str | None, seed: int) -> Case:
         drawn = free_poses(task, make_body(task.robot, task.grid), 1, np.random.default_rng([seed, 1]))
         place = (float(drawn[0, 0]), float(drawn[0, 1]))
     else:
-        place = _target(target)
+        place = _target(target, task.grid)
     return Case(name, task, maps.get(about.map_id).rooms, about.spec, f"go to {_point(place)}", place)
 
 
-def _target(text: str) -> tuple[float, float]:
+def _target(text: str, grid: OccupancyGrid) -> tuple[float, float]:
+    """Raises InputError for what is no place, and for one where nothing can stand."""
     try:
-        x, y = json.loads(f"[{text}]")
-        return float(x), float(y)
+        x, y = map(float, json.loads(f"[{text}]"))
     except (ValueError, TypeError):
         raise InputError("not a place", path="--target", got=text, expected="x,y in metres") from None
+    if grid.is_occupied((x, y)):
+        raise InputError(
+            "the place is off the map, or an obstacle stands there",
+            path="--target",
+            got=text,
+            expected=f"a free place within {grid.bounds} (xmin, ymin, xmax, ymax)",
+        )
+    return x, y
 
 
 def _point(values: Sequence[float]) -> str:

@@ -184,8 +184,16 @@ def _expected(item: Mapping[str, Any]) -> str:
         "union_tag_not_found": "a value: this field is required",
         "model_type": "an object",
         "model_attributes_type": "an object",
+        "int_parsing": "a whole number",
+        "string_too_short": "at least {min_length} character",
+        "string_too_long": "at most {max_length} characters",
+        "string_pattern_mismatch": "a text of the form {pattern}",
+        "too_short": "at least {min_length} of them",
+        "too_long": "at most {max_length} of them",
     }
-    return told.get(item["type"], said.removeprefix("Value error, ").removeprefix("Input should be "))
+    if item["type"] in told:
+        return told[item["type"]].format(**context)
+    return said.removeprefix("Value error, ").removeprefix("Input should be ")
 
 
 def _path(item: Mapping[str, Any], body: Any) -> str:

@@ -94,11 +94,11 @@ class Session(NamedTuple):
         same = self.rules, self.settings, self.state, self.version
         return Session(*same, rows, self.signal_names, self.weight, self.held)
 
-    def added(self) -> tuple[bytes, int]:
+    def added(self, stored: int) -> tuple[bytes, int]:
         """The rows that a change has to write, and the byte where they begin: only what is new, and row 0
-        once more with the first step, which brings its signals.
+        once more with the first step, which brings its signals. stored: how many rows the store has.
         """
-        first = min(self.state.length, len(self.rows) - 1)
+        first = min(stored, len(self.rows) - 1)
         return pack(self.rows[first:]), first * 8 * self.rows.shape[1]
 
 

@@ -183,7 +183,7 @@ class Steps:
             finished=decision.finished,
             carry=pack_carry(decision.carry),
         )
-        return Change(state.packed(), *session.added(), request.t, content), state
+        return Change(state.packed(), *session.added(session.state.length), request.t, content), state
 
     async def _decide(self, session: Session, request: StepBody, timing: defaultdict[str, float]) -> Decided:
         ids = tuple(session.config["policy_ids"])

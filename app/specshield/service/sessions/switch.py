@@ -60,7 +60,7 @@ class Switches:
             wanted = _wanted(session, request, ids, found.step)
             made = await self._made(wanted, owner)
             before, after = session.rows.shape[1], made.rows.shape[1]
-            rows = made.added() if before == after else (pack(made.rows), 0)
+            rows = made.added(session.state.length) if before == after else (pack(made.rows), 0)
             state = msgspec.structs.replace(made.state, expires_at=time.time() + self._ttl)
             line = files.to_json(made.config)
             change = Change(state.packed(), *rows, config=b"\n".join([found.config, line]))

@@ -10,6 +10,9 @@ if (redis.call('HGET', KEYS[1], 'version') or '') ~= ARGV[1] then
   found[5] = ARGV[4] ~= '' and redis.call('LINDEX', KEYS[3], ARGV[4])
   return found
 end
+if tonumber(ARGV[2]) > redis.call('STRLEN', KEYS[2]) then
+  return redis.error_reply('rows are missing before those to write') -- SETRANGE would make them of zeros
+end
 -- A version tells apart two sessions of one id too: no other has this config.
 local begun, n = string.match(ARGV[1], '^(%x+):(%d+)$')
 if ARGV[1] == '' then
