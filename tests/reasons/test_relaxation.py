@@ -1,6 +1,7 @@
 """What is said of the conjuncts of a rule that cannot be kept is true: held against every future on cells."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -129,3 +130,14 @@ def test_whoever_lands_exactly_on_an_edge_is_one_step_short():
     found = relaxations(make_shield([synthesise(task)]), np.array([[1.5, 1.5, 0.0]]), {})
     assert found.way is None
     assert (found.conjuncts[0].late_by, found.conjuncts[0].feasible_alone) == (1, False)
+
+
+def test_a_heading_that_can_be_had_is_feasible_alone():
+    turns = [("go", 0.25, 0.0), ("left", 0.0, math.pi / 4), ("right", 0.0, -math.pi / 4), ("wait", 0.0, 0.0)]
+    actions = [{"name": name, "translate": far, "rotate": turn} for name, far, turn in turns]
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": actions})
+    formula = "F[0,3] x > 9 and F[0,7] theta > 1 and F[0,1] theta < -1"
+    task = make_task(OccupancyGrid(np.zeros((12, 40), bool), 0.25), robot, formula)
+    waiting = make_shield([Scripted(SimpleNamespace(task=task), waits)])
+    told = relaxations(waiting, np.array([[1.0, 1.0, 0.0]]), {}).conjuncts
+    assert [each.feasible_alone for each in told] == [False, True, False]

@@ -79,11 +79,14 @@ def _case(id: str, name: str, target: str | None, seed: int) -> Case:
 
 def _target(text: str, grid: OccupancyGrid) -> tuple[float, float]:
     """Raises InputError for what is no place, and for one where nothing can stand."""
+    import numpy as np
+
     try:
         x, y = map(float, json.loads(f"[{text}]"))
     except (ValueError, TypeError):
         raise InputError("not a place", path="--target", got=text, expected="x,y in metres") from None
-    if grid.is_occupied((x, y)):
+    column, row = np.floor(grid.to_grid((x, y)) / grid.resolution).astype(int)
+    if not grid.holds((x, y)) or grid.occupied[row, column]:
         raise InputError(
             "the place is off the map, or an obstacle stands there",
             path="--target",

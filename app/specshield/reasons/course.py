@@ -55,11 +55,19 @@ def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -
                 return f"{need.formula} asks for '{asked}', which holds nowhere that the robot fits"
         where = _possible(_together(need, guards, need.end), ground)
         begun = need.first == need.last == known.now + 1
-        if not begun and not np.array_equal(where, ground.free):
+        everywhere = np.array_equal(where, ground.free) and not _turns(need.predicate, known)
+        if not begun and not everywhere:
             found.append((need, where))
     found = sorted(found, key=lambda goal: int(goal[1].sum()))
     goals = (Goal(need, where, _far(need, where, guards, known.now, ground, late)) for need, where in found)
     return Course(guards, tuple(goals))
+
+
+def _turns(predicate: Formula, known: Known) -> bool:
+    """Whether it may depend on the heading, of which a square says nothing."""
+    areas = known.task.areas
+    carried = any(areas[name].point != (0.0, 0.0) for name in predicate.names if name in areas)
+    return carried or "theta" in predicate.names
 
 
 def _possible(predicate: Formula, ground: Ground) -> Bools:

@@ -81,8 +81,7 @@ def start(shield: Shield, pose: Sequence[float], way: bytes | None = None) -> No
 def check_place(shield: Shield, pose: Floats, path: str) -> None:
     """Raises PoseError, at `path`, for a pose (3,) that is outside the map or in collision."""
     grid, got = shield.task.grid, pose.tolist()
-    u, v = grid.to_grid(pose[:2])
-    if not (0.0 <= u < grid.width * grid.resolution and 0.0 <= v < grid.height * grid.resolution):
+    if not grid.holds(pose[:2]):
         raise PoseError(
             "the pose is outside the map",
             path=path,

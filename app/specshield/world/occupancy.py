@@ -102,6 +102,12 @@ class OccupancyGrid:
         dx, dy = delta[..., 0], delta[..., 1]
         return np.stack([dx * cos + dy * sin, dy * cos - dx * sin], axis=-1)
 
+    def holds(self, points: ArrayLike) -> Bools:
+        """Which points [..., 2] of the map frame lie on the map. Shape [...]."""
+        at = self.to_grid(points)
+        inside = (at >= 0.0) & (at < (self.width * self.resolution, self.height * self.resolution))
+        return np.asarray(inside.all(axis=-1))
+
     def to_map(self, points: ArrayLike) -> Floats:
         """Grid frame to map frame: the inverse of to_grid."""
         x0, y0, yaw = self.origin

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -95,6 +97,14 @@ def test_free_poses_are_free_and_spread():
     u = task.grid.to_grid(poses[:, :2])[:, 0]
     assert 0.4 < np.mean(u < 2.0) < 0.6
     assert abs(np.mean(poses[:, 2])) < 0.2
+
+
+def test_free_poses_have_their_origin_on_the_map_also_where_the_footprint_lies_beside_it():
+    grid = OccupancyGrid(np.zeros((8, 6), bool), 0.25, (0.0, 0.0, 0.8))
+    robot = replace(STRETCH, radius=0.1, offset=(0.3, 0.0))
+    task = make_task(grid, robot, "F[0,3] x > 1")
+    poses = free_poses(task, make_body(robot, grid), 2000, np.random.default_rng(0))
+    assert grid.holds(poses[:, :2]).all()
 
 
 def test_a_map_without_free_space_is_refused():

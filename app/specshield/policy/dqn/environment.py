@@ -95,7 +95,7 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> F
     for _ in range(1000):
         draw = random.random((2 * n + 64, 3))
         poses = np.array([xmin, ymin, -math.pi]) + draw * np.array([xmax - xmin, ymax - ymin, 2 * math.pi])
-        kept = np.concatenate([kept, poses[_are_free(body, poses)]])
+        kept = np.concatenate([kept, poses[_are_free(body, poses) & task.grid.holds(poses[:, :2])]])
         if len(kept) >= n:
             return kept[:n]
     raise MapError(
