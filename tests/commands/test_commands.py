@@ -46,6 +46,9 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
     assert driven.returncode == 0, driven.stderr
     assert "shielded rule satisfied" in driven.stdout
     assert (tmp_path / "flat-run.png").stat().st_size > 5000
+    refused = command("run", "flat", "--target=-1,-1", "--out", tmp_path, **own)
+    said = "--target: no robot can stand there; got '-1,-1'; expected a free place"
+    assert refused.stderr.splitlines()[-1] == said
 
 
 def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from specshield.errors import SpecshieldError, TransportError, tree
 from specshield.service import description
 from specshield.service.app import create_app
 from specshield.service.examples import POLICY
+from specshield.service.problems import status_of
 from specshield.service.settings import Settings
 from tests.browsing import CHROMIUM, needs_chromium
 from tests.serving import HUNG
@@ -34,6 +36,15 @@ def operations(told):
 
 def test_the_committed_description_is_this_one(told):
     assert json.loads(COMMITTED.read_text()) == told, "run `make openapi`"
+
+
+def test_the_docs_say_what_to_do_about_every_type_of_problem():
+    """Those of status 422 that are not listed have a row in common."""
+    text = (COMMITTED.parent / "docs" / "http.md").read_text()
+    rows = re.findall(r"^\| (\d{3} `.*?) \| .* \|$", text, re.MULTILINE)
+    listed = {found for row in rows for found in re.findall(r"`([\w-]+)`", row)}
+    kinds = [each for each in tree() if not issubclass(each, TransportError) and each is not SpecshieldError]
+    assert {each.type for each in kinds if status_of(each("")) != 422} <= listed
 
 
 def test_every_operation_and_every_field_is_described(told):

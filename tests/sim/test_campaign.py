@@ -148,13 +148,13 @@ def test_a_pair_that_ended_at_once_is_counted(campaign):
     at_once, later = (
         dataclasses.replace(campaign.shielded[0], main_done=True, ended_at=end) for end in (0, 7)
     )
-    pairs = dataclasses.replace(campaign, shielded=[later, at_once, at_once], unshielded=[at_once] * 3)
+    pairs = campaign._replace(shielded=[later, at_once, at_once], unshielded=[at_once] * 3)
     assert re.search(r"^median extra steps +\+0$", report.table([pairs]), re.MULTILINE)  # of 7, 0 and 0
 
 
 def test_a_broken_rule_is_noticed(campaign):
     broken = dataclasses.replace(campaign.shielded[0], spec_status="violated")
-    assert dataclasses.replace(campaign, shielded=[campaign.shielded[1], broken]).broken == [broken]
+    assert campaign._replace(shielded=[campaign.shielded[1], broken]).broken == [broken]
 
 
 def test_the_picture_shows_both_ways(campaign, case, tmp_path):

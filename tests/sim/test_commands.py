@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -47,9 +46,7 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     assert done.stdout.count("1 of 1") >= 4
     assert sorted(path.name for path in tmp_path.iterdir()) == ["case1.png", "case2.png"]
     assert "starting the service" in done.stderr
-    assert re.search(
-        r"page of both: http://127\.0\.0\.1:\d+/#/floor\?sessions=[\w.-]+,[\w.-]+\n", done.stdout
-    )
+    assert "page of both" not in done.stdout  # the service has ended
 
 
 def listens_to_interrupts():

@@ -231,10 +231,8 @@ def deadline_value(deadline: float) -> float:
 
 def _floats(values: Any, error: type[InputError], where: str, expected: str) -> list[float]:
     """None is minus infinity, which only a logit may be."""
-    listed = values.tolist() if hasattr(values, "tolist") else values
+    listed = values.tolist() if hasattr(values, "tolist") else [values] if isinstance(values, str) else values
     try:
-        if isinstance(listed, str):
-            raise TypeError("a text is not numbers")
         return [-math.inf if value is None else float(value) for value in listed]
     except (TypeError, ValueError, OverflowError) as cause:
         raise error("these are not numbers", path=where, got=f"{listed!r:.80}", expected=expected) from cause

@@ -10,11 +10,10 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -33,8 +32,7 @@ CLOCK = 2.0  # [s] by which this machine and a server may differ before it is sa
 State = Literal["ok", "note", "wrong"]
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """state `note`: it works, and there is something to know. remedy: what to do, empty where it is ok."""
 
     state: State

@@ -13,7 +13,6 @@ from specshield.errors import InputError
 
 if TYPE_CHECKING:  # every command line reads this module
     from specshield.sim.cases import Case
-    from specshield.world.occupancy import OccupancyGrid
 
 
 def run_policy(
@@ -73,27 +72,19 @@ def _case(id: str, name: str, target: str | None, seed: int) -> Case:
         drawn = free_poses(task, make_body(task.robot, task.grid), 1, np.random.default_rng([seed, 1]))
         place = (float(drawn[0, 0]), float(drawn[0, 1]))
     else:
-        place = _target(target, task.grid)
-    return Case(name, task, maps.get(about.map_id).rooms, about.spec, f"go to {_point(place)}", place)
+        place = _target(target)
+    case = Case(name, task, maps.get(about.map_id).rooms, about.spec, f"go to {_point(place)}", place)
+    if not task.grid.holds(place) or task.grid.occupied[case.cell(place)]:
+        raise InputError("no robot can stand there", path="--target", got=target, expected="a free place")
+    return case
 
 
-def _target(text: str, grid: OccupancyGrid) -> tuple[float, float]:
-    """Raises InputError for what is no place, and for one where nothing can stand."""
-    import numpy as np
-
+def _target(text: str) -> tuple[float, float]:
     try:
-        x, y = map(float, json.loads(f"[{text}]"))
+        x, y = json.loads(f"[{text}]")
+        return float(x), float(y)
     except (ValueError, TypeError):
         raise InputError("not a place", path="--target", got=text, expected="x,y in metres") from None
-    column, row = np.floor(grid.to_grid((x, y)) / grid.resolution).astype(int)
-    if not grid.holds((x, y)) or grid.occupied[row, column]:
-        raise InputError(
-            "the place is off the map, or an obstacle stands there",
-            path="--target",
-            got=text,
-            expected=f"a free place within {grid.bounds} (xmin, ymin, xmax, ymax)",
-        )
-    return x, y
 
 
 def _point(values: Sequence[float]) -> str:

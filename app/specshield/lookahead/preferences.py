@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from specshield.errors import InputError
+from specshield.errors import FragmentError, InputError
 from specshield.registry import Registry
 from specshield.shield.preference import Preference
 from specshield.shield.proposal import Proposer
@@ -53,9 +53,18 @@ def check_shaping(name: str) -> None:
 def prepare(name: str, task: Task, proposers: Sequence[Proposer], pose: Sequence[float]) -> Preference:
     """The preference of that name for a task, ready for its first step: its kernels are compiled.
 
-    pose: any pose (x, y, theta) of the robot's. Raises what `PreferenceKind.prepare` raises.
+    pose: any pose (x, y, theta) of the robot's. Raises what `PreferenceKind.prepare` raises, and says of a
+    FragmentError that the shaping is at fault.
     """
-    preference = PREFERENCES.get(name).prepare(task, proposers)
+    try:
+        preference = PREFERENCES.get(name).prepare(task, proposers)
+    except FragmentError as error:
+        raise FragmentError(
+            f"{name!r} cannot be had for this formula: {error.message}",
+            path="shaping",
+            got=name,
+            expected="'projection', or a formula that 'reachability' takes",
+        ) from None
     actions = len(task.robot.actions)
     signals = {signal: np.array([value]) for signal, value in task.signals.items()}
     even = np.full(actions, -math.log(actions))

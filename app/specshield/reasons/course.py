@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +17,7 @@ from specshield.stl import SATISFIED_ABOVE, And, Formula
 MOST_NEEDS = 24  # that are looked at; each is held against the others
 
 
-@dataclass(frozen=True)
-class Goal:
+class Goal(NamedTuple):
     """A need, the squares where it may be met, and how far [m] each square is from them at least."""
 
     need: Need
@@ -25,8 +25,7 @@ class Goal:
     far: Floats
 
 
-@dataclass(frozen=True)
-class Course:
+class Course(NamedTuple):
     """guards: the needs that have to hold at every step of a window. goals: the needs that some way has to
     lead to, the smallest places first; a guard whose window is still to come is one of them.
     """

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +31,7 @@ MOST_TRIED = 3  # alternatives of one conjunct, or of all, that are searched for
 MOST_CONJUNCTS = 8  # that are searched for; of further ones the policies' futures alone tell
 
 
-@dataclass(frozen=True)
-class Conjunct:
+class Conjunct(NamedTuple):
     """One conjunct of a rule that cannot be kept.
 
     feasible_alone: whether a future was found that keeps it, whatever becomes of the others. robustness: the
@@ -48,8 +48,7 @@ class Conjunct:
     only: bool = False
 
 
-@dataclass(frozen=True)
-class Relaxed:
+class Relaxed(NamedTuple):
     """conjuncts: of the rule. tried: how many futures were judged. way: the motions, one a byte, of one that
     keeps the rule, which the policies did not find.
     """

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +31,7 @@ TINY = 1e-9  # [m] a step of a robot that does not move
 CELL, HEADINGS = 0.05, 120  # [m] and per turn: poses that are one place
 
 
-@dataclass(frozen=True)
-class Wanted:
+class Wanted(NamedTuple):
     """What a way has to meet: `far` [m] of the ground's squares from where that may be, and the last step to
     begin it by, which is later than the need has it where it may be late.
     """

@@ -74,12 +74,11 @@ def judge(shield: Shield, now: Situation) -> Judged:
         shield = replace(shield, proposers=(*shield.proposers, *clear))
     motions = len(robot.motions)
     tried = futures(prefix, shield.body, shield.proposers, tail, (asked, 0.0))
-    kept, leaves = tried.rho, tried.leaves
-    best, part, vain = best_of(tried, kept, motions), prefix, False
-    left_out = np.zeros(motions, np.bool_)
+    kept, leaves, part, vain = tried.rho, tried.leaves, prefix, False
     if violated:
-        tried, best, part = _left(shield, prefix, tried)
+        tried, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried)
+    best, left_out = best_of(tried, kept, motions), np.zeros(motions, np.bool_)
     if care.barred is not None:
         others = _aside(shield, care.barred, prefix, tried, kept)
         vain = others.max() <= SATISFIED_ABOVE
@@ -207,8 +206,8 @@ def _by_action(
     return all_feasible, all_values, robustness
 
 
-def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best, Prefix]:
-    """What can still be kept of a violated formula: futures, the best of them, and the prefix as it sees it.
+def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Prefix]:
+    """What can still be kept of a violated formula: futures, and the prefix as that sees it.
 
     Conjuncts that cannot be kept any more are dropped. A broken G can still be enforced from a later step on.
     These are tried in turn, and the first that some future keeps is what is kept:
@@ -248,14 +247,12 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Best
                 yield [*guards, *again(places, t + steps)]
         yield kept
 
-    part, best = prefix, None
+    part = prefix
     for parts in filter(None, options()):
-        formula = joined(parts)
-        part = prefix.of(formula)
-        best = best_of(tried, rho_of(part, tried)[0], len(task.robot.motions))
-        if _some(best):
+        part = prefix.of(joined(parts))
+        if rho_of(part, tried)[0].max() > SATISFIED_ABOVE:
             break
-    return tried, best or best_of(tried, rho_of(part, tried)[0], len(task.robot.motions)), part
+    return tried, part
 
 
 def _holds_now(prefix: Prefix, formula: Always) -> bool:

@@ -8,11 +8,10 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from multiprocessing import active_children, get_context, parent_process
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -30,8 +29,7 @@ MOST_ROBOTS = 8  # processes at once, of 190 MB each; chosen by hand
 DRAWS = 100  # starts tried for one episode before giving up
 
 
-@dataclass(frozen=True)
-class Campaign:
+class Campaign(NamedTuple):
     """Episodes in pairs: `shielded[i]` and `unshielded[i]` share their start and the model's seed.
 
     refused: how many starts the service refused as infeasible before it took those of the episodes.

@@ -38,10 +38,10 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
         status.clear()
         _tell(campaigns, runs, seed, out)
         print(f"{time.monotonic() - began:.0f} s")
-        for campaign in campaigns:
-            both = f"{campaign.shielded[0].session},{campaign.unshielded[0].session}"
-            print(f"page of both: {url}/#/floor?sessions={both}")  # the first episode of the case, twice
         if stay:
+            for campaign in campaigns:
+                both = f"{campaign.shielded[0].session},{campaign.unshielded[0].session}"
+                print(f"page of both: {url}/#/floor?sessions={both}")  # the first episode of the case, twice
             print("The service stays up for it; Ctrl-C ends both.", flush=True)
             with contextlib.suppress(KeyboardInterrupt):
                 signal.pause()

@@ -166,7 +166,7 @@ class Sessions:
                     closed=True,
                     expires_at=self._expiry(),
                 )
-                change = Change(state.packed(), *session.added(state.length))
+                change = Change(state.packed(), *session.added(session.state.length))
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue
             self.steps.recent.drop(id)

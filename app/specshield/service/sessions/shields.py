@@ -12,7 +12,6 @@ from typing import Any
 import msgspec
 
 from specshield.arrays import Floats
-from specshield.errors import FragmentError
 from specshield.lookahead.preferences import AHEADS, PROJECTION, prepare
 from specshield.robot.dynamics import make_body
 from specshield.rule.early import conjunction_of
@@ -86,16 +85,8 @@ class Shields:
             ids = [self.policies.find(key, owner).id for key in keys]
             return self._prepare(shaping, ids, self.get(ids, Config()), pose)
 
-        try:
-            preference: Preference = await asyncio.shield(asyncio.wrap_future(await run(begin)))
-            return preference
-        except FragmentError as error:
-            raise FragmentError(
-                f"{shaping!r} cannot be had for this formula: {error.message}",
-                path="shaping",
-                got=shaping,
-                expected="'projection', or a formula that 'reachability' takes",
-            ) from None
+        preference: Preference = await asyncio.shield(asyncio.wrap_future(await run(begin)))
+        return preference
 
     def verdict(self, config: Mapping[str, Any], rows: Floats, names: Sequence[str]) -> tuple[str, Bounds]:
         """Of a rule on a session's rows [t + 1, 3 + signals], and the bounds on its robustness.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +27,7 @@ NO_VERSION = b"-"  # that no session ever has
 APPEND = Script(Path(__file__).with_name("append.lua").read_text())
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(NamedTuple):
     """A session as one read saw it. rows: its history. step: what a step left, None if not decided."""
 
     config: bytes
@@ -39,8 +37,7 @@ class Record:
     step: bytes | None
 
 
-@dataclass(frozen=True)
-class Dump:
+class Dump(NamedTuple):
     """All of a session. steps: what each step left, by t; b"" for one that was passed over."""
 
     config: bytes
@@ -50,8 +47,7 @@ class Dump:
     steps: list[bytes]
 
 
-@dataclass(frozen=True)
-class News:
+class News(NamedTuple):
     """What a session has from some step on: rows and steps as in `Dump`, both from that step."""
 
     state: bytes

@@ -6,7 +6,7 @@ import { el } from "../lib/dom.js";
 const METHODS = {
   reachability: "computed in seconds",
   planner: "for every rule, slower at each step",
-  dqn: "learned, takes hours",
+  dqn: "learned, takes minutes to hours",
 };
 const OWN = {
   footprint: { radius: 0.2 },

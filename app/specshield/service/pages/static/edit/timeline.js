@@ -15,7 +15,7 @@ function row({ operator, formula, begin, end, depth }, horizon, avoided) {
   bar.style.left = `${(100 * begin) / horizon}%`;
   bar.style.width = `${Math.max(0.8, (100 * (end - begin)) / horizon)}%`;
   if (avoided.some((name) => formula.includes(name)) && operator === "G") bar.classList.add("avoid");
-  const text = el("span", { class: "of" }, el("code", {}, formula), el("small", {}, ` ${SAID[operator]} ${begin} to ${end}`));
+  const text = el("span", { class: "of" }, el("code", {}, formula), el("small", {}, ` ${depth ? "may look at steps" : SAID[operator]} ${begin} to ${end}`));
   if (depth) text.style.paddingLeft = `${depth}rem`;
   return el("li", {}, text, el("span", { class: "track" }, bar));
 }

@@ -34,7 +34,7 @@ export class Chart {
     this.line.setAttribute("points", values.map(([step, value]) => `${x(step)},${y(value)}`).join(" "));
     for (const end of ["y1", "y2"]) this.base.setAttribute(end, y(0));
     for (const end of ["x1", "x2"]) this.now.setAttribute(end, x(t));
-    const here = values.findLast(([step]) => step <= t);
+    const here = values.find(([step]) => step === t);
     this.value.textContent = here ? this.told(here[1]) : "–";
   }
 }

@@ -121,7 +121,7 @@ function shown({ session, items, mark, row }, t) {
   mark.show(known);
   const { decision } = item;
   const mass = decision?.feasible_mass;
-  const without = items.some((each) => each?.decision) ? "over" : "not shielded";
+  const without = items.some((each) => each?.decision) ? "over" : items.length > 1 ? "not shielded" : "–";
   const status = t >= items.length - 1 ? (decision?.spec_status === "pending" ? session.spec_status : decision?.spec_status ?? session.spec_status) : (decision?.spec_status ?? "pending");
   const cells = [item.t, decision?.mode ?? without, mass === null || mass === undefined ? "–" : `${(100 * mass).toFixed(0)} %`];
   cells.forEach((text, k) => (row.children[k + 1].textContent = text));

@@ -74,10 +74,12 @@ export class Panel {
 
   mode(decision) {
     const reason = REASONS[decision.reason] ?? decision.reason;
+    const lost = decision.mode === "fallback" && decision.reason === "infeasible";
+    const said = lost ? "Nothing certifies a way: the policy's own choice is made." : MODES[decision.mode];
     const warnings = decision.warnings.map((text) => el("li", {}, text));
     if (decision.in_collision) warnings.push(el("li", {}, "The robot touches an obstacle."));
     return [
-      el("p", { class: "mode" }, el("strong", {}, decision.mode), " ", MODES[decision.mode] ?? "", reason ? ` (${reason})` : ""),
+      el("p", { class: "mode" }, el("strong", {}, decision.mode), " ", said ?? "", reason ? ` (${reason})` : ""),
       warnings.length ? el("ul", { class: "warnings" }, warnings) : null,
     ].filter(Boolean);
   }
@@ -94,7 +96,7 @@ export class Panel {
       margin === undefined ? null : pair("Margin, slack", `${metres(margin)}, ${slack} steps`),
       left === undefined || left === null || left === 1 ? null : pair("Threshold left", left.toFixed(3)),
       typeof any === "boolean" ? pair("Kept", any ? "whatever the signals do" : "if the signals stay as they are") : null,
-      revision ? pair("Own map", `changed ${revision} times`) : null,
+      revision ? pair("Own map", revision === 1 ? "changed once" : `changed ${revision} times`) : null,
     );
   }
 

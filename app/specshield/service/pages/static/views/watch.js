@@ -19,7 +19,7 @@ export class Watch {
     this.charts = [
       [new Chart("Robustness ahead", metres), (d) => d.robustness[taken(d)]],
       [new Chart("Feasible mass", percent), (d) => d.feasible_mass],
-      [new Chart("Slack kept", (steps) => `${steps} steps`), (d) => d.slack || null],
+      [new Chart("Slack kept", (steps) => `${steps} steps`), (d) => d.slack],
     ];
     this.draw = onceAFrame(() => this.show());
     this.replay = new Replay(this.draw);
@@ -56,7 +56,8 @@ export class Watch {
     const last = Math.max(this.session.horizon, this.items.length - 1);
     for (const [chart, value] of this.charts) {
       const values = decided.map((each) => [each.t, value(each.decision)]);
-      chart.show(values.filter(([, v]) => v !== null && v !== undefined && Math.abs(v) < 1e6), last, t);
+      const known = values.filter(([, v]) => v !== null && v !== undefined && Math.abs(v) < 1e6);
+      chart.show(known.some(([, v]) => v !== 0) ? known : [], last, item.t);
     }
     this.charted.hidden = this.charts.every(([chart]) => chart.element.hidden);
   }
