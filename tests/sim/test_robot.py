@@ -7,6 +7,8 @@ import pytest
 from specshield.policy.dqn.environment import free_poses
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import in_collision
+from specshield.sim.cases import load_case
+from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot, waypoints
 
 A = {name: i for i, name in enumerate(STRETCH.action_names)}
@@ -72,3 +74,13 @@ def test_at_the_target_is_a_metre_along_free_space(case):
     observation = SimulatedRobot(case, (x - 0.8, y, math.pi / 2)).observe()
     assert observation.distance == pytest.approx(0.8, abs=0.06)
     assert observation.bearing == pytest.approx(-math.pi / 2, abs=0.1)
+
+
+def test_a_target_with_little_room_around_it_is_reached():
+    case, random = replace(load_case("case1"), target=(8.9, 5.57)), np.random.default_rng(0)
+    for start in ((4.5, 5.0, 0.0), (2.0, 5.0, 1.0), (8.7, 1.3, 2.0)):
+        robot, model = SimulatedRobot(case, start), GoalSeeker(case.task.robot)
+        for _ in range(300):
+            logits = model.logits(robot)
+            robot.execute(int(random.choice(len(logits), p=np.exp(logits) / np.exp(logits).sum())))
+        assert robot.at_target

@@ -221,14 +221,14 @@ def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
     if isinstance(world, Mapping):
         members = dict(world)
         return read_map(members.pop("format", None), members)
-    path = Path(world)
+    path = Path(str(world))
     images = [image for kind in (".pgm", ".png") if (image := path.with_suffix(kind)).is_file()]
     if not path.is_file() or not images:
         raise MapError(
             "no map can be read there",
             path="world",
-            got=str(path),
-            expected="a .yaml with its image beside it",
+            got=str(world),
+            expected="a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it",
         )
     named = path.with_suffix(".regions.json")
     areas = json.loads(named.read_text()) if named.is_file() else {}

@@ -98,9 +98,6 @@ class Taught(NamedTuple):
         return Taught(LearnedMap.from_bytes(value[HEAD.size :]), Followed(*HEAD.unpack_from(value)))
 
 
-NOTHING = Taught()
-
-
 def teach(
     shield: Shield, carry: Carry | None, poses: Floats, occupied: ArrayLike | None, free: ArrayLike | None
 ) -> tuple[Taught, tuple[str, ...]]:
@@ -112,7 +109,7 @@ def teach(
     grid, config, t = shield.task.grid, shield.config, len(poses) - 1
     learned = None if carry is None else carry.learned
     if learned is None and occupied is None and free is None and not config.learn_map:
-        return NOTHING, ()
+        return Taught(), ()
     before = Taught.from_bytes(learned)
     known, followed, motion, on = before.map, before.followed, -1, -1
     stuck, near = () if carry is None else carry.stuck, NEAR

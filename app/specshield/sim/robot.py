@@ -97,5 +97,8 @@ def waypoints(case: Case) -> Floats:
     goal = np.zeros_like(free)
     goal[case.cell(case.target)] = True
     onward = geodesic_distance(comfortable | goal, goal, grid.resolution)  # it may stand beside a wall
+    if not np.isfinite(onward[comfortable]).any():  # or where it is narrow all around
+        narrow = free & (case.distance <= case.distance[comfortable].min(initial=np.inf))
+        onward = geodesic_distance(comfortable | narrow, goal, grid.resolution)
     cell = downhill(falling(free, onward, grid.resolution), LOOK_AHEAD)
     return grid.centres.reshape(-1, 2)[cell].reshape(*free.shape, 2)

@@ -57,11 +57,10 @@ def _normal(formula: Formula) -> tuple[Obligation, ...]:
                 return tuple(_shifted(each, a, b) for each in inner)
             if isinstance(formula, Eventually) and len(inner) == 1:
                 return (_under_eventually(a, b, inner[0]),)
-    expected = "conjunctions of F, G and F[a,c1] G[c2,b] over boolean combinations of predicates"
     raise FragmentError(
-        f"'{formula}' is outside the fragment of this method; expected {expected}",
+        "the formula is outside the fragment of this method",
         got=str(formula),
-        expected=f"{expected}; or method 'planner', which takes any formula",
+        expected="F, G and F[a,c1] G[c2,b] over predicates, joined by and; or the method 'planner'",
     )
 
 
