@@ -32,7 +32,7 @@ run: .venv/.server
 	$(BIN)/specshield serve
 
 test: .venv/.dev
-	$(BIN)/python -m pytest -n 3 --dist loadfile  # each module's tests stay in one process; three keep two cores busy
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder  # each module's tests stay in one process; three keep two cores busy
 
 # The wheels, into dist/: one that compiles at its first start, one that brings its kernels for this Python and
 # processor. Both are installed in a new environment and run in an empty folder, as a newcomer would.
