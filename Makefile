@@ -65,7 +65,8 @@ bench: .venv-bench/.done
 docs: .venv/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-# docs/reliability.md; hours, best on a machine that nobody else uses. What is in out/reliability is not run again.
+# docs/reliability.md; hours, best on a machine that nobody else uses. What is in out/reliability is not run again, and a part
+# that has no figures there stays as the page has it.
 RELIABILITY = $(BIN)/python -m benchmarks.reliability
 reliability: .venv-bench/.done
 	-$(RELIABILITY) faults --resume

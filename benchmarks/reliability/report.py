@@ -1,8 +1,13 @@
-"""docs/reliability.md, from the figures that are there; what was not run is said to be."""
+"""docs/reliability.md, from the figures that are there.
+
+A part that was not measured anew stays as the page has it, with the run that it came from; the rows of faults
+stay together.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +19,42 @@ PAGE = ROOT / "docs" / "reliability.md"
 FRAME = Path(__file__).with_name("page.md")
 ASKED_AWAY = 3.0  # [s] most that a fault may keep a robot waiting, kernels cached
 NOT_RUN = "Not run."
+RUNS = ("load", "isolation", "fuzz", "contract")
 
 
 def run(out: Path, page: Path) -> int:
     from benchmarks.reliability.faults.rows import ROWS
 
-    parts = {
-        "summary": _summary(out, list(ROWS)),
-        "faults": _faults(out, list(ROWS)),
-        "races": _races(out),
-        "training": _training(out),
-        "load": _load(out),
-        "isolation": _isolation(out),
-        "fuzz": _fuzz(out),
-        "contract": _contract(out),
-        "others": _others(out),
-        "runs": _runs(out, list(ROWS)),
-    }
-    text = FRAME.read_text()
-    for name, lines in parts.items():
-        text = text.replace(f"<!-- {name} -->", "\n".join(lines))
+    rows = list(ROWS)
+    measured = [name for name in (*RUNS, *MODULES) if read(out, name) is not None]
+    if all(read(out, f"fault-{name}") is not None for name in rows):
+        measured += [f"fault-{name}" for name in rows]
+        faults = {"summary": _summary(out, rows), "faults": _faults(out, rows), "races": _races(out)}
+        faults["training"] = _training(out)
+    else:
+        faults = {}
+    makers = {"load": _load, "isolation": _isolation, "fuzz": _fuzz, "contract": _contract}
+    parts = faults | {name: make(out) for name, make in makers.items() if name in measured}
+    parts |= {name: _other(out, name) for name in MODULES if name in measured}
+    known = page.read_text() if page.exists() else ""
+    parts["runs"] = _runs(out, measured, _part(known, "runs"))
+    others = "\n\n".join(
+        f"`python -m benchmarks.{name}`: {what}.\n\n<!-- {name} -->" for name, what in MODULES.items()
+    )
+    text = FRAME.read_text().replace("<!-- others -->", others)
+    for name in re.findall(r"<!-- (\w+) -->", text):
+        lines = parts.get(name) or _part(known, name) or [NOT_RUN]
+        whole = "\n".join([f"<!-- {name} -->", "", *lines, "", f"<!-- end of {name} -->"])
+        text = text.replace(f"<!-- {name} -->", whole)
     page.write_text(text)
     print(page)
     return 0
+
+
+def _part(page: str, name: str) -> list[str]:
+    """The lines of a part as the page has them; none where it has no such part."""
+    found = re.search(rf"<!-- {name} -->\n\n(.*?)\n\n<!-- end of {name} -->", page, re.DOTALL)
+    return found[1].splitlines() if found else []
 
 
 def table(head: list[str], rows: list[list[Any]]) -> Iterator[str]:
@@ -146,8 +164,7 @@ def _training(out: Path) -> list[str]:
 
 def _load(out: Path) -> list[str]:
     found = read(out, "load")
-    if found is None:
-        return [NOT_RUN]
+    assert found is not None
     took, cpu = found["took_ms"], found["cpu_ms_a_step"]
     pace = f"each at {found['rate']:g} Hz" if found["rate"] else "each as fast as it is answered"
     lines = [
@@ -174,8 +191,7 @@ def _load(out: Path) -> list[str]:
 
 def _isolation(out: Path) -> list[str]:
     found = read(out, "isolation")
-    if found is None:
-        return [NOT_RUN]
+    assert found is not None
     rows = [
         [row["attack"].replace("_", " "), row["p99_quiet_ms"], row["p99_attack_ms"], row["p99_limit_ms"],
          "yes" if row["isolated"] else "**no**", row["memory_before_mb"], row["memory_most_mb"],
@@ -189,8 +205,7 @@ def _isolation(out: Path) -> list[str]:
 
 def _fuzz(out: Path) -> list[str]:
     found = read(out, "fuzz")
-    if found is None:
-        return [NOT_RUN]
+    assert found is not None
     rows = [
         [name, f"{each['inputs']:,}", f"{each['accepted'] / each['inputs']:.0%}",
          each["finds"].get("crash", 0), each["finds"].get("slow", 0) + each["finds"].get("hang", 0),
@@ -213,8 +228,7 @@ def _fuzz(out: Path) -> list[str]:
 
 def _contract(out: Path) -> list[str]:
     found = read(out, "contract")
-    if found is None:
-        return [NOT_RUN]
+    assert found is not None
     failures = ", ".join(f"{name}: {count}" for name, count in found["failures"].items()) or "none"
     return [
         f"{found['tool']}, all checks, all phases and links: {found['cases']:,} cases. Answers by status: "
@@ -223,23 +237,24 @@ def _contract(out: Path) -> list[str]:
     ]
 
 
-def _others(out: Path) -> list[str]:
-    """What the modules of elsewhere.py printed."""
-    lines = list[str]()
-    for name, what in MODULES.items():
-        found = read(out, name)
-        lines += [f"`python -m benchmarks.{name}`: {what}.", ""]
-        if found is None:
-            lines += [NOT_RUN, ""]
-        else:
-            lines += [f"Exit status {found['status']}.", "", "```", *found["lines"], "```", ""]
-    return lines[:-1]
+def _other(out: Path, name: str) -> list[str]:
+    """What a module of elsewhere.py printed."""
+    found = read(out, name)
+    assert found is not None
+    return [f"Exit status {found['status']}.", "", "```", *found["lines"], "```"]
 
 
-def _runs(out: Path, names: list[str]) -> list[str]:
-    """Command, machine and commit of every part, alike ones together."""
+def _runs(out: Path, measured: Sequence[str], before: Sequence[str]) -> list[str]:
+    """Command, machine and commit of every part, alike ones together. before: the lines that the page has, of
+    which those of parts that were measured anew go.
+    """
     alike: dict[str, list[str]] = {}
-    for name in [*(f"fault-{name}" for name in names), "load", "isolation", "fuzz", "contract", *MODULES]:
+    for line in before:
+        key, _, parts = line.removeprefix("- ").partition(": ran ")
+        stays = [part for part in re.findall(r"[\w-]+ \([^)]*\)", parts) if part.split()[0] not in measured]
+        if stays:
+            alike[key] = stays
+    for name in measured:
         found = read(out, name)
         if found is None or "machine" not in found:
             continue
@@ -248,7 +263,7 @@ def _runs(out: Path, names: list[str]) -> list[str]:
         where = f"{machine['cpu']}, {size}, Python {machine['python']}"
         key = f"`{found['command']}` at commit {found['commit']}: {where}"
         alike.setdefault(key, []).append(f"{name} ({found['when']}, load {machine['load']:.1f})")
-    return [f"- {key}: {', '.join(parts)}" for key, parts in alike.items()] or [NOT_RUN]
+    return [f"- {key}: ran {', '.join(parts)}" for key, parts in alike.items()]
 
 
 def _pairs(counts: Mapping[str, int]) -> str:
