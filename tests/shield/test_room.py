@@ -20,7 +20,8 @@ from specshield.robot import STRETCH, Action
 from specshield.robot.dynamics import make_body
 from specshield.robot.room import ROOM
 from specshield.shield.episode import Config, decide, make_shield
-from specshield.shield.uncertainty import Uncertainty
+from specshield.shield.taught import Taught, wary
+from specshield.shield.uncertainty import Care, Uncertainty
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -46,6 +47,11 @@ def policy(robot=FORWARD, steps=70, wide=True):
 
 def shield_of(made, **config):
     return make_shield([made], Config(**({"uncertainty": Uncertainty(), "learn_map": True} | config)))
+
+
+@pytest.mark.parametrize(("robot", "least"), [(FORWARD, 20 + 2 * 6), (BACK, 20)])
+def test_time_is_kept_to_turn_round_twice_where_the_robot_cannot_drive_backwards(robot, least):
+    assert wary(shield_of(policy(robot)), Care(0.0, 0), Taught(), True).least == least
 
 
 def way_of(shield):
