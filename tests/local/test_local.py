@@ -214,6 +214,7 @@ def test_after_a_step_without_a_decision_a_switch_needs_the_pose(
             with pytest.raises(HistoryGap):
                 session.switch(other)
             assert session.switch(other, pose=pose).next_t == 1
+            assert session.switch(other).next_t == 1  # x_t is known by now
 
 
 @pytest.mark.parametrize("clock", ["keep", "restart"])

@@ -23,7 +23,7 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.objects import open_objects
 from specshield.service.storage.store import Change, Dump
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import serving, wait_for
+from tests.serving import HUNG, serving, wait_for
 
 TTL = 3600
 ROW = bytes(range(24))
@@ -356,3 +356,29 @@ def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
         assert client.get("/v1/sessions/robot").status_code == 404
         assert client.get("/v1/sessions").json()["items"] == []
         assert not any(path.is_file() for path in (tmp_path / "archive").rglob("*"))
+
+
+def test_who_watches_an_archived_session_hears_of_its_end_and_of_no_other_one(tmp_path):
+    with (
+        serving(tmp_path, SPECSHIELD_ARCHIVE_AFTER="1") as server,
+        httpx.Client(base_url=server.url, verify=False, timeout=HUNG) as client,
+    ):
+        client.post("/v1/maps", json=grid_json())
+        begun = {"policy_id": send_policy(client)["id"], "initial_pose": START, "id": "robot"}
+        for again in (False, True):
+            assert client.post("/v1/sessions", json=begun).status_code == 201
+            body = {"t": 0, "poses": ahead(0)[-1:], "logits": LOGITS}
+            assert client.post("/v1/sessions/robot/steps", json=body).status_code == 200
+            with httpx.stream(
+                "GET", f"{server.url}/v1/sessions/robot/events?after=-1", timeout=HUNG
+            ) as watched:
+                lines = watched.iter_lines()
+                assert "id: 0" in lines
+                wait_for(lambda: any(path.is_file() for path in (tmp_path / "archive").rglob("*")))
+                assert client.delete("/v1/sessions/robot").status_code == 204
+                if again:
+                    assert client.post("/v1/sessions", json=begun).status_code == 201
+                    assert client.post("/v1/sessions/robot/steps", json=body).status_code == 200
+                rest = list(lines)
+                assert "event: end" in rest
+                assert not any(line.startswith("id: ") for line in rest)

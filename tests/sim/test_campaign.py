@@ -31,22 +31,29 @@ def campaign(server, case):
         yield run(several, case.name, RUNS, seed=SEED)
 
 
-def test_an_interrupt_comes_between_two_results_and_nowhere_else():
+def test_an_interrupt_is_raised_between_two_results_and_not_while_they_are_made_or_waited_for():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    first, second = Future(), Future()
+
+    def made():
+        yield first
+        signal.raise_signal(signal.SIGINT)
+        yield second
+
     try:
-        first, second = Future(), Future()
         second.set_result("b")
         found = each_done([first, second])
         assert next(found) == (1, "b")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler  # the caller's own, meanwhile
         first.set_result("a")
-        signal.raise_signal(signal.SIGINT)  # the program goes on with what it is about
-        assert next(found) == (0, "a")
+        assert list(found) == [(0, "a")]
+        found = []
         with pytest.raises(KeyboardInterrupt):
-            next(found)
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+            found.extend(each_done(made()))
         threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGINT]).start()
         with pytest.raises(KeyboardInterrupt):
             next(each_done([Future()]))
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)
 

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from specshield.client.models import Decision, Pose
 from specshield.errors import InputError, LimitReached, SpecshieldError, TransportError
@@ -59,8 +59,7 @@ class Circuit:
         self.pause, self.again = 0.0, -math.inf
 
 
-@dataclass(frozen=True)
-class Branch:
+class Branch(NamedTuple):
     """One way on: the pose x_t that was foreseen, and the actions from t to the rule's last step."""
 
     pose: Pose

@@ -17,8 +17,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, ParamSpec, TypeVar
 
 from specshield.client.models import Page, build
 from specshield.client.wire import Failure, Reply, Request, check, error_of, get, json_object
@@ -49,13 +48,11 @@ class Resource(Generic[R]):
         self._run = run
 
 
-@dataclass(frozen=True)
-class Wait:
+class Wait(NamedTuple):
     seconds: float
 
 
-@dataclass(frozen=True)
-class Within:
+class Within(NamedTuple):
     """From its beginning to its end, this call may take so many seconds; None: five timeouts."""
 
     seconds: float | None
@@ -65,16 +62,14 @@ class Within:
         return began + ((PATIENCE + 1) * timeout if self.seconds is None else self.seconds)
 
 
-@dataclass(frozen=True)
-class Feed:
+class Feed(NamedTuple):
     """An answer that is read while it comes. pieces: an iterator of the shell's. close: leaves it."""
 
     pieces: Any
     close: Callable[[], Any]
 
 
-@dataclass(frozen=True)
-class More:
+class More(NamedTuple):
     """The next piece of a feed, as the content of a Reply, by `ends` on the clock of time.monotonic(). It is
     empty where the feed has ended, was lost or brought nothing in time; the feed is closed then.
     """
@@ -89,8 +84,7 @@ class More:
 Flow = Generator[Request | Wait | Within | More, Reply | Failure, T]
 
 
-@dataclass(frozen=True)
-class Delivery:
+class Delivery(NamedTuple):
     """A reply, the number of tries and the time [s] it took."""
 
     reply: Reply

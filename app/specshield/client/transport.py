@@ -42,7 +42,7 @@ def headers(api_key: str | None) -> dict[str, str]:
         raise InputError(
             "the API key cannot be sent in a header",
             path="api_key",
-            expected="characters of ASCII, of which the first and the last are no spaces",
+            expected="printable ASCII, with no space at either end",
         )
     plain = {"Accept-Encoding": "identity"}  # what is compressed could be larger than it looks
     return plain if api_key is None else {**plain, "Authorization": f"Bearer {api_key}"}

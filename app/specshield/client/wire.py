@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 from urllib.parse import quote
 
 from specshield.client.models import Pose
@@ -45,8 +45,7 @@ TRIES = 5
 Content = bytes | str | os.PathLike[str]
 
 
-@dataclass(frozen=True)
-class Request:
+class Request(NamedTuple):
     """One request. `slow`: the server prepares something; `tries`: how often it may be sent at most.
 
     `t`: the step that the answer has to be about; an answer about another one is none (see `stale`).
@@ -89,8 +88,7 @@ class Reply:
             return None
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(NamedTuple):
     """No answer: the error, after `seconds`, where `timeout` were allowed; `left`: of the call's time."""
 
     error: TransportError

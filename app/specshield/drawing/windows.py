@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from specshield.stl import Always, Eventually, Formula, Until
 
 LETTERS: dict[type[Formula], str] = {Always: "G", Eventually: "F", Until: "U"}
 
 
-@dataclass(frozen=True)
-class Window:
+class Window(NamedTuple):
     """begin, end: the first and last step [steps from the session's start] that `formula` looks at.
 
     operator: G, F or U. depth: how many other windows it lies in.

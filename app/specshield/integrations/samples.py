@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -32,8 +32,7 @@ class Session(Protocol):
     def step(self, pose: Any, logits: Any = None, *, main_task_done: bool | None = None) -> Any: ...
 
 
-@dataclass(frozen=True)
-class Chosen:
+class Chosen(NamedTuple):
     """sample: the index of the sample to run, None where none is allowed and the robot's `action` is run."""
 
     action: int

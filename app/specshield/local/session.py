@@ -71,6 +71,7 @@ class LocalSession:
         self._poses: list[Pose] = []
         self._signals: dict[str, list[float]] = {name: [] for name in shield.task.signals}
         self._decisions: dict[int, Decision] = {}
+        self._given: dict[int, Pose] = {}  # x_t of the next step, where a switch told it
 
     @property
     def id(self) -> str:
@@ -160,7 +161,8 @@ class LocalSession:
             raise InputError(
                 "this is no policy in process", path="policy", got=policy, expected="a LocalShield"
             )
-        x_t = self._foreseen() if pose is None else self._at(pose)
+        given = self._given.get(self.t) if pose is None else self._at(pose)
+        x_t = self._foreseen() if given is None else given
         old, rule = self._rule, self._rule.followed_by(policy, self._shaping, self.t, clock)
         first = {**policy.task.signals, **self._first}
         held = self._held({}, self.t + 1, first)
@@ -171,7 +173,7 @@ class LocalSession:
         carry = handover.carried_over(self._carry, same_map, same_robot, later)
         way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
         carry = handover.carried_over(self._carry, same_map, same_robot, later, way)
-        known = self._poses if pose is None and self.t > 0 else [*self._poses, x_t]
+        known = self._poses if given is None and self.t > 0 else [*self._poses, x_t]
         ended, (status, _) = old.told(old.verdict(known, held)[0]), rule.verdict(known, held)
         info = replace(
             self.info,
@@ -184,6 +186,7 @@ class LocalSession:
         )
         self._rules.append(rule)
         self._carry, self._first = carry, first
+        self._given = {} if given is None else {self.t: given}
         self._signals = {name: values[: self.t] for name, values in held.items()}
         self.info, self.spec_status, self.finished = info, status, False
         return info

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -221,7 +222,7 @@ def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
     if isinstance(world, Mapping):
         members = dict(world)
         return read_map(members.pop("format", None), members)
-    path = Path(str(world))
+    path = Path(world if isinstance(world, str | os.PathLike) else str(world))
     images = [image for kind in (".pgm", ".png") if (image := path.with_suffix(kind)).is_file()]
     if not path.is_file() or not images:
         raise MapError(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,8 +79,7 @@ def _refuted(needs: Sequence[Need], known: Known, ground: Ground, body: Body) ->
     return next((said for said in alone if said is not None), why)
 
 
-@dataclass(frozen=True)
-class _Ahead:
+class _Ahead(NamedTuple):
     known: Known
     ground: Ground
     body: Body

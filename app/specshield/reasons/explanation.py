@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,8 +40,7 @@ Rank = tuple[int, float]
 KEEPS_ALL, KEPT, LATE, BROKEN, SEVERAL, NOTHING = range(6)  # what a future shows, the most telling first
 
 
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """A conjunct as the formula has it, and what J asks for in its place."""
 
     conjunct: Formula

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +21,7 @@ POSES = {  # message types that hold a pose in one frame, and where in them
 }
 
 
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """lost: the first step from which no future was found that keeps the rule, None where there always was
     one. last: the pose before it. left: the steps that the drive lacks to the horizon.
     """

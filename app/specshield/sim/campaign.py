@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from functools import cache
 from multiprocessing import active_children, get_context, parent_process
 from queue import SimpleQueue
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -87,28 +87,34 @@ def run(
 
 
 def each_done(futures: Iterable[Future[T]]) -> Iterator[tuple[int, T]]:
-    """The number of each future and its result, as they come. An interrupt is raised between two of them.
+    """The number of each future and its result, as they come.
 
-    Python would raise it wherever the program is. In the midst of taking one of the pool's locks, that leaves
-    the lock held, and the program waits for it for ever when it ends.
+    An interrupt that comes while they are made or waited for is raised afterwards. Python would raise it at
+    once: in the midst of taking one of the pool's locks, which then stays held, so that the program waits for
+    it for ever when it ends.
     """
     done: SimpleQueue[Future[T] | None] = SimpleQueue()  # None: an interrupt came
+    number = dict[Future[T], int]()
+    with _interrupts_into(done):
+        for future in futures:
+            number[future] = len(number)
+            future.add_done_callback(done.put)
+    while number or not done.empty():
+        with _interrupts_into(done):
+            found = done.get()
+        if found is None:
+            raise KeyboardInterrupt
+        yield number.pop(found), found.result()
+
+
+@contextmanager
+def _interrupts_into(done: SimpleQueue[Any]) -> Iterator[None]:
     raises = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     raises = raises and threading.current_thread() is threading.main_thread()
     if raises:
         signal.signal(signal.SIGINT, lambda *_: done.put(None))
     try:
-        number = dict[Future[T], int]()
-        for future in futures:
-            number[future] = len(number)
-            future.add_done_callback(done.put)
-        left = len(number)
-        while left or not done.empty():
-            found = done.get()
-            if found is None:
-                raise KeyboardInterrupt
-            left -= 1
-            yield number[found], found.result()
+        yield
     finally:
         if raises:
             signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -192,8 +191,7 @@ def _rotation(degrees: tuple[float, float, float]) -> Floats:
     return rotation
 
 
-@dataclass(frozen=True)
-class _Canvas:
+class _Canvas(NamedTuple):
     """The cells while they are drawn: bool[height, width], resolution [m], lower left corner (x, y)."""
 
     occupied: Bools

@@ -12,9 +12,8 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -41,8 +40,7 @@ LEAST_RATE = 0.02  # share of the learning rate that it falls to, linearly, by t
 REPORT_EVERY = 100  # updates
 
 
-@dataclass(frozen=True)
-class Progress:
+class Progress(NamedTuple):
     """A report from a running training. satisfied: the rate measured last, None before the first."""
 
     update: int

@@ -9,16 +9,14 @@ robustness as one of this form and are rewritten: `not` moves inwards, F F and G
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from specshield.errors import FragmentError
 from specshield.stl import Always, Eventually, Formula, conjuncts
 from specshield.stl.conjunction import is_predicate, signed
 
 
-@dataclass(frozen=True)
-class Obligation:
+class Obligation(NamedTuple):
     """One conjunct, on steps counted from 0.
 
     eventually:         predicate at some t in [a, b]
@@ -75,5 +73,5 @@ def _under_eventually(a: int, b: int, inner: Obligation) -> Obligation:
 def _shifted(inner: Obligation, a: int, b: int) -> Obligation:
     """F[a,b] of an inner F, or G[a,b] of an inner G: one obligation over the sum of the windows."""
     if inner.kind == "eventually_always":
-        return replace(inner, a=inner.a + a, c1=inner.c1 + b)
-    return replace(inner, a=inner.a + a, b=inner.b + b)
+        return inner._replace(a=inner.a + a, c1=inner.c1 + b)
+    return inner._replace(a=inner.a + a, b=inner.b + b)

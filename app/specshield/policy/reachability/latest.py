@@ -16,7 +16,7 @@ semi-Lagrangian sweeps, bilinear between the lattice's crossings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,8 +46,7 @@ def masks_of(rules: Rules) -> list[int]:
     return sorted(possible, key=lambda m: -m.bit_count())
 
 
-@dataclass(frozen=True)
-class Phase:
+class Phase(NamedTuple):
     """Steps `start` to `end`, in which the same `always` (indices) hold."""
 
     start: int

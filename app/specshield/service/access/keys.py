@@ -78,7 +78,7 @@ class Keys:
                 return OPEN
             if not (self._read or self._own):
                 raise StoreError("the store cannot be reached: which keys there are is not known yet")
-            what = "the API key is not one of this server's" if given else "an API key is needed"
+            what = "the API key is not one of this server's" if digest else "an API key is needed"
             raise Unauthorized(what, path="Authorization", expected="Bearer <key>")
         return found
 

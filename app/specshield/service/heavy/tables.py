@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from specshield.errors import SpecshieldError
 from specshield.policy.reachability.policy import ReachabilityPolicy
@@ -24,8 +25,7 @@ log = logging.getLogger("specshield")
 ROOM = 64  # sessions whose tables are kept: about a megabyte each. Chosen by hand.
 
 
-@dataclass(frozen=True)
-class Made:
+class Made(NamedTuple):
     """A shield's policies, with the tables for a session's own map.
 
     digest: of what that map has learned. policies: their ids.

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -161,7 +160,7 @@ def explain(maps: Maps, settings: Settings, content: bytes, owner: str) -> dict[
         "formula": str(formula),
         "horizon": formula.horizon,
         "names": list(formula.names),
-        "windows": [asdict(window) for window in windows(formula)][:MOST_WINDOWS],
+        "windows": [window._asdict() for window in windows(formula)][:MOST_WINDOWS],
         "avoided": sorted(avoided(formula)),
         "methods": _methods(formula),
     }

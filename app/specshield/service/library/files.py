@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import re
+import secrets
 import shutil
 import tempfile
 import threading
@@ -53,8 +54,8 @@ def there(folder: Path, *names: str) -> bool:
         return False
     if not folder.is_dir():
         _write_folder(folder, missing)
-    else:
-        for name, content in missing.items():
+    for name, content in missing.items():
+        if not (folder / name).exists():  # another may have made the folder, with fewer files
             _write_file(folder / name, content)
     return True
 
@@ -123,7 +124,7 @@ def write_file(path: Path, content: bytes) -> None:
 
 
 def _write_file(path: Path, content: bytes) -> None:
-    draft = path.with_name(f".draft-{path.name}")
+    draft = path.with_name(f".draft-{secrets.token_hex(8)}")
     write_through(draft, content)
     os.replace(draft, path)
     sync(path.parent)

@@ -141,12 +141,7 @@ class Maps(Claimed):
         """Takes an owner's map; its content goes with the last owner. Raises NotFound, InUse and Conflict."""
         found = self.shipped(key)
         if found is not None:
-            raise InUse(
-                f"map {found.name!r} came with the server and cannot be deleted",
-                path="map_id",
-                got=key,
-                expected="a map that was sent here",
-            )
+            raise stays("map", found.name, key)
         key, token = self._id_of(key, owner), secrets.token_hex(8)
         user = self.claims.mark("maps", key, owner, token)
         if user is not None:
@@ -204,6 +199,12 @@ class Maps(Claimed):
             return Map(id, load_map((folder / "map.yaml").read_text(), image.read_bytes()), rooms)
         except (FileNotFoundError, StopIteration):
             raise missing("maps", id) from None
+
+
+def stays(what: str, name: str | None, key: str) -> InUse:
+    """what: "map" or "policy"."""
+    message, expected = f"{what} {name!r} came with the server and cannot be deleted", f"a {what} of your own"
+    return InUse(message, path=f"{what}_id", got=key, expected=expected)
 
 
 def _shipped(folder: Path) -> Iterator[Map]:

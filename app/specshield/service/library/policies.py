@@ -27,6 +27,7 @@ from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 
 KEPT_IN_MEMORY = 64
+NOT_COPIED = 4 << 10  # [bytes] as which a list counts a policy that is behind a URL
 SMALL = "policy.json", "card.json"  # of the files of a policy, all that a list shows
 log = logging.getLogger("specshield")
 
@@ -202,7 +203,8 @@ class Policies(Claimed):
         stored = asdict(replace(record, card=None))
         del stored["card"]
         content, folder = {"policy.json": files.to_json(stored), **(trained or {})}, self._folder / record.id
-        size = max(sum(map(len, content.values())), files.weight_of(folder))  # all, if it is trained already
+        files.there(folder)  # if it is trained already, all of it is counted
+        size = max(sum(map(len, content.values())), files.weight_of(folder))
         with self.claims.adding("policies", record.id, key, size, self._own_map(record.about)):
             if not folder.is_dir():
                 files.write_folder(folder, content)
@@ -253,7 +255,7 @@ class Policies(Claimed):
             [*self._named, *self.claims.ids("policies", owner)],
             after,
             limit,
-            lambda key: sum(files.size(self._folder / key / name) for name in SMALL),
+            lambda key: sum(files.size(self._folder / key / name) for name in SMALL) or NOT_COPIED,
         )
         found = [self.made_here(key) for key in keys]  # None: not written to the end, or deleted by now
         return [record for record in found if record is not None], following

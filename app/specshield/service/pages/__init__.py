@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from fastapi import APIRouter, Request, Response
 
@@ -31,8 +31,7 @@ HEADERS = {
 }
 
 
-@dataclass(frozen=True)
-class File:
+class File(NamedTuple):
     """packed: gzip of the content. tag: what a browser shows to hear that it has it already."""
 
     kind: str

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -72,8 +71,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     way: str = ""
 
 
-@dataclass(frozen=True)
-class Chain:
+class Chain(NamedTuple):
     """A record whose chain is whole. rows [n, 3 + signals]; steps: b"" where passed over. seal: in hex.
 
     configs: one a rule. names: of the signals, for each rule: those of the rows' columns that there were.

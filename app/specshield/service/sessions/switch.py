@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -90,8 +89,7 @@ class Switches:
         return here
 
 
-@dataclass(frozen=True)
-class Wanted:
+class Wanted(NamedTuple):
     """A switch at step t of `session`, which has the poses that came with it. row [3 + signals]: that of x_t;
     where the session does not have it yet, as the last decision foresaw it.
     """

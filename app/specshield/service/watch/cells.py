@@ -12,8 +12,8 @@ import mmap
 import os
 from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from prometheus_client.metrics_core import CounterMetricFamily, HistogramMetricFamily, Metric
@@ -23,8 +23,7 @@ from specshield.arrays import Floats
 SIZE = 512  # cells; a page of memory
 
 
-@dataclass(frozen=True)
-class Family:
+class Family(NamedTuple):
     """A counter, or with `bounds` a histogram; with `label` one of each of its `values`.
 
     first: its first cell. A counter takes one; a histogram one a bucket, the last of them without a bound,

@@ -45,6 +45,7 @@ HERE = 3.0  # [s] since a session was decided here; by hand: a robot's next step
 TOGETHER, EACH = 0.1, 0.0125  # [s] between two messages of a stream of several sessions, and more for each of
 # them: 0.5 s for 32. By hand: a message costs some 0.1 ms
 PARTS = 4  # of the sessions, looked at one after the other, so that none of them holds up a decision
+AWAY = 3.0  # [s] between two looks for a session in the archive, from where it may be erased. By hand
 HEARTBEAT = 15.0  # [s] without an event; chosen by hand, below what proxies wait
 FIRST = b"retry: 1000\n\n"
 log = logging.getLogger("specshield")
@@ -210,7 +211,7 @@ class Watchers:
             return
         before = [feed.version for feed in feeds]
         versions = await self._store.versions([feed.id for feed in feeds])
-        seen = zip(feeds, before, versions, strict=True)
+        seen = list(zip(feeds, before, versions, strict=True))
         gone_on = [
             (feed, version) for feed, known, version in seen if version != known and feed.version == known
         ]  # one that was decided here meanwhile is looked at next time
@@ -221,16 +222,21 @@ class Watchers:
             for (feed, version), end, new in zip(here, ends, news, strict=True):
                 if feed.end != end:
                     continue
-                if new is None or not outdated(feed, new) or not await self._switched(feed):
+                if feed.version is None:  # it is back from the archive, or another one has its id
+                    if await self._switched(feed):
+                        feed.version = b""
+                    else:
+                        feed.close()
+                elif new is None or not outdated(feed, new) or not await self._switched(feed):
                     self._gone_on(feed, version, new)
-        for feed, found in gone_on:
-            if found is None:
+        since = time.monotonic() - AWAY
+        for feed, known, now in seen:
+            if now is None and feed.version == known and (known is not None or feed.looked < since):
                 await self._left(feed)
 
     def _gone_on(self, feed: Feed, version: bytes, new: News | None) -> None:
         if new is None or begun(version) != begun(feed.version or version):
-            feed.over = True  # erased, and perhaps another session of this id was begun
-            feed.wake()
+            feed.close()  # erased, and perhaps another session of this id was begun
             return
         state, (found, end) = State.of(new.state), events(feed, feed.end, new)
         upto = reached(feed, end, new)
@@ -241,19 +247,14 @@ class Watchers:
     async def _switched(self, feed: Feed) -> bool:
         """Reads the rules anew; what else is new is for the next look. False where the session is gone."""
         found = await self._store.load(feed.id)
-        if found is None or begun(found.version) != begun(feed.version or found.version):
-            return False
-        feed.rules, feed.told, feed.width = ruled(Session.of(found))
-        return True
+        return found is not None and feed.rule(Session.of(found))
 
     async def _left(self, feed: Feed) -> None:
         """The session is no longer in the store: it was erased, or lies in the archive."""
-        dump = await self._store.dump(feed.id)
-        if dump is None:
-            feed.over = True
-            feed.wake()
+        dump, feed.looked = await self._store.dump(feed.id), time.monotonic()
+        if dump is None or not feed.rule(Session.of(dump)):
+            feed.close()
         else:
-            feed.rules, feed.told, feed.width = ruled(Session.of(dump))
             new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
             state, (found, _) = State.of(dump.state), events(feed, feed.end, new)
             feed.add(state, found, state.next_t, state.next_t)
@@ -266,9 +267,8 @@ class Watchers:
         (new,) = await self._store.news([(feed.id, t, feed.width, KEPT)])
         if new is None:
             dump = await self._store.dump(feed.id)
-            if dump is None:
+            if dump is None or not feed.rule(Session.of(dump)):
                 return [], feed.end
-            feed.rules, feed.told, feed.width = ruled(Session.of(dump))
             new = News(dump.state, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
         elif outdated(feed, new):
             return [], t if await self._switched(feed) else feed.end

@@ -63,7 +63,8 @@ class Feed:
     bytes of a row.
 
     recent: the decisions of the steps from `start` to before `end`. version: the one that was read; None for
-    a session that is not in the store. here: when it was decided in this process last [s, of
+    a session that is not in the store, b"" for one that is back there. looked: when it was looked for in the
+    archive last, and here: when it was decided in this process last [s, of
     time.monotonic].
     """
 
@@ -78,6 +79,7 @@ class Feed:
     status: str
     watchers: int = 0
     here: float = -math.inf
+    looked: float = -math.inf
     recent: deque[Told] = field(default_factory=lambda: deque(maxlen=KEPT))
     changed: asyncio.Event = field(default_factory=asyncio.Event)
 
@@ -99,6 +101,19 @@ class Feed:
                 break
             found.append(each)
         return found[::-1]
+
+    def rule(self, session: Session) -> bool:
+        """Takes over the rules that it has had by now; False where it is another session of this id."""
+        rules, told, width = ruled(session)
+        if rules[0].get("nonce") != self.rules[0].get("nonce"):
+            return False
+        self.rules, self.told, self.width = rules, told, width
+        return True
+
+    def close(self) -> None:
+        """It was erased."""
+        self.over = True
+        self.wake()
 
     def wake(self) -> None:
         self.changed.set()

@@ -24,8 +24,8 @@ class Begun:
     id = "the way that was begun"
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        left = self.task.horizon + 1 - len(history)
-        return Proposal(self.motions[:, -left:], int(self.motions[0, -left]))
+        rest = self.motions[:, len(history) - self.task.horizon - 1 :]  # too short for an earlier step's
+        return Proposal(rest, int(rest[0, 0]))
 
 
 def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:

@@ -16,7 +16,7 @@ const VIEWS = [
   [/^\/try\/([^/]+)$/, () => import("./views/trial.js")],
 ];
 
-const ANEW = "specshield.anew"; // in the tab: that the page began anew to read a module
+const ANEW = "specshield.anew"; // in the tab: for which view the page began anew, to read its module
 const main = document.querySelector("main");
 let leaving = new AbortController();
 
@@ -62,18 +62,19 @@ function found(path) {
  * does not read a module again that it could not read once, unless the page begins anew.
  */
 async function module(load, signal) {
+  let loaded;
   try {
-    const loaded = await load();
-    sessionStorage.removeItem(ANEW);
-    return loaded;
+    loaded = await load();
   } catch (error) {
     await fetched("page/main.js", { cache: "no-store" });
     signal.throwIfAborted();
-    if (sessionStorage.getItem(ANEW)) throw error; // it did, and still cannot
-    sessionStorage.setItem(ANEW, "yes");
+    if (sessionStorage.getItem(ANEW) === location.hash) throw error; // it did for this view, and still cannot
+    sessionStorage.setItem(ANEW, location.hash);
     location.reload();
     return new Promise(() => {}); // this page is about to go
   }
+  sessionStorage.removeItem(ANEW);
+  return loaded;
 }
 
 /** As soon as the view has its heading, the window is called after it, and the keyboard is in the view. */

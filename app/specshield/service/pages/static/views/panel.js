@@ -74,8 +74,8 @@ export class Panel {
 
   mode(decision) {
     const reason = REASONS[decision.reason] ?? decision.reason;
-    const lost = decision.mode === "fallback" && decision.reason === "infeasible";
-    const said = lost ? "Nothing certifies a way: the policy's own choice is made." : MODES[decision.mode];
+    const lost = decision.mode === "fallback" && !decision.witness;
+    const said = lost ? "No way was found that keeps what is asked; this is what comes nearest." : MODES[decision.mode];
     const warnings = decision.warnings.map((text) => el("li", {}, text));
     if (decision.in_collision) warnings.push(el("li", {}, "The robot touches an obstacle."));
     return [

@@ -19,7 +19,7 @@ export class Watch {
     this.charts = [
       [new Chart("Robustness ahead", metres), (d) => d.robustness[taken(d)]],
       [new Chart("Feasible mass", percent), (d) => d.feasible_mass],
-      [new Chart("Slack kept", (steps) => `${steps} steps`), (d) => d.slack],
+      [new Chart("Slack kept", (steps) => `${steps} ${steps === 1 ? "step" : "steps"}`), (d) => d.slack, true],
     ];
     this.draw = onceAFrame(() => this.show());
     this.replay = new Replay(this.draw);
@@ -54,10 +54,10 @@ export class Watch {
     this.panel.show(item);
     const decided = this.items.filter((each) => each?.decision);
     const last = Math.max(this.session.horizon, this.items.length - 1);
-    for (const [chart, value] of this.charts) {
+    for (const [chart, value, hidesZero] of this.charts) {
       const values = decided.map((each) => [each.t, value(each.decision)]);
       const known = values.filter(([, v]) => v !== null && v !== undefined && Math.abs(v) < 1e6);
-      chart.show(known.some(([, v]) => v !== 0) ? known : [], last, item.t);
+      chart.show(hidesZero && known.every(([, v]) => v === 0) ? [] : known, last, item.t);
     }
     this.charted.hidden = this.charts.every(([chart]) => chart.element.hidden);
   }
