@@ -106,3 +106,25 @@ def test_what_one_server_keeps_behind_a_url_another_finds_and_loads_from_its_own
     assert (there / "policy.safetensors").read_bytes() == b"weights"
     files.remove_folder(there)
     assert not files.there(here)
+
+
+def test_a_copy_that_several_fetch_at_once_is_whole(tmp_path):
+    def folders(name: str) -> Path:
+        nothing = tmp_path / "nothing"
+        settings = {"data_url": f"memory://{tmp_path.name}", "maps_dir": nothing, "models_dir": nothing}
+        return files.kept(Settings(data_dir=tmp_path / name, **settings), "policies")
+
+    here, there = folders("one"), folders("other")
+    weights, ids = bytes(1 << 20), [f"{number:064x}" for number in range(20)]
+    for id in ids:
+        files.write_folder(here / id, {"policy.json": b"{}", "policy.safetensors": weights})
+
+    def fetched(id: str, *names: str) -> bytes:
+        assert files.there(there / id, *names)
+        assert files.there(there / id)
+        return (there / id / "policy.safetensors").read_bytes()
+
+    with ThreadPoolExecutor(6) as several:
+        asked = [several.submit(fetched, id, *names) for id in ids for names in ((), ("policy.json",), ())]
+        assert all(each.result() == weights for each in asked)
+    assert not list(there.glob("*/.draft-*"))
