@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from evaluation.evaluation import workers
 from evaluation.statistics import clopper_pearson
 from evaluation.worlds.runs import Outcome, Trial, run
+from specshield.sim.campaign import each_done
 
 HEAD = (
     "| robot | case | world | senses | kept of what the oracle can keep | 95 % interval | oracle | "
@@ -54,7 +54,8 @@ def _made(trial: Trial, missing: Sequence[int], processes: int) -> Iterator[Outc
         yield from (run(trial, i) for i in missing)
         return
     with workers(processes) as pool:
-        yield from pool.map(partial(run, trial), missing)
+        for _, outcome in each_done(pool.submit(run, trial, i) for i in missing):
+            yield outcome
 
 
 def figures(found: Sequence[Outcome]) -> dict[str, Any]:
