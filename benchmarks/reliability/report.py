@@ -1,7 +1,7 @@
 """docs/reliability.md, from the figures that are there.
 
-A part that was not measured anew stays as the page has it, with the run that it came from; the rows of faults
-stay together.
+A part that was not measured anew stays as the page has it, with the run that it came from; so does a row of
+faults.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ RUNS = ("load", "isolation", "fuzz", "contract")
 def run(out: Path, page: Path) -> int:
     from benchmarks.reliability.faults.rows import ROWS
 
-    rows = list(ROWS)
+    rows, known = list(ROWS), page.read_text() if page.exists() else ""
     measured = [name for name in (*RUNS, *MODULES) if read(out, name) is not None]
     if all(read(out, f"fault-{name}") is not None for name in rows):
         measured += [f"fault-{name}" for name in rows]
@@ -33,10 +33,14 @@ def run(out: Path, page: Path) -> int:
         faults["training"] = _training(out)
     else:
         faults = {}
+        fresh = [name for name in rows if "away_all_s" in (read(out, f"fault-{name}") or {})]
+        if fresh and _part(known, "faults"):
+            faults["faults"] = _merged(_part(known, "faults"), _faults(out, fresh)[2:])
+            faults["summary"] = _summed(faults["faults"], _part(known, "summary"))
+            measured += [f"fault-{name}" for name in fresh]
     makers = {"load": _load, "isolation": _isolation, "fuzz": _fuzz, "contract": _contract}
     parts = faults | {name: make(out) for name, make in makers.items() if name in measured}
     parts |= {name: _other(out, name) for name in MODULES if name in measured}
-    known = page.read_text() if page.exists() else ""
     parts["runs"] = _runs(out, measured, _part(known, "runs"))
     others = "\n\n".join(
         f"`python -m benchmarks.{name}`: {what}.\n\n<!-- {name} -->" for name, what in MODULES.items()
@@ -49,6 +53,25 @@ def run(out: Path, page: Path) -> int:
     page.write_text(text)
     print(page)
     return 0
+
+
+def _merged(before: Sequence[str], fresh: Sequence[str]) -> list[str]:
+    """The lines of a table, of which those that begin with the same cell as a fresh one give way to it."""
+    new = {line.split(" | ")[0]: line for line in fresh}
+    return [new.get(line.split(" | ")[0], line) for line in before]
+
+
+def _summed(table: Sequence[str], before: Sequence[str]) -> list[str]:
+    """The summary `before`, with the sums of this table of faults."""
+    rows = [line.strip("| ").split(" | ") for line in table[2:]]
+    rows = [row for row in rows if len(row) > 4]
+    faults, steps = (sum(int(row[i].replace(",", "")) for row in rows) for i in (1, 2))
+    bad = [sum(int(row[4].split(" / ")[i]) for row in rows) for i in range(len(COUNTS))]
+    told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in zip(COUNTS, bad, strict=True))
+    first = (
+        f"Over all rows that were run to their end: {faults:,} faults, {steps:,} acknowledged steps: {told}."
+    )
+    return [first + " ".join(before).partition("stuck.")[2]]
 
 
 def _part(page: str, name: str) -> list[str]:
