@@ -9,8 +9,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -315,13 +317,19 @@ def test_no_step_is_lost_or_doubled_however_often_a_mover_is_killed(url, tmp_pat
     assert list(Path(place).rglob("*"))
 
 
-def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
+@contextmanager
+def archiving(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, Any]]]:
+    """A client of a server whose sessions move to the archive after a second, and how to begin one there."""
     with (
         serving(tmp_path, SPECSHIELD_ARCHIVE_AFTER="1") as server,
-        httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
+        httpx.Client(base_url=server.url, verify=False, timeout=HUNG) as client,
     ):
         client.post("/v1/maps", json=grid_json())
-        begun = {"policy_id": send_policy(client)["id"], "initial_pose": START, "id": "robot"}
+        yield client, {"policy_id": send_policy(client)["id"], "initial_pose": START, "id": "robot"}
+
+
+def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
+    with archiving(tmp_path) as (client, begun):
         assert client.post("/v1/sessions", json=begun).status_code == 201
 
         def step(t: int) -> httpx.Response:
@@ -359,19 +367,12 @@ def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
 
 
 def test_who_watches_an_archived_session_hears_of_its_end_and_of_no_other_one(tmp_path):
-    with (
-        serving(tmp_path, SPECSHIELD_ARCHIVE_AFTER="1") as server,
-        httpx.Client(base_url=server.url, verify=False, timeout=HUNG) as client,
-    ):
-        client.post("/v1/maps", json=grid_json())
-        begun = {"policy_id": send_policy(client)["id"], "initial_pose": START, "id": "robot"}
+    with archiving(tmp_path) as (client, begun):
         for again in (False, True):
             assert client.post("/v1/sessions", json=begun).status_code == 201
             body = {"t": 0, "poses": ahead(0)[-1:], "logits": LOGITS}
             assert client.post("/v1/sessions/robot/steps", json=body).status_code == 200
-            with httpx.stream(
-                "GET", f"{server.url}/v1/sessions/robot/events?after=-1", timeout=HUNG
-            ) as watched:
+            with client.stream("GET", "/v1/sessions/robot/events?after=-1") as watched:
                 lines = watched.iter_lines()
                 assert "id: 0" in lines
                 wait_for(lambda: any(path.is_file() for path in (tmp_path / "archive").rglob("*")))

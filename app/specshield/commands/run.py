@@ -74,7 +74,7 @@ def _case(id: str, name: str, target: str | None, seed: int) -> Case:
     else:
         place = _target(target)
     case = Case(name, task, maps.get(about.map_id).rooms, about.spec, f"go to {_point(place)}", place)
-    if target is not None and not (task.grid.holds(place) and not task.grid.occupied[case.cell(place)]):
+    if target is not None and (not task.grid.holds(place) or task.grid.occupied[case.cell(place)]):
         raise InputError("no robot can stand there", path="--target", got=target, expected="a free place")
     return case
 

@@ -89,9 +89,9 @@ def run(
 def each_done(futures: Iterable[Future[T]]) -> Iterator[tuple[int, T]]:
     """The number of each future and its result, as they come.
 
-    An interrupt that comes while they are made or waited for is raised afterwards. Python would raise it at
-    once: in the midst of taking one of the pool's locks, which then stays held, so that the program waits for
-    it for ever when it ends.
+    An interrupt that comes while the futures are made or waited for is raised afterwards. Python would raise
+    it at once. If one of the pool's locks is just being taken then, the lock stays held, and at its end the
+    program waits for that lock for ever.
     """
     done: SimpleQueue[Future[T] | None] = SimpleQueue()  # None: an interrupt came
     number = dict[Future[T], int]()

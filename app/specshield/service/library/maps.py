@@ -141,7 +141,7 @@ class Maps(Claimed):
         """Takes an owner's map; its content goes with the last owner. Raises NotFound, InUse and Conflict."""
         found = self.shipped(key)
         if found is not None:
-            raise stays("map", found.name, key)
+            raise undeletable("map", found.name, key)
         key, token = self._id_of(key, owner), secrets.token_hex(8)
         user = self.claims.mark("maps", key, owner, token)
         if user is not None:
@@ -201,8 +201,8 @@ class Maps(Claimed):
             raise missing("maps", id) from None
 
 
-def stays(what: str, name: str | None, key: str) -> InUse:
-    """what: "map" or "policy"."""
+def undeletable(what: str, name: str | None, key: str) -> InUse:
+    """The error for a `what`, "map" or "policy", that came with the server and is to be deleted."""
     message, expected = f"{what} {name!r} came with the server and cannot be deleted", f"a {what} of your own"
     return InUse(message, path=f"{what}_id", got=key, expected=expected)
 

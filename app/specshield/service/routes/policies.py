@@ -16,7 +16,7 @@ from specshield.service.access.keys import Key
 from specshield.service.access.owners import Caller, Owner
 from specshield.service.bounds.body import received
 from specshield.service.heavy.uploads import PARTS, is_multipart
-from specshield.service.library.maps import stays
+from specshield.service.library.maps import undeletable
 from specshield.service.library.policies import Record
 from specshield.service.schemas.base import Id
 from specshield.service.schemas.policies import PolicyList, PolicyRequest, PolicyResponse
@@ -173,7 +173,7 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
     """
     record = await asyncio.to_thread(server.policies.find, policy_id, owner)
     if record.name is not None:
-        raise stays("policy", record.name, policy_id)
+        raise undeletable("policy", record.name, policy_id)
     claims, token = server.policies.claims, secrets.token_hex(8)
     training = await asyncio.to_thread(_training, server, record)
     if training.status in ("queued", "training") and not await asyncio.to_thread(

@@ -63,9 +63,9 @@ class Feed:
     bytes of a row.
 
     recent: the decisions of the steps from `start` to before `end`. version: the one that was read; None for
-    a session that is not in the store, b"" for one that is back there. looked: when it was looked for in the
-    archive last, and here: when it was decided in this process last [s, of
-    time.monotonic].
+    a session that is not in the store, and b"" for one that has come back there and was not read yet. looked:
+    when it was last looked for in the archive; here: when it was last decided in this process. Both in
+    seconds of time.monotonic.
     """
 
     id: str
@@ -103,7 +103,7 @@ class Feed:
         return found[::-1]
 
     def rule(self, session: Session) -> bool:
-        """Takes over the rules that it has had by now; False where it is another session of this id."""
+        """Takes over the rules that the session has had by now; False where this is another one of its id."""
         rules, told, width = ruled(session)
         if rules[0].get("nonce") != self.rules[0].get("nonce"):
             return False
@@ -111,7 +111,7 @@ class Feed:
         return True
 
     def close(self) -> None:
-        """It was erased."""
+        """Ends the feed of a session that was erased."""
         self.over = True
         self.wake()
 
