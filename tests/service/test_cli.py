@@ -74,6 +74,18 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
         ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
         (
             "serve",
+            {"SPECSHIELD_API_KEYS": "secret"},
+            "SPECSHIELD_API_KEYS is not a setting",
+            "SPECSHIELD_API_KEY,",
+        ),
+        (
+            "serve",
+            {"SPECSHIELD_REDIS_URL": "redis://:secret@host:port"},
+            "REDIS_URL is not valid",
+            "redis://127.0.0.1:6379/0",
+        ),
+        (
+            "serve",
             {"REDIS_URL": "redis://:secret@host:port"},
             "REDIS_URL is not valid",
             "redis://127.0.0.1:6379/0",

@@ -111,6 +111,7 @@ def test_a_handshake_is_refused_over_http(server):
         with pytest.raises(InvalidStatus) as refused:
             connect(url)
         assert refused.value.response.status_code == status
+    assert "handshake" not in server.log.read_text()  # a caller's mistake is no error of the server's
 
 
 def test_a_message_over_the_limit_ends_the_stream_and_no_other(server, begin):

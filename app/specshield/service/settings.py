@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 
@@ -16,11 +17,12 @@ from specshield.service.access.site import AUTHORITY
 from specshield.service.storage.connect import FORMS, connect
 
 LONGEST = 24 * 3600  # [s] that a wait may be set to: timers do not take every number
+ALIKE = 0.9  # of a name's letters, by difflib: Kubernetes sets SPECSHIELD_PORT, SPECSHIELD_SERVICE_HOST...
 HEADER_TEXT = re.compile(r"[!-~]([ -~]*[!-~])?")
 
 
 class Settings(BaseSettings):
-    """Environment variables: the field names in upper case after `SPECSHIELD_`, and `REDIS_URL`."""
+    """Environment variables: the field names in upper case after `SPECSHIELD_`; REDIS_URL without it too."""
 
     model_config = SettingsConfigDict(
         env_prefix="SPECSHIELD_", frozen=True, extra="ignore", env_ignore_empty=True
@@ -38,7 +40,7 @@ class Settings(BaseSettings):
     maps_dir: Path = Field(shipped.MAPS, description="Maps there at start, <name>.yaml beside its image.")
     redis_url: str | None = Field(
         None,
-        validation_alias=AliasChoices("redis_url", "REDIS_URL"),
+        validation_alias=AliasChoices("redis_url", "REDIS_URL", "SPECSHIELD_REDIS_URL"),
         description="The store, as storage/connect.py says; unset, the server starts its own.",
     )
     store_timeout: float = Field(2.0, gt=0, le=LONGEST, description="Longest wait for the store [s].")
@@ -212,11 +214,16 @@ def read_settings() -> Settings:
             path="SPECSHIELD_API_KEY",
             expected="a key, or the variable not set",
         )
+    known = [f"SPECSHIELD_{field.upper()}" for field in Settings.model_fields]
+    for name in os.environ:  # a setting that is misspelt would be left out without a word
+        if name.startswith("SPECSHIELD_") and name not in known:
+            if meant := get_close_matches(name, known, 1, ALIKE):
+                raise InputError(f"{name} is not a setting", path=name, expected=f"{meant[0]}, or not set")
     try:
         return Settings()
     except ValidationError as invalid:
         wrong = invalid.errors(include_url=False)[0]
-        field = str(wrong["loc"][0]).lower()
+        field = str(wrong["loc"][0]).lower().removeprefix("specshield_")
         name = "REDIS_URL" if field == "redis_url" else f"SPECSHIELD_{field.upper()}"
         secret = field in ("redis_url", "api_key")  # a URL may hold a password
         shown = "" if secret else f": {wrong['input']!r}"

@@ -9,6 +9,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from specshield.shield.proposal import Proposer
 from specshield.task import Task, make_task
 
 KEPT_IN_MEMORY = 64
+AT_ONCE = 16  # policies that a list reads
 NOT_COPIED = 4 << 10  # [bytes] as which a list counts a policy that is behind a URL
 SMALL = "policy.json", "card.json"  # of the files of a policy, all that a list shows
 log = logging.getLogger("specshield")
@@ -257,7 +259,8 @@ class Policies(Claimed):
             limit,
             lambda key: sum(files.size(self._folder / key / name) for name in SMALL) or NOT_COPIED,
         )
-        found = [self.made_here(key) for key in keys]  # None: not written to the end, or deleted by now
+        with ThreadPoolExecutor(AT_ONCE) as pool:  # those behind a URL that are not copied yet take long
+            found = list(pool.map(self.made_here, keys))  # None: not written to the end, or deleted by now
         return [record for record in found if record is not None], following
 
     def _map_of(self, id: str) -> str:

@@ -38,10 +38,15 @@ def config(form: str, level: str) -> dict[str, Any]:
     own = {"handlers": ["default"], "level": level.upper(), "propagate": False}
     loggers = {**LOGGING_CONFIG["loggers"], "specshield": own}
     formatters = {"default": {"()": kind, "fmt": "%(levelprefix)s %(message)s"}}
-    handlers = {"default": LOGGING_CONFIG["handlers"]["default"]}
+    handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": [_is_true]}}
     # Access lines are the metrics' and the refusals' part: uvicorn's own cost a request some 60 us.
     del loggers["uvicorn.access"]
     return {**LOGGING_CONFIG, "formatters": formatters, "handlers": handlers, "loggers": loggers}
+
+
+def _is_true(record: logging.LogRecord) -> bool:
+    """uvicorn 0.54 says this of every WebSocket that is refused, though the refusal has been sent."""
+    return record.getMessage() != "ASGI callable returned without completing handshake."
 
 
 class Text(DefaultFormatter):
