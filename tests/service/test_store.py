@@ -231,7 +231,12 @@ def test_a_store_of_ones_own_and_sessions_that_expire(tmp_path):
                 wait_for(lambda: client.get(path).status_code == 404)
                 assert client.get("/v1/sessions").json() == {"items": [], "next": None}
                 assert connection.keys(f"specshield:*{session['id']}*") == []
-                assert begin(client)["next_t"] == 0  # there is room again
+                session = begin(client)  # there is room again
+                connection.config_set("maxmemory", 1)
+                refused = step(client, session, 0)
+                assert refused.json()["detail"].startswith("the store refuses: OOM")  # why, in its own words
+                connection.config_set("maxmemory", 0)
+                assert step(client, session, 0).status_code == 200
     finally:
         own.leave()
 
