@@ -236,6 +236,47 @@ def test_a_decision_that_was_never_heard_is_passed_over_by_a_robot_that_stood():
     assert [(body["t"], len(body["poses"])) for body in bodies] == [(0, 1), (1, 1)]
 
 
+@pytest.mark.parametrize("on_failure", ["witness", "stop"])
+def test_a_decision_whose_question_was_cancelled_is_passed_over_too(on_failure):
+    """As by asyncio's `wait_for`, or by Ctrl-C: the service may have decided it all the same."""
+    state = robust(on_failure)
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    cancelled = state._step((0.2, 0, 0), LOGITS)
+    next(cancelled)
+    next(cancelled)  # the request is on its way
+    assert type(step(state, 0.2, problem(422, "invalid-logits"))[0]) is errors.LogitsError
+    conflict = problem(409, "step-conflict", expected_t=2)
+    decision, bodies = step(state, 0.2, conflict, decided(2, M), logits=[1.0, 0.0, 0.0])
+    assert (decision.source, decision.t, state.t) == ("service", 2, 3)
+    assert [body["t"] for body in bodies] == [1, 2]
+    assert isinstance(step(state, 0.4, conflict)[0], errors.StepConflict), "this one nobody asked for here"
+
+
+def test_after_a_step_is_passed_over_the_continuation_that_began_before_it_is_not_followed():
+    """It would come a step late, and its rule may not have one to spare."""
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    cancelled = state._step((0.2, 0, 0), LOGITS)
+    [next(cancelled) for _ in range(2)]
+    decision, bodies = step(state, 0.2, problem(409, "step-conflict", expected_t=2), *AWAY)
+    assert (decision.source, decision.execute, decision.t) == ("stop", None, 2)
+    assert [body["t"] for body in bodies] == [1, *[2] * 5]
+
+
+def test_a_session_that_was_over_by_an_answer_that_nobody_heard_ends_the_loop():
+    state = robust()
+    step(state, 0.0, decided(0, M, witness=[M, M]))
+    assert step(state, 0.2, *AWAY)[0].execute == M
+    state._circuit.clock.now += LONGEST_PAUSE
+    decision, _ = step(state, 0.4, over := problem(409, "session-finished"))
+    assert (decision.source, decision.execute, decision.finished) == ("stop", None, True)
+    assert state.finished
+    assert isinstance(decision.error, errors.SessionFinished)
+    heard = robust()
+    step(heard, 0.0, decided(0, M, witness=[M, M]))
+    assert isinstance(step(heard, 0.2, over)[0], errors.SessionFinished), "somebody else has closed it"
+
+
 @pytest.mark.parametrize("taken", [False, True])
 def test_the_main_task_that_ends_at_a_step_that_says_to_stop_has_ended(taken):
     """Whether the service took that step or not: of the first, nobody heard the answer."""

@@ -28,7 +28,7 @@ from specshield.client.models import (
     execute_of,
 )
 from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
-from specshield.errors import HistoryConflict, HistoryGap, SpecshieldError, StepConflict
+from specshield.errors import HistoryConflict, HistoryGap, SessionFinished, SpecshieldError, StepConflict
 
 
 class SessionState:
@@ -133,26 +133,28 @@ class SessionState:
             body["explain"] = True
         own = main_task_done is None
         if self.on_failure == "raise":
-            return (yield from self._ask(x_t, body, own, TRIES))
-        way: Branch | str = "the session was begun with on_failure='stop'"
-        if self.on_failure == "witness":
-            way = self._continuation.at(x_t)
+            return (yield from self._decided(x_t, body, own, TRIES))
         error: SpecshieldError | None = None
         if self._circuit.due:
             try:
                 decision = yield from self._ask(x_t, body, own, 1 if self._circuit.open else TRIES)
-            except SpecshieldError as failed:
-                if not is_away(failed):
-                    raise
-                error = failed
-                self._circuit.failed()
-                self._unanswered = self.t
-            else:
                 self._circuit.answered()
                 return decision
+            except SpecshieldError as failed:
+                over = isinstance(failed, SessionFinished) and self._unanswered >= 0
+                if not over and not is_away(failed):
+                    raise
+                self.finished, error = self.finished or over, failed
+                self._circuit.failed()
+        way: Branch | str = "the session was begun with on_failure='stop'"
+        if self.on_failure == "witness":
+            way = self._continuation.at(x_t)
+        if self.finished:
+            way = "the session is over"
         if isinstance(way, str):
             self.main_task_done = self.main_task_done or body["main_task_done"]
-            return LocalDecision(self.t, "stop", None, way, self.spec_status, error=error)
+            last = self.spec_status, None, None, self.finished
+            return LocalDecision(self.t, "stop", None, way, *last, error)
         return self._alone(x_t, way, body["main_task_done"], error)
 
     def _alone(self, x_t: Pose, way: Branch, over: bool, error: SpecshieldError | None) -> LocalDecision:
@@ -169,14 +171,16 @@ class SessionState:
         """The service's decision at t. One that it took here unheard, for another pose or other logits, is
         passed over: the robot stood meanwhile, so x_t is the pose of the step after.
         """
+        asked, self._unanswered = self._unanswered, self.t  # until it is heard: a caller may cancel the step
         try:
             return (yield from self._decided(x_t, body, own, tries))
-        except StepConflict:
-            if self._unanswered != self.t:
+        except SpecshieldError as error:
+            self._unanswered = self.t if is_away(error) else asked
+            if not isinstance(error, StepConflict) or asked != self.t:
                 raise
         self.record(x_t)
         self._stored = max(self._stored, self.t)
-        return (yield from self._decided(x_t, body, own, tries))
+        return (yield from self._ask(x_t, body, own, tries))
 
     def _decided(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
         t, over, poses = self.t, body["main_task_done"], {**self._poses, self.t: x_t}
