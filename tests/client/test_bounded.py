@@ -1,5 +1,6 @@
 """The client's connections."""
 
+import asyncio
 import multiprocessing
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -39,5 +40,21 @@ def test_a_forked_process_opens_connections_of_its_own():
         child.join()
         assert its[0] == its[1] != first  # it keeps its own, too
         assert client.get("/").text == first
+    server.shutdown()
+    server.server_close()
+
+
+def test_another_event_loop_opens_connections_of_its_own():
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _Port)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = httpx.URL(f"http://127.0.0.1:{server.server_port}")
+    client = httpx.AsyncClient(base_url=url, transport=bounded.AsyncTransport(url))
+
+    async def ports():
+        return [(await client.get("/")).text for _ in range(2)]
+
+    first, second = asyncio.run(ports()), asyncio.run(ports())
+    assert first[0] == first[1] != second[0] == second[1]
+    asyncio.run(client.aclose())  # in a third one, in which it has none
     server.shutdown()
     server.server_close()

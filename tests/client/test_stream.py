@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import multiprocessing
 import sys
 import threading
 import time
@@ -16,8 +17,9 @@ from test_shells import NO_NAME
 from websockets.sync.server import serve
 
 from specshield import errors
-from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient
+from specshield.client import AsyncSession, AsyncShieldClient, Session, SessionInfo, ShieldClient, stream
 from specshield.client.models import build
+from specshield.client.stream import leave
 from tests.serving import wait_for
 
 POSE, LOGITS = (0.0, 0.0, 0.0), [0.0, None]
@@ -188,3 +190,70 @@ def test_without_the_packages_it_says_what_to_install(client, missing, monkeypat
     with pytest.raises(errors.InputError, match=missing) as caught:
         client("http://127.0.0.1:9", stream=True)
     assert "specshield[stream]" in caught.value.expected
+
+
+def test_a_forked_process_asks_over_connections_of_its_own():
+    """Else the parent would read what the child was answered, whose pose may be another."""
+    server, fork, elsewhere = Server(), multiprocessing.get_context("fork"), (0.0, 0.3, 0.0)
+    with served(server) as url, ShieldClient(url, timeout=10.0, stream=True) as client:
+        session = Session(client._run, INFO, POSE)
+        session.step(POSE, LOGITS)
+
+        def asks():
+            session.step(elsewhere, LOGITS)
+            client.close()
+
+        child = fork.Process(target=asks)
+        child.start()
+        child.join()
+        assert session.step(POSE, LOGITS).next_poses[0] == POSE
+    assert (child.exitcode, len(server.paths)) == (0, 2)
+
+
+def test_of_two_connections_for_one_session_one_is_kept_and_none_of_a_closed_client(monkeypatch):
+    left, answering = [], threading.Event()
+    monkeypatch.setattr(stream, "leave", lambda connection: left.append(connection) or leave(connection))
+    server = Server(answering, answering, None, closing := threading.Event())
+    with served(server) as url, ShieldClient(url, timeout=60.0, stream=True) as client:
+        asking = [
+            threading.Thread(target=Session(client._run, INFO, POSE).step, args=(POSE, LOGITS)) for _ in "ab"
+        ]
+        [thread.start() for thread in asking]
+        wait_for(lambda: len(server.messages) == 2)
+        answering.set()
+        [thread.join() for thread in asking]
+        assert (len(left), len(client._streams._open)) == (1, 1)
+        Session(client._run, INFO, POSE).step(POSE, LOGITS)
+        last = threading.Thread(target=Session(client._run, INFO, POSE).step, args=(POSE, LOGITS))
+        last.start()
+        wait_for(lambda: len(server.messages) == 4)
+        client.close()
+        closing.set()
+        last.join()
+        assert (len(left), len(client._streams._open), len(server.paths)) == (2, 0, 2)
+
+
+def test_a_client_that_is_closed_while_a_step_is_asked_keeps_no_connection():
+    server = Server(answering := threading.Event())
+
+    async def closed(url):
+        client = AsyncShieldClient(url, timeout=60.0, stream=True)
+        step = asyncio.create_task(AsyncSession(client._run, INFO, POSE).step(POSE, LOGITS))
+        while not server.messages:
+            await asyncio.sleep(0.01)
+        await client.close()
+        answering.set()
+        return (await step).t, client._streams._open
+
+    with served(server) as url:
+        assert asyncio.run(closed(url)) == (0, {})
+
+
+def test_another_event_loop_asks_over_connections_of_its_own():
+    server = Server()
+    with served(server) as url:
+        client = AsyncShieldClient(url, timeout=10.0, stream=True)
+        session = AsyncSession(client._run, INFO, POSE)
+        assert [asyncio.run(session.step(POSE, LOGITS)).t for _ in range(2)] == [0, 1]
+        asyncio.run(client.close())
+    assert (len(server.messages), len(server.paths)) == (2, 2)

@@ -75,21 +75,18 @@ class AsyncShieldClient:
         await self._http.aclose()
 
     async def _run(self, flow: Flow[T], /) -> T:
-        began, ends = time.monotonic(), math.inf
+        began, ends, got = time.monotonic(), math.inf, cast(Any, None)
         try:
-            command = next(flow)
             while True:
+                command, got = flow.send(got), None
                 if isinstance(command, Request):
-                    command = flow.send(await self._perform(command, ends))
-                    continue
-                if isinstance(command, More):
-                    command = flow.send(await self._more(command))
-                    continue
-                if isinstance(command, Wait):
+                    got = await self._perform(command, ends)
+                elif isinstance(command, More):
+                    got = await self._more(command)
+                elif isinstance(command, Wait):
                     await asyncio.sleep(max(0.0, min(command.seconds, ends - time.monotonic())))
                 else:
                     ends = command.ends(began, self._timeout)
-                command = next(flow)
         except StopIteration as stop:
             return cast(T, stop.value)
 
@@ -121,10 +118,10 @@ class AsyncShieldClient:
                 async for chunk in response.aiter_bytes():
                     exchange.take(chunk)
             reply = exchange.reply(response)
-            if reply is None:
-                await hang_up(response)
-            elif listens:
+            if reply is not None and listens:
                 reply = replace(reply, feed=Feed(response.aiter_bytes(), opened.pop_all().aclose))
+            elif reply is None and "network_stream" in response.extensions:
+                await response.extensions["network_stream"].aclose()  # nothing more is read from it
             return reply
 
     async def _more(self, more: More) -> Reply:
@@ -136,11 +133,6 @@ class AsyncShieldClient:
         if not piece:
             await more.feed.close()
         return more.got(piece)
-
-
-async def hang_up(response: httpx.Response) -> None:
-    if "network_stream" in response.extensions:
-        await response.extensions["network_stream"].aclose()
 
 
 def awaiting(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource[Run], P], Coroutine[Any, Any, T]]:
@@ -179,11 +171,9 @@ def opening(
 
     @looks_like(flow)
     async def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> AsyncSession:
-        info = await self._run(flow(*args, **kwargs))
-        given = cast(dict[str, Any], kwargs)
-        begun = AsyncSession[Any](
-            self._run, info, given.get("initial_pose"), given.get("on_failure", "raise")
-        )
+        info, given = await self._run(flow(*args, **kwargs)), cast(dict[str, Any], kwargs)
+        pose, on_failure = given.get("initial_pose"), given.get("on_failure", "raise")
+        begun = AsyncSession[Any](self._run, info, pose, on_failure)
         await self._run(begun._recall())
         return begun
 

@@ -7,6 +7,7 @@ With asyncio a try is cancelled.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import socket
@@ -18,7 +19,7 @@ from concurrent.futures import Future, wait
 from contextvars import ContextVar
 from functools import cache
 from ipaddress import ip_address
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 from urllib.request import getproxies, proxy_bypass
 
 import httpcore
@@ -190,9 +191,21 @@ class Transport(httpx.HTTPTransport):
 
 
 class AsyncTransport(httpx.AsyncHTTPTransport):
+    """The same for asyncio. Connections are their event loop's, so in another loop it opens its own."""
+
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
-        _connect_by(self, url, AsyncNetwork(), httpcore.AsyncConnectionPool, httpcore.AsyncHTTPProxy)
+        self._url, self._loop = url, cast(asyncio.AbstractEventLoop | None, None)
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        if self._loop is not (loop := asyncio.get_running_loop()):
+            network, self._loop = AsyncNetwork(), loop
+            _connect_by(self, self._url, network, httpcore.AsyncConnectionPool, httpcore.AsyncHTTPProxy)
+        return await super().handle_async_request(request)
+
+    async def aclose(self) -> None:
+        if self._loop is asyncio.get_running_loop():
+            await super().aclose()
 
 
 def _connect_by(transport: Any, url: httpx.URL, network: object, direct: Any, through_proxy: Any) -> None:

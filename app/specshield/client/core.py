@@ -150,9 +150,8 @@ def erase(request: Request) -> Flow[None]:
 
 
 def page_of(cls: type[T], resource: str, cursor: str | None) -> Flow[Page[T]]:
-    raw: Page[Any] = build(
-        Page, (yield from call(get(resource, params={} if cursor is None else {"cursor": cursor})))
-    )
+    params = {} if cursor is None else {"cursor": cursor}
+    raw: Page[Any] = build(Page, (yield from call(get(resource, params=params))))
     return Page(tuple(build(cls, item) for item in raw.items), raw.next)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import socket
 import time
 from concurrent.futures import Future
@@ -99,29 +100,29 @@ def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
 
 
 class SyncStreams(Streams):
+    """As with HTTP (bounded.py), a forked process opens its own connections."""
+
     def __init__(self, http: httpx.Client) -> None:
         super().__init__(http)
-        self._open: dict[str, Socket] = {}
+        self._open: dict[tuple[int, str], Socket] = {}
 
     def perform(self, exchange: Exchange, message: bytes) -> Reply | Failure:
         import websockets
 
-        path = exchange.request.path
-        connection = self._open.pop(path, None)
+        mine, reply = (os.getpid(), exchange.request.path), None
+        connection: Any = self._open.pop(mine, None)
         try:
             connection = connection or self._connected(exchange)
             connection.send(message)
             reply = self._read(exchange, connection.recv(max(exchange.ends - time.monotonic(), 0.0)))
-            if reply is not None:
-                self._open[path] = connection
-                return reply
-            failed: Reply | Failure = exchange.failure(httpx.ReadError(STALE))
         except TimeoutError:
-            failed = exchange.failure(httpx.ReadTimeout("the time of this try is over"))
+            return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
-            failed = _failed(exchange, error)
-        leave(connection)
-        return failed
+            return _failed(exchange, error)
+        finally:
+            if not reply or self._http.is_closed or self._open.setdefault(mine, connection) is not connection:
+                leave(connection)
+        return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     def _connected(self, exchange: Exchange) -> Socket:
         """In a thread, since nothing can limit the time in which a name is looked up."""
@@ -136,7 +137,9 @@ class SyncStreams(Streams):
 
     def close(self) -> None:
         while self._open:
-            leave(self._open.popitem()[1])
+            (process, _), connection = self._open.popitem()
+            if process == os.getpid():
+                leave(connection)
 
 
 def _leave_late(made: Future[Socket]) -> None:
@@ -153,7 +156,7 @@ def leave(connection: Any) -> None:
 class AsyncStreams(Streams):
     def __init__(self, http: httpx.AsyncClient) -> None:
         super().__init__(http)
-        self._open: dict[str, AsyncSocket] = {}
+        self._open: dict[tuple[object, str], AsyncSocket] = {}
 
     async def perform(self, exchange: Exchange, message: bytes) -> Reply | Failure:
         import websockets
@@ -172,8 +175,8 @@ class AsyncStreams(Streams):
         """The connection is kept only where it brought the answer: whoever cancels leaves it too."""
         from websockets.asyncio.client import connect
 
-        path, reply = exchange.request.path, None
-        connection = self._open.pop(path, None)
+        mine, reply = (asyncio.get_running_loop(), exchange.request.path), None
+        connection = self._open.pop(mine, None)
         if connection is None:
             options = self._options(exchange.seconds)
             connection = await connect(self._address(exchange.request), **options).__aenter__()
@@ -181,12 +184,12 @@ class AsyncStreams(Streams):
             await connection.send(message)
             reply = self._read(exchange, await connection.recv())
         finally:
-            if reply is None or path in self._open:
+            if not reply or self._http.is_closed or self._open.setdefault(mine, connection) is not connection:
                 connection.transport.abort()
-            else:
-                self._open[path] = connection
         return reply
 
     def close(self) -> None:
         while self._open:
-            self._open.popitem()[1].transport.abort()
+            (loop, _), connection = self._open.popitem()
+            if loop is asyncio.get_running_loop():
+                connection.transport.abort()

@@ -77,26 +77,23 @@ class ShieldClient:
         self._run(calls.wait_until_ready(timeout))
 
     def close(self) -> None:
+        self._http.close()
         if self._streams is not None:
             self._streams.close()
-        self._http.close()
 
     def _run(self, flow: Flow[T], /) -> T:
-        began, ends = time.monotonic(), math.inf
+        began, ends, got = time.monotonic(), math.inf, cast(Any, None)
         try:
-            command = next(flow)
             while True:
+                command, got = flow.send(got), None
                 if isinstance(command, Request):
-                    command = flow.send(self._perform(command, ends))
-                    continue
-                if isinstance(command, More):
-                    command = flow.send(self._more(command))
-                    continue
-                if isinstance(command, Wait):
+                    got = self._perform(command, ends)
+                elif isinstance(command, More):
+                    got = self._more(command)
+                elif isinstance(command, Wait):
                     time.sleep(max(0.0, min(command.seconds, ends - time.monotonic())))
                 else:
                     ends = command.ends(began, self._timeout)
-                command = next(flow)
         except StopIteration as stop:
             return cast(T, stop.value)
 
@@ -117,10 +114,10 @@ class ShieldClient:
                 for chunk in () if listens else response.iter_bytes():
                     exchange.take(chunk)
                 reply = exchange.reply(response)
-                if reply is None:
-                    hang_up(response)
-                elif listens:
+                if reply is not None and listens:
                     return replace(reply, feed=Feed(response.iter_bytes(), opened.pop_all().close))
+                if reply is None and "network_stream" in response.extensions:
+                    response.extensions["network_stream"].close()  # nothing more is read from it
         except httpx.RequestError as error:
             return exchange.failure(error)
         finally:
@@ -138,12 +135,6 @@ class ShieldClient:
         if not piece:
             more.feed.close()
         return more.got(piece)
-
-
-def hang_up(response: httpx.Response) -> None:
-    """Close the connection under a response, so that nothing more is read from it."""
-    if "network_stream" in response.extensions:
-        response.extensions["network_stream"].close()
 
 
 def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource[Run], P], T]:
