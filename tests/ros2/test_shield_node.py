@@ -127,6 +127,13 @@ def test_a_robot_off_the_way_is_told_to_stand(logic: Logic) -> None:
     assert logic.silent((x, y, theta)).source == "witness"
 
 
+def test_a_rule_begins_where_the_robot_is_at_the_first_logits_that_can_be_read(logic: Logic) -> None:
+    with pytest.raises(SpecshieldError, match="number of logits"):
+        logic.on_logits(START, [0.0])
+    x, y, theta = START
+    assert logic.on_logits((x + 0.01, y, theta), [0.0] * 4).source == "shield"
+
+
 def test_without_a_map_it_says_so() -> None:
     with pytest.raises(SpecshieldError, match="no map"):
         Logic("F[0,9] x > 1", "{}", PARAMETERS["robot"]).on_logits(START, [0.0] * 4)

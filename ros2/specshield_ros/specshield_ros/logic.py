@@ -75,6 +75,7 @@ class Logic:
         if session.finished:
             return self._stopped("the rule is decided, and the session is over")
         decision = session.step(pose, logits)
+        self.session = session  # not before: logits that are refused begin nothing
         self._plan = list(decision.witness or ())
         return self._going(pose, decision.execute, "shield", decision)
 
@@ -91,9 +92,7 @@ class Logic:
     def _begun(self, pose: Pose) -> LocalSession:
         if self.shield is None:
             raise SpecshieldError("there is no map yet", expected="a nav_msgs/OccupancyGrid on ~/map")
-        if self.session is None:
-            self.session = self.shield.session(initial_pose=pose)
-        return self.session
+        return self.session or self.shield.session(initial_pose=pose)
 
     def _going(self, pose: Pose, action: int, source: str, decision: Any) -> Told:
         assert self.shield is not None
