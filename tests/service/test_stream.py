@@ -114,6 +114,15 @@ def test_a_handshake_is_refused_over_http(server):
     assert "handshake" not in server.log.read_text()  # a caller's mistake is no error of the server's
 
 
+def test_text_that_is_no_text_ends_the_stream_and_writes_no_traceback(server, begin):
+    with connect(stream_of(server, begin())) as stream:
+        stream.send(b"\xff", text=True)
+        with pytest.raises(ConnectionClosed) as closed:
+            stream.recv()
+    assert closed.value.rcvd.code == 1007
+    assert "Traceback" not in server.log.read_text()
+
+
 def test_a_message_over_the_limit_ends_the_stream_and_no_other(server, begin):
     session, other = begin(), begin()
     with connect(stream_of(server, session)) as large, connect(stream_of(server, other)) as stream:

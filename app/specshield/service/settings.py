@@ -216,9 +216,9 @@ def read_settings() -> Settings:
         )
     known = [f"SPECSHIELD_{field.upper()}" for field in Settings.model_fields]
     for name in os.environ:  # a setting that is misspelt would be left out without a word
-        if name.startswith("SPECSHIELD_") and name not in known:
-            if meant := get_close_matches(name, known, 1, ALIKE):
-                raise InputError(f"{name} is not a setting", path=name, expected=f"{meant[0]}, or not set")
+        meant = get_close_matches(name, known, 1, ALIKE)
+        if meant and name not in known:
+            raise InputError(f"{name} is not a setting", path=name, expected=f"{meant[0]}, or not set")
     try:
         return Settings()
     except ValidationError as invalid:

@@ -23,6 +23,13 @@ from uvicorn.logging import DefaultFormatter
 log = logging.getLogger("specshield")
 request: ContextVar[Scope | None] = ContextVar("request", default=None)  # the one that is being answered
 TRACEPARENT = re.compile(rb"[0-9a-f]{2}-([0-9a-f]{32})-([0-9a-f]{16})-[0-9a-f]{2}")  # W3C Trace Context
+# What uvicorn 0.54 writes of a WebSocket that was refused, as it should be; of one that sent what is not
+# UTF-8; and of one that was opened, of whose end it writes nothing.
+NO_NEWS = {
+    "ASGI callable returned without completing handshake.",
+    "Invalid UTF-8 sequence received from client.",
+    "connection open",
+}
 PLAIN = re.compile(r"[\w.:/{}@+-]+")  # what a text line shows without quotes
 
 
@@ -38,15 +45,14 @@ def config(form: str, level: str) -> dict[str, Any]:
     own = {"handlers": ["default"], "level": level.upper(), "propagate": False}
     loggers = {**LOGGING_CONFIG["loggers"], "specshield": own}
     formatters = {"default": {"()": kind, "fmt": "%(levelprefix)s %(message)s"}}
-    handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": [_is_true]}}
+    handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": [_is_news]}}
     # Access lines are the metrics' and the refusals' part: uvicorn's own cost a request some 60 us.
     del loggers["uvicorn.access"]
     return {**LOGGING_CONFIG, "formatters": formatters, "handlers": handlers, "loggers": loggers}
 
 
-def _is_true(record: logging.LogRecord) -> bool:
-    """uvicorn 0.54 says this of every WebSocket that is refused, though the refusal has been sent."""
-    return record.getMessage() != "ASGI callable returned without completing handshake."
+def _is_news(record: logging.LogRecord) -> bool:
+    return record.getMessage() not in NO_NEWS
 
 
 class Text(DefaultFormatter):
