@@ -41,6 +41,11 @@ def decision(formula, *motions, **config):
         ("F[0,4] A and F[2,4] x > 0", [FORWARD], 2, [1, 1, 1, 1], False),  # A is done with
         ("F[2,2] A", [], 5, [1, 0, 0, 1], False),
         ("not G[0,4] not A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("x > 0 U[0,4] A", [], 2, [1, 0, 0, 1], False),  # an `until` has a deadline too
+        ("x > 0 U[0,4] A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("x > 0 U[0,4] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
+        ("x > 0 U[0,4] A", [WAIT, WAIT], 0, [1, 0, 0, 1], False),
+        ("F[0,4] A or F[1,3] x > 9", [WAIT], 2, [1, 0, 0, 0], False),  # and so has an `or`
     ],
 )
 def test_slack_asks_for_deadlines_early_and_for_the_most_that_can_be_had(
@@ -56,6 +61,15 @@ def test_slack_asks_for_deadlines_early_and_for_the_most_that_can_be_had(
 def test_slack_is_given_up_where_the_rule_itself_cannot_be_kept():
     lost = decision("F[0,2] A", LEFT, slack=1)
     assert (lost.mode, lost.reason, lost.feasible_mass) == ("fallback", "infeasible", 0.0)
+
+
+@pytest.mark.parametrize(("slack", "feasible"), [(0, [1, 1, 1, 1]), (2, [1, 0, 0, 0])])
+def test_slack_is_kept_beside_as_much_of_the_margin_as_can_be_had(slack, feasible):
+    """In row 0 the G is kept by 0.05 m, whatever the robot does, so the deadline is asked for early still."""
+    found = decision("F[0,4] A and G[0,4] y < 0.15", WAIT, margin=0.1, slack=slack)
+    assert list(found.j_values[:4]) == feasible
+    assert (found.reason, found.slack) == ("margin_unattainable", slack)
+    assert found.margin == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("formula", ["G[0,3] x > 0.05", "not F[0,3] x <= 0.05", "not not G[0,3] x > 0.05"])

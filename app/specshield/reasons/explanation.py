@@ -103,8 +103,7 @@ class _Motion:
             _Part(each, still_open(prefix.task, each, prefix.poses, prefix.rows, slack) if slack else each)
             for each in kept
         ]
-        enforced = [again([each], prefix.t + 1)[0] for each in broken]
-        parts += [_Part(each, each) for each in enforced]
+        parts += [_Part(each, each) for lost in broken for each in again([lost], prefix.t + 1)]
         return parts or [_Part(prefix.formula, prefix.formula)]
 
     def shows(

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from specshield.arrays import Floats
 from specshield.rule.residual import joined
 from specshield.rule.view import look, view_of
-from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Until, conjuncts
 from specshield.task import Task
 
 
 def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats, slack: int) -> Formula:
-    """What x_{0:t} leaves open of the formula, with each F of the conjunction met `slack` steps early.
+    """What x_{0:t} leaves open of the formula, with each F and U of the conjunction met `slack` steps early.
 
     poses [t + 1, 3], rows [t + 1, S]: the signals. A G is asked from the first step on at which its child is
-    still open. The window of an F keeps at least half its length, however much slack is asked for. Where
-    nothing is open the result is the formula itself.
+    open. A window keeps half its length or more. Where nothing is open the result is the formula itself.
     """
     t, kept = len(poses) - 1, list[Formula]()
     for conjunct in conjuncts(formula):
@@ -25,8 +26,8 @@ def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats, slack:
         match conjunct:
             case Always(a, b, child):
                 kept.append(Always(max(a, min(t + 1 - child.horizon, b)), b, child))
-            case Eventually(a, b, child):
-                kept.append(Eventually(a, b - min(slack, (b - a) // 2), child))
+            case Eventually(a, b) | Until(a, b):
+                kept.append(replace(conjunct, b=b - min(slack, (b - a) // 2)))
             case _:
                 kept.append(conjunct)
     return joined(kept) if kept else formula

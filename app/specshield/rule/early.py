@@ -1,8 +1,7 @@
 """What a prefix leaves open of a formula, with each F of the conjunction met some steps early.
 
-A conjunct that the prefix has settled is left out. An F is asked for so many steps before its window ends, a
-G from the first step on at which its child is still open. All of it is read off the values of the formula's
-leaves along a trajectory, so that no formula is compiled at a step.
+What the prefix has settled is left out. An F is asked for so many steps before its window ends, a G from the
+first step on at which its child is open: read off the leaves' values, so no formula is compiled at a step.
 """
 
 from __future__ import annotations
@@ -13,8 +12,9 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
+from specshield.rule.residual import joined
 from specshield.rule.values import places
-from specshield.stl import SATISFIED_ABOVE, Always, And, Eventually, Formula, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Or, Until, conjuncts
 from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_value
 from specshield.task import Task, kept_with_task
 
@@ -24,10 +24,9 @@ OTHER, EVENTUALLY, ALWAYS = 0, 1, 2
 class Conjuncts(NamedTuple):
     """A conjunction of K formulas, over the leaves of its tree.
 
-    below: the tree without the F or G at the top of each conjunct, and without the `and` that joins them.
-    kind [K]: what that is; OTHER: none, and the conjunct is whole in `below`. at [K]: where in the buffer the
-    values begin that it ranges over; a, b [K]: its window; horizon [K]: of what is below it. plain [K]:
-    whether that is a predicate, or under an F a G over one.
+    below: the tree without the F or G at the top of each conjunct, and the `and`. kind [K]: what that is;
+    OTHER: none, all is in `below`. at [K]: where in the buffer values begin that it ranges over. a, b [K]:
+    its window. horizon [K]: of what is below. plain [K]: whether that is a predicate, or under F a G of one.
     """
 
     below: Tree
@@ -41,13 +40,10 @@ class Conjuncts(NamedTuple):
 
 @kept_with_task
 def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
-    """The formula as a plain conjunction, whose tree has the leaves, and its conjuncts, prepared once.
-
-    It is the very formula where that is one.
-    """
-    parts, slots = conjuncts(formula) if is_temporal(formula) else (formula,), places(task)  # as in the tree
-    whole = parts[0] if len(parts) == 1 else And(parts)
-    whole = formula if whole == formula else whole
+    """The formula itself where it is a plain conjunction, else one that is equal; and its conjuncts."""
+    above, slots = conjuncts(formula) if is_temporal(formula) else (formula,), places(task)  # as in the tree
+    parts = [each for part in above for each in _with_deadline(part)]
+    whole = formula if joined(parts) == formula else joined(parts)
     tree = compile_tree(whole, slots)
     rows, kept, node, size = [], np.ones(len(tree.op), np.bool_), 0, 0
     for k, part in enumerate(parts):
@@ -59,22 +55,26 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
             kind = EVENTUALLY if isinstance(part, Eventually) else ALWAYS
             row = (kind, size, part.a, part.b, part.child.horizon)
         rows.append(row)
-        if k > 0:  # the `and`
-            kept[node] = False
-            node += 1
-        size += own.size
-    below = tree._replace(
-        **{name: getattr(tree, name)[kept] for name in ("op", "at", "length", "a", "b", "right")}
-    )
+        kept[node : node + (k > 0)] = False  # the `and`
+        node, size = node + (k > 0), size + own.size
+    below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:6]})  # of its nodes
     kind_of, at, a, b, horizon = np.array(rows, np.int64).T.copy()
-    plain = np.array([_is_plain(part) for part in parts], np.bool_)
-    return whole, Conjuncts(below, kind_of, at, a, b, horizon, plain)
+    return whole, Conjuncts(below, kind_of, at, a, b, horizon, np.array([*map(_is_plain, parts)], np.bool_))
+
+
+def _with_deadline(part: Formula) -> tuple[Formula, ...]:
+    """A conjunct, and for an `until`, or an `or` of F, the F that follows from it, which can be met early."""
+    if isinstance(part, Until):
+        return part, Eventually(part.a, part.b, part.right)
+    ways = [each for each in part.parts if isinstance(each, Eventually)]
+    if not isinstance(part, Or) or len(ways) < len(part.children):
+        return (part,)
+    return part, Eventually(min(w.a for w in ways), max(w.b for w in ways), Or(tuple(w.child for w in ways)))
 
 
 def _is_plain(part: Formula) -> bool:
-    if isinstance(part, Eventually) and isinstance(part.child, Always):
-        return part.child.child.horizon == 0
-    return isinstance(part, (Always, Eventually)) and part.child.horizon == 0
+    inner = part.child if isinstance(part, Eventually) and isinstance(part.child, Always) else part
+    return isinstance(inner, (Always, Eventually)) and inner.child.horizon == 0
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 The margin is asked of the whole trajectory first. Where no future keeps it there, or where slack is asked for
 too, it is asked of what the formula still leaves open. Where both cannot be had, the slack is lowered first,
-to the most steps with which the margin can be had, and then the margin.
+to the most steps with which the margin can be had, or with which as much of it can be had as without slack.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ def aim(
 
     motions = len(task.robot.motions)
     if before is not None:
+        margin = min(margin, SATISFIED_ABOVE + before.margin)
         best, _ = at(before.most)
         return before._replace(best=best, kept=best.robustness > margin)
     best, had = at(high)
@@ -76,11 +77,8 @@ def aim(
         return Aimed(best, best.robustness > margin, care.margin, next_due, False, high)
     low = 0  # slack `high` cannot be had
     best, had = at(low)
-    if not had:
-        highest = max(float(best.robustness.max()), SATISFIED_ABOVE)
-        kept = (best.robustness >= highest) & (best.robustness > SATISFIED_ABOVE)
-        found = highest - SATISFIED_ABOVE
-        return Aimed(best, kept, found, low, found <= shield.config.margin)
+    if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
+        margin, high = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE), high + 1
     while high - low > 1:
         middle = (low + high) // 2
         tighter, had = at(middle)
@@ -88,8 +86,9 @@ def aim(
             low, best = middle, tighter
         else:
             high = middle
-    slack, lowered = min(low, next_due), low < shield.config.slack
-    return Aimed(best, best.robustness > margin, care.margin, slack, lowered, low)
+    margin_had = margin - SATISFIED_ABOVE
+    lowered = low < shield.config.slack or margin_had < shield.config.margin
+    return Aimed(best, best.robustness > margin, margin_had, min(low, next_due), lowered, low)
 
 
 class Open(NamedTuple):
