@@ -371,6 +371,16 @@ def test_what_is_in_the_way_is_not_waited_for_where_waiting_would_break_the_rule
     assert decision.spec_status == "pending"
 
 
+def test_marks_are_not_blamed_where_nothing_was_marked():
+    """No motion of the only step brings the robot nearer to its goal, and it has run into nothing."""
+    grid, goal = OccupancyGrid(np.zeros((20, 80), bool), 0.05), {"Goal": GOAL | {"center": [3.5, 0.5]}}
+    policy = synthesise(make_task(grid, STRETCH, "F[0,1] Goal", goal), Settings(pitch=0.1))
+    decision = decide(make_shield([policy], Config(learn_map=True)), [(0.6, 0.5, math.pi / 2)], None, True)
+    assert (decision.mode, decision.reason) == ("fallback", "infeasible")
+    assert [said for said in decision.warnings if "no way was found to keep F[0,1] Goal" in said]
+    assert not [said for said in decision.warnings if "marked" in said]
+
+
 @pytest.mark.parametrize("uncertainty", [None, Uncertainty()])
 @pytest.mark.parametrize("steps", [17, 19, 22])
 def test_whoever_pauses_within_the_time_that_is_left_is_there_in_time(steps, uncertainty):

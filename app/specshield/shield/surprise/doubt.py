@@ -78,12 +78,13 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
     if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
     elif not helps:  # what is believed of contacts may be why
-        known = taught.map
-        free = on_map(told, revised(known, forget(known, known.occupied & (known.by != SENT))))
+        known, marked = taught.map, taught.map.occupied & (taught.map.by != SENT)
+        free = on_map(told, revised(known, forget(known, marked)))
         ways = futures(now.prefix, free.body, free.proposers, None, (0.0,))
-        first, _, lacks, helps = most_kept(free, judged.part, ways)
+        first, _, said, helps = most_kept(free, judged.part, ways)
         first = first if helps else ways.preferred
-        said = ("what was marked after contacts leaves no way, so it is ignored for this action", *lacks)
+        if marked.any() or len(taught.barred):
+            said = ("what was marked after contacts leaves no way, so it is ignored for this action", *said)
     tried = tried._replace(warnings=(*tried.warnings, *said))
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 
