@@ -64,6 +64,10 @@ class SpecshieldError(Exception):
 
     type: ClassVar[str] = "error"
 
+    def __init_subclass__(cls, type: str | None = None) -> None:
+        super().__init_subclass__()
+        cls.type = type or cls.type
+
     def __init__(
         self,
         message: str,
@@ -89,180 +93,141 @@ class SpecshieldError(Exception):
         message = self.message.removesuffix(expected)  # some messages say it already
         return f"{where}{message}{got}{expected}"
 
+    def retold(self, message: str, **details: Any) -> SpecshieldError:
+        """The same error in other words, and with these details."""
+        return type(self)(message, path=self.path, got=self.got, expected=self.expected, **details)
+
     def at(self, path: str) -> SpecshieldError:
         """The same error, its path put below `path`: 'formula' at 'spec' is 'spec.formula'."""
         self.path = path if self.path is None else f"{path}.{self.path}"
         return self
 
 
-class InputError(SpecshieldError):
-    type = "invalid-input"
+class InputError(SpecshieldError, type="invalid-input"): ...
 
 
-class FormulaError(InputError):
+class FormulaError(InputError, type="invalid-formula"):
     """`position` (0-based offset into the text) is in `details`."""
 
-    type = "invalid-formula"
 
+class HorizonError(FormulaError, type="horizon-too-long"): ...
 
-class HorizonError(FormulaError):
-    type = "horizon-too-long"
 
+class FragmentError(InputError, type="outside-fragment"): ...
 
-class FragmentError(InputError):
-    type = "outside-fragment"
 
+class SampleError(InputError, type="invalid-samples"): ...
 
-class SampleError(InputError):
-    type = "invalid-samples"
 
+class MapError(InputError, type="invalid-map"): ...
 
-class MapError(InputError):
-    type = "invalid-map"
 
+class RobotError(InputError, type="invalid-robot"): ...
 
-class RobotError(InputError):
-    type = "invalid-robot"
 
+class PoseError(InputError, type="invalid-pose"): ...
 
-class PoseError(InputError):
-    type = "invalid-pose"
 
+class LogitsError(InputError, type="invalid-logits"): ...
 
-class LogitsError(InputError):
-    type = "invalid-logits"
 
+class PolicyError(InputError, type="invalid-policy"): ...
 
-class PolicyError(InputError):
-    type = "invalid-policy"
 
+class InfeasibleStart(InputError, type="infeasible-start"): ...
 
-class InfeasibleStart(InputError):
-    type = "infeasible-start"
 
+class InfeasibleSwitch(InputError, type="infeasible-switch"): ...
 
-class InfeasibleSwitch(InputError):
-    type = "infeasible-switch"
 
+class Unsupported(InputError, type="unsupported"): ...
 
-class Unsupported(InputError):
-    type = "unsupported"
 
+class TooExpensive(InputError, type="too-expensive"): ...
 
-class TooExpensive(InputError):
-    type = "too-expensive"
 
+class HeadersTooLarge(InputError, type="headers-too-large"): ...
 
-class HeadersTooLarge(InputError):
-    type = "headers-too-large"
 
+class BodyTooLarge(InputError, type="body-too-large"): ...
 
-class BodyTooLarge(InputError):
-    type = "body-too-large"
 
+class UnsupportedMediaType(InputError, type="unsupported-media-type"): ...
 
-class UnsupportedMediaType(InputError):
-    type = "unsupported-media-type"
 
+class NotFound(SpecshieldError, type="not-found"): ...
 
-class NotFound(SpecshieldError):
-    type = "not-found"
 
+class MethodNotAllowed(SpecshieldError, type="method-not-allowed"): ...
 
-class MethodNotAllowed(SpecshieldError):
-    type = "method-not-allowed"
 
+class Conflict(SpecshieldError, type="conflict"): ...
 
-class Conflict(SpecshieldError):
-    type = "conflict"
 
+class HistoryGap(Conflict, type="history-gap"): ...
 
-class HistoryGap(Conflict):
-    type = "history-gap"
 
+class HistoryConflict(Conflict, type="history-conflict"): ...
 
-class HistoryConflict(Conflict):
-    type = "history-conflict"
 
+class StepConflict(Conflict, type="step-conflict"): ...
 
-class StepConflict(Conflict):
-    type = "step-conflict"
 
+class SessionFinished(Conflict, type="session-finished"): ...
 
-class SessionFinished(Conflict):
-    type = "session-finished"
 
+class SessionExists(Conflict, type="session-exists"): ...
 
-class SessionExists(Conflict):
-    type = "session-exists"
 
+class NameTaken(Conflict, type="name-taken"): ...
 
-class NameTaken(Conflict):
-    type = "name-taken"
 
+class InUse(Conflict, type="in-use"): ...
 
-class InUse(Conflict):
-    type = "in-use"
 
+class Unauthorized(SpecshieldError, type="unauthorized"): ...
 
-class Unauthorized(SpecshieldError):
-    type = "unauthorized"
 
+class CrossSite(SpecshieldError, type="cross-site"): ...
 
-class CrossSite(SpecshieldError):
-    type = "cross-site"
 
+class MisdirectedRequest(SpecshieldError, type="misdirected-request"): ...
 
-class MisdirectedRequest(SpecshieldError):
-    type = "misdirected-request"
 
+class LimitReached(SpecshieldError, type="limit-reached"): ...
 
-class LimitReached(SpecshieldError):
-    type = "limit-reached"
 
+class RateLimited(LimitReached, type="rate-limited"): ...
 
-class RateLimited(LimitReached):
-    type = "rate-limited"
 
+class InsufficientStorage(SpecshieldError, type="insufficient-storage"): ...
 
-class InsufficientStorage(SpecshieldError):
-    type = "insufficient-storage"
 
+class Busy(SpecshieldError, type="busy"): ...
 
-class Busy(SpecshieldError):
-    type = "busy"
 
+class RequestTimeout(SpecshieldError, type="request-timeout"): ...
 
-class RequestTimeout(SpecshieldError):
-    type = "request-timeout"
 
+class TrainingUnavailable(SpecshieldError, type="training-unavailable"): ...
 
-class TrainingUnavailable(SpecshieldError):
-    type = "training-unavailable"
 
+class Starting(SpecshieldError, type="starting"): ...
 
-class Starting(SpecshieldError):
-    type = "starting"
 
+class Stopping(SpecshieldError, type="stopping"): ...
 
-class Stopping(SpecshieldError):
-    type = "stopping"
 
+class StoreError(SpecshieldError, type="store-unavailable"): ...
 
-class StoreError(SpecshieldError):
-    type = "store-unavailable"
 
+class ServerError(SpecshieldError, type="internal-error"): ...
 
-class ServerError(SpecshieldError):
-    type = "internal-error"
 
+class TransportError(SpecshieldError, type="transport-error"): ...
 
-class TransportError(SpecshieldError):
-    type = "transport-error"
 
-
-class TransportTimeout(TransportError):
-    type = "transport-timeout"
+class TransportTimeout(TransportError, type="transport-timeout"): ...
 
 
 def tree(root: type[SpecshieldError] = SpecshieldError) -> Iterator[type[SpecshieldError]]:

@@ -76,9 +76,7 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
             with suppress(InfeasibleStart):
                 start(shield, pose, told.way)
                 return True, told.way
-        raise InfeasibleStart(
-            told.message, path=error.path, got=error.got, expected=error.expected, **told.details
-        ) from None
+        raise error.retold(told.message, **told.details) from None
     return True, None
 
 
@@ -101,13 +99,7 @@ def switch(
             with suppress(InfeasibleSwitch):
                 switching.switch(shield, history, signals, found, elsewhere)
                 return told.way
-        raise InfeasibleSwitch(
-            f"the new rule was not taken: {told.message}",
-            path=error.path,
-            got=error.got,
-            expected=error.expected,
-            **told.details,
-        ) from None
+        raise error.retold(f"the new rule was not taken: {told.message}", **told.details) from None
 
 
 def refusal(
