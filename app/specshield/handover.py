@@ -1,11 +1,14 @@
-"""What a session takes along when another rule, map or robot holds from some step on."""
+"""What a session takes along when another rule, map or robot holds from some step on, and how it is told."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from specshield.errors import StepConflict
 from specshield.shield.decision import Carry
 from specshield.shield.taught import Taught
 
@@ -42,6 +45,32 @@ def carried_over(
         way=way,
         stuck=carry.stuck if same_map and same_robot else (),
     )
+
+
+def check_main_task(over: bool, told: bool) -> None:
+    """over: whether the main task is; told: whether a step says so. Raises StepConflict where that is taken
+    back.
+    """
+    if over and not told:
+        raise StepConflict(
+            "an earlier step said that the main task is done, which cannot be taken back",
+            path="main_task_done",
+            got=False,
+            expected="true",
+        )
+
+
+def rule_told(about: Mapping[str, Any], begins: int, origin: int, clock: str, status: str) -> dict[str, Any]:
+    """A rule of a session as the contract shows it. about: its policies, and the task that they are for."""
+    return {
+        "from": begins,
+        "origin": origin,
+        "clock": clock,
+        **{name: about[name] for name in ("policy_ids", "map_id")},
+        "formula": about["spec"]["formula"],
+        **{name: about[name] for name in ("horizon", "actions", "terminal_actions")},
+        "spec_status": status,
+    }
 
 
 def _learned(learned: bytes | None, later: int) -> bytes | None:

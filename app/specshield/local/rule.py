@@ -12,6 +12,7 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.client.models import Pose, SpecStatus
 from specshield.errors import InputError
+from specshield.handover import rule_told
 from specshield.shield import episode
 from specshield.shield.decision import Shield
 
@@ -59,16 +60,4 @@ class Rule:
 
     def told(self, status: SpecStatus) -> dict[str, Any]:
         """As the contract shows it."""
-        about = self.policy.about()
-        return {
-            "from": self.begins,
-            "origin": self.origin,
-            "clock": self.clock,
-            "policy_ids": about["policy_ids"],
-            "map_id": about["map_id"],
-            "formula": about["spec"]["formula"],
-            "horizon": about["horizon"],
-            "actions": about["actions"],
-            "terminal_actions": about["terminal_actions"],
-            "spec_status": status,
-        }
+        return rule_told(self.policy.about(), self.begins, self.origin, self.clock, status)

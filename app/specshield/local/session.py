@@ -24,7 +24,7 @@ from specshield.client.models import (
     execute_of,
 )
 from specshield.client.wire import Logits, Numbers, Points
-from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished, StepConflict
+from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished
 from specshield.local.rule import Rule
 from specshield.reasons import refusal
 from specshield.reasons.explanation import explanations
@@ -229,13 +229,7 @@ class LocalSession:
                 got=self.t,
                 expected="a new session",
             )
-        if self.main_task_done and not over:
-            raise StepConflict(
-                "an earlier step said that the main task is done, which cannot be taken back",
-                path="main_task_done",
-                got=False,
-                expected="true",
-            )
+        handover.check_main_task(self.main_task_done, over)
 
     def _foreseen(self) -> Pose:
         """Where the last decision's action leads. Raises HistoryGap after a step without a decision."""

@@ -79,18 +79,8 @@ def way(config: Config) -> bytes | None:
 
 def told(rules: Sequence[Config], verdicts: Sequence[str]) -> list[dict[str, Any]]:
     """The rules as the contract shows them; verdicts: of each."""
+    each = zip(rules, verdicts, strict=True)
     return [
-        {
-            "from": begins(config),
-            "origin": origin(config),
-            "clock": config.get("clock", "restart"),
-            "policy_ids": config["policy_ids"],
-            "map_id": config["map_id"],
-            "formula": config["spec"]["formula"],
-            "horizon": config["horizon"],
-            "actions": config["actions"],
-            "terminal_actions": config["terminal_actions"],
-            "spec_status": verdict,
-        }
-        for config, verdict in zip(rules, verdicts, strict=True)
+        handover.rule_told(rule, begins(rule), origin(rule), rule.get("clock", "restart"), verdict)
+        for rule, verdict in each
     ]

@@ -10,6 +10,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import Conflict, InputError, NotFound, SessionFinished, StepConflict
+from specshield.handover import check_main_task
 from specshield.reasons.explanation import explanations
 from specshield.robot import robot_from_json
 from specshield.service.access.owners import shown
@@ -142,13 +143,7 @@ def check_step(session: Session, request: StepBody) -> None:
             expected=f"{state.next_t} or later",
             expected_t=state.next_t,
         )
-    if state.main_task_done and not request.main_task_done:
-        raise StepConflict(
-            "an earlier step said that the main task is done, which cannot be taken back",
-            path="main_task_done",
-            got=False,
-            expected="true",
-        )
+    check_main_task(state.main_task_done, request.main_task_done)
 
 
 def check_last(t: int, last: int) -> None:
