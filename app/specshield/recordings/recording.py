@@ -14,9 +14,9 @@ from PIL import Image
 
 from specshield.arrays import Floats
 from specshield.client.models import TrajectoryItem
+from specshield.drawing.outline import way_ahead
 from specshield.errors import InputError
 from specshield.robot import Robot, robot_from_json
-from specshield.robot.dynamics import make_body, step
 from specshield.task import parse_regions
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Region
@@ -48,19 +48,11 @@ class Recording:
 
     def ahead(self, t: int) -> Floats:
         """The certified continuation at step t, as poses [n, 3] from x_t on; only x_t where there is none."""
-        item, ahead = self.items[t], [self.items[t].pose]
-        decision = item.decision
-        if decision is None or decision.get("witness") is None or self.grid is None or self.robot is None:
-            return np.array(ahead)
-        action = decision["action"]
-        if self.robot.actions[action].terminal:
-            action = decision["completion_action"]
-        body = make_body(self.robot, self.grid)
-        for each in (action, *decision["witness"]):
-            motion = int(self.robot.motion_of[each])
-            if motion >= 0:
-                ahead.append(step(body, *ahead[-1], motion))
-        return np.array(ahead)
+        pose, told = self.items[t].pose, self.items[t].decision
+        if told is None or self.grid is None or self.robot is None:
+            return np.array([pose])
+        taken = told["action"], told.get("completion_action"), told.get("witness")
+        return way_ahead(self.grid, self.robot, pose, *taken)
 
 
 def of_record(

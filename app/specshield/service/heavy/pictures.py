@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from specshield.arrays import Floats
+from specshield.drawing.outline import way_ahead
 from specshield.drawing.svg import Plan
 from specshield.errors import InfeasibleStart, PoseError
-from specshield.robot.dynamics import make_body, step
 from specshield.service.heavy.latest import latest
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.library.policies import Description
@@ -23,7 +23,6 @@ from specshield.service.sessions import record
 from specshield.service.settings import Settings
 from specshield.shield.decision import Shield, make_shield
 from specshield.shield.episode import start
-from specshield.task import Task
 
 # Chosen by hand. A start takes 0.4 ms with tables, and any time with a planner.
 HEADINGS = 4  # looked at from each place where places are no more than NEAR apart, else one
@@ -72,13 +71,15 @@ def draw_session(settings: Settings, config: dict[str, Any], rows: Floats, last:
     plan = Plan(task, f"session {config['id']} at step {len(rows) - 1}")
     plan.walls()
     plan.regions()
-    if last:
-        plan.way(_continuation(task, rows[-1], record.decode(last)), "next")
+    decided = record.decode(last) if last else None
+    witness = None if decided is None else decided.witness
+    if decided is not None:
+        pose, taken = (*rows[-1, :3].tolist(),), (decided.action, decided.completion_action)
+        plan.way(way_ahead(task.grid, task.robot, pose, *taken, witness), "next")
     plan.way(rows[:, :3])
     plan.robot(rows[-1, :3].tolist())
     plan.line(str(task.formula), "ink formula")
-    witness = last and record.decode(last).witness is not None
-    dashed = "; dashed: the certified continuation" if witness else ""
+    dashed = "" if witness is None else "; dashed: the certified continuation"
     told = f"{config['id']}, step {len(rows) - 1} of {task.horizon}. The line is the way driven{dashed}."
     plan.line(told, "faint")
     return plan.svg()
@@ -118,15 +119,3 @@ def _kept(shield: Shield, x: float, y: float, theta: float) -> float:
     except InfeasibleStart:
         return 0.0
     return 1.0
-
-
-def _continuation(task: Task, row: Floats, decided: record.StepRecord) -> Floats:
-    """x_t, then the poses that `action` and its witness lead to. Shape [N, 3]."""
-    body, poses = make_body(task.robot, task.grid), [(float(row[0]), float(row[1]), float(row[2]))]
-    chosen = decided.completion_action if task.robot.terminal[decided.action] else decided.action
-    following = () if decided.witness is None or chosen is None else (chosen, *decided.witness)
-    for action in following:
-        if not task.robot.terminal[action]:
-            x, y, theta = poses[-1]
-            poses.append(step(body, x, y, theta, int(task.robot.motion_of[action])))
-    return np.array(poses)
