@@ -32,6 +32,17 @@ class Run(Protocol):
     async def __call__(self, flow: Flow[T], /) -> T: ...
 
 
+def awaiting(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]:
+    """The method of a client, or of a resource of its, that makes this call."""
+
+    @looks_like(flow)
+    async def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        made: T = await self._run(flow(*args, **kwargs))
+        return made
+
+    return method
+
+
 class AsyncShieldClient:
     """`ShieldClient` for asyncio: `async with await client.sessions.create(...) as session`."""
 
@@ -61,13 +72,7 @@ class AsyncShieldClient:
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
-    async def wait_until_ready(self, timeout: float = 120.0) -> None:
-        """Return when the server is ready to decide: its first start takes about half a minute.
-
-        A server that cannot be reached yet is waited for too. Raises TransportTimeout after `timeout` [s],
-        which says how far the server was.
-        """
-        await self._run(calls.wait_until_ready(timeout))
+    wait_until_ready = awaiting(calls.wait_until_ready)
 
     async def close(self) -> None:
         if self._streams is not None:
@@ -133,16 +138,6 @@ class AsyncShieldClient:
         if not piece:
             await more.feed.close()
         return more.got(piece)
-
-
-def awaiting(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource[Run], P], Coroutine[Any, Any, T]]:
-    """The method of a resource that makes this call."""
-
-    @looks_like(flow)
-    async def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return await self._run(flow(*args, **kwargs))
-
-    return method
 
 
 def awaiting_step(

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from specshield.client import wire
 from specshield.client.away import OnFailure, on_failure_value
-from specshield.client.core import Flow, Wait, call, deliver, erase
+from specshield.client.core import Flow, Wait, call, deliver, erase, fetch
 from specshield.client.models import Map, Policy, SessionInfo, Spec, build
 from specshield.client.wire import Content, Failure, Numbers, Reply, Request
 from specshield.errors import InputError, SessionExists, StoreError, TransportError, TransportTimeout
@@ -21,8 +21,12 @@ log = logging.getLogger("specshield")
 READY_EVERY = 0.25  # s between two questions whether the server is ready
 
 
-def wait_until_ready(timeout: float) -> Flow[None]:
-    """Ask until the server is ready, also one that cannot be reached yet."""
+def wait_until_ready(timeout: float = 120.0) -> Flow[None]:
+    """Return when the server is ready to decide: its first start takes about half a minute.
+
+    A server that cannot be reached yet is waited for too. Raises TransportTimeout after `timeout` [s],
+    which says how far the server was.
+    """
     seconds = 0.0
     while True:
         outcome = yield Request("GET", "/readyz")
@@ -69,11 +73,8 @@ def create_map(format: str, **members: Any) -> Flow[Map]:
 
 def upload_map(metadata: Content, image: Content, *, name: str | None = None) -> Flow[Map]:
     """A ROS map_server map: YAML and PGM or PNG, each its content or the path object of a file."""
-    read: dict[str, Content] = {
-        "metadata": wire.content(metadata, "metadata"),
-        "image": wire.content(image, "image"),
-    }
-    return (yield from create_map("map_server", **read, **_named(name)))
+    files = {"metadata": wire.content(metadata, "metadata"), "image": wire.content(image, "image")}
+    return (yield from create_map("map_server", **files, **_named(name)))
 
 
 def procthor_map(
@@ -109,9 +110,7 @@ def delete_map(id: str) -> Flow[None]:
 
 def map_image(id: str) -> Flow[bytes]:
     """The map as PNG: white is free, black occupied."""
-    delivery = yield from deliver(wire.get("maps", id, "image.png", slow=True))
-    wire.check(delivery.reply)
-    return delivery.reply.content
+    return (yield from fetch(wire.get("maps", id, "image.png", slow=True))).content
 
 
 def create_policy(
@@ -157,9 +156,7 @@ def upload_policy(weights: Content, card: Content | Mapping[str, Any]) -> Flow[P
 
 def policy_image(id: str) -> Flow[bytes]:
     """The floor as SVG, and from where the policy can keep the rule."""
-    delivery = yield from deliver(wire.get("policies", id, "image.svg", slow=True))
-    wire.check(delivery.reply)
-    return delivery.reply.content
+    return (yield from fetch(wire.get("policies", id, "image.svg", slow=True))).content
 
 
 def get_policy(id: str) -> Flow[Policy]:

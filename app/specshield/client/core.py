@@ -134,6 +134,13 @@ def _asked_for(reply: Reply) -> float:
         return 1.0
 
 
+def fetch(request: Request) -> Flow[Reply]:
+    """The reply, which is not an error."""
+    reply = (yield from deliver(request)).reply
+    check(reply)
+    return reply
+
+
 def call(request: Request) -> Flow[dict[str, Any]]:
     delivery = yield from deliver(request)
     return json_object(delivery.reply)

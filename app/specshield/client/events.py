@@ -12,10 +12,10 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from specshield.client.core import Feed, Flow, More, Wait, deliver
+from specshield.client.core import Feed, Flow, More, Wait, fetch
 from specshield.client.models import Decision
 from specshield.client.stream import LONGEST
-from specshield.client.wire import TRIES, Failure, Request, check, path
+from specshield.client.wire import TRIES, Failure, Request, path
 from specshield.errors import ServerError
 
 SILENCE = 30.0  # s without a whole line; two of the server's heartbeats
@@ -64,8 +64,7 @@ class Events:
     def _connect(self) -> Flow[None]:
         params = {"after": str(self._after)}
         request = Request("GET", self._path, params=params, slow=True, tries=self._tries, listens=True)
-        reply = (yield from deliver(request)).reply
-        check(reply)
+        reply = yield from fetch(request)
         self._over, self.feed, self._tries = reply.status == 204, reply.feed, RESUMING
         self._rest.clear()
         self._event.clear()

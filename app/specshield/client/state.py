@@ -11,7 +11,7 @@ from typing import Any, Literal
 from specshield.client import wire
 from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
 from specshield.client.calls import policies_asked
-from specshield.client.core import Flow, Within, call, deliver
+from specshield.client.core import Flow, Within, call, deliver, fetch
 from specshield.client.events import Events
 from specshield.client.models import (
     Decision,
@@ -274,8 +274,7 @@ class SessionState:
 
         Who keeps the seal can tell later that a record shown to them is this one.
         """
-        reply = (yield from deliver(wire.get("sessions", self.id, "record", slow=True))).reply
-        wire.check(reply)
+        reply = yield from fetch(wire.get("sessions", self.id, "record", slow=True))
         Path(path).write_bytes(reply.content)
         return reply.headers.get("x-record-seal", "")
 

@@ -31,6 +31,17 @@ class Run(Protocol):
     def __call__(self, flow: Flow[T], /) -> T: ...
 
 
+def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Any, P], T]:
+    """The method of a client, or of a resource of its, that makes this call."""
+
+    @looks_like(flow)
+    def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        made: T = self._run(flow(*args, **kwargs))
+        return made
+
+    return method
+
+
 class ShieldClient:
     """The service at `base_url`.
 
@@ -68,13 +79,7 @@ class ShieldClient:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def wait_until_ready(self, timeout: float = 120.0) -> None:
-        """Return when the server is ready to decide: its first start takes about half a minute.
-
-        A server that cannot be reached yet is waited for too. Raises TransportTimeout after `timeout` [s],
-        which says how far the server was.
-        """
-        self._run(calls.wait_until_ready(timeout))
+    wait_until_ready = blocking(calls.wait_until_ready)
 
     def close(self) -> None:
         self._http.close()
@@ -135,16 +140,6 @@ class ShieldClient:
         if not piece:
             more.feed.close()
         return more.got(piece)
-
-
-def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Resource[Run], P], T]:
-    """The method of a resource that makes this call."""
-
-    @looks_like(flow)
-    def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return self._run(flow(*args, **kwargs))
-
-    return method
 
 
 def blocking_step(
