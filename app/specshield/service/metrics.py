@@ -12,15 +12,8 @@ import os
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
-from prometheus_client import (
-    CollectorRegistry,
-    Counter,
-    Gauge,
-    Histogram,
-    disable_created_metrics,
-    generate_latest,
-    multiprocess,
-)
+import prometheus_client as prometheus
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, multiprocess
 from prometheus_client.metrics_core import Metric
 
 from specshield import __version__
@@ -36,7 +29,7 @@ RESIDUAL = (1e-6, 1e-3, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m] and 
 MODES = ("prior", "shaped", "completion", "fallback", "violated")
 REASONS = ("infeasible", "zero_prior_mass", "margin_unattainable")
 
-disable_created_metrics()  # type: ignore[no-untyped-call]
+prometheus.disable_created_metrics()  # type: ignore[no-untyped-call]
 registry = CollectorRegistry()
 requests = Counter(
     "specshield_requests", "Requests answered.", ["method", "route", "status"], registry=registry
@@ -138,7 +131,8 @@ def exposition(gauges: Iterable[Metric] = ()) -> bytes:
     if "PROMETHEUS_MULTIPROC_DIR" in os.environ:
         every = CollectorRegistry()
         multiprocess.MultiProcessCollector(every)  # type: ignore[no-untyped-call]
-    return generate_latest(every) + generate_latest(_Given([*cells.collect(), *gauges]))
+    own = _Given([*cells.collect(), *gauges])
+    return prometheus.generate_latest(every) + prometheus.generate_latest(own)
 
 
 class _Given(CollectorRegistry):

@@ -28,6 +28,12 @@ class ClientGone(Exception):
     """The caller has closed its connection: nobody is there to be answered."""
 
 
+async def until_gone(receive: Receive) -> None:
+    """Returns when the caller has closed its connection."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
+
 STATUS: Mapping[type[SpecshieldError], int] = {
     errors.BodyTooLarge: 413,
     errors.UnsupportedMediaType: 415,

@@ -12,7 +12,6 @@ import contextlib
 import gc
 import os
 import sys
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +30,7 @@ from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, motion_count
 from specshield.service.sessions import record
+from specshield.service.storage.keeper import at_end_of_input
 from specshield.shield import episode
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.surprise.contact import cells_met
@@ -129,14 +129,7 @@ def _hasten() -> None:
             flags.values = lambda flags: {**defaults, **flags._values}
 
 
-def _end_with_parent() -> None:
-    """Standard input is a pipe from the server: it reaches its end when the server is gone."""
-    while os.read(sys.stdin.fileno(), 4096):
-        pass
-    os._exit(1)
-
-
 if __name__ == "__main__":
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    at_end_of_input(lambda: os._exit(1))  # the server is gone
     _hasten()
     warm_up(sys.argv[1])

@@ -12,7 +12,7 @@ from typing import Any
 from fastapi import Request
 
 from specshield.service.heavy.pool import Pool, Template
-from specshield.service.problems import ClientGone
+from specshield.service.problems import ClientGone, until_gone
 from specshield.service.settings import Settings
 
 # Chosen by hand: below what the server itself does (0), above what trains policies (`specshield worker`).
@@ -50,7 +50,7 @@ class Heavy:
                 owner=str(request.scope["state"].get("owner", "")),
             )
         )
-        gone = asyncio.ensure_future(_gone(request))
+        gone = asyncio.ensure_future(until_gone(request.receive))
         try:
             await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
             if not work.done():
@@ -86,9 +86,3 @@ class Heavy:
         self.tasks.close()
         self.decisions.close()
         self._template.stop()
-
-
-async def _gone(request: Request) -> None:
-    """Returns when the caller has closed its connection."""
-    while (await request.receive())["type"] != "http.disconnect":
-        pass

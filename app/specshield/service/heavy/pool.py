@@ -90,28 +90,25 @@ class _Child:
         self.writer.close()
 
 
+@dataclass(eq=False)
 class Pool:
     """size: children at once. memory [bytes]: the most that a child may take. waiting: calls of one owner
     that may wait. idle [s]: a child without a call ends after as long. unused: called when the last child
-    has ended, with the time of the end of its last call.
+    has ended, with the time of the end of its last call. children: how many there are.
     """
 
-    def __init__(
-        self,
-        template: Template,
-        *,
-        size: int,
-        memory: int,
-        nice: int,
-        waiting: int,
-        idle: float,
-        unused: Callable[[float], None],
-    ) -> None:
-        self._template, self._size, self._memory, self._nice = template, size, memory, nice
-        self._turns, self._idle_for, self._unused = Turns(size, waiting), idle, unused
-        self._idle: list[_Child] = []
+    template: Template
+    size: int
+    memory: int
+    nice: int
+    waiting: int
+    idle: float
+    unused: Callable[[float], None]
+    children: int = 0
+
+    def __post_init__(self) -> None:
+        self._turns, self._idle = Turns(self.size, self.waiting), list[_Child]()
         self._sweeping: asyncio.TimerHandle | None = None
-        self.children = 0
 
     async def run(
         self, function: str, *arguments: Any, seconds: float, owner: str = "", key: Hashable = None
@@ -146,9 +143,9 @@ class Pool:
             else:
                 self._idle.append(child)
                 if self._sweeping is None:
-                    self._sweeping = asyncio.get_running_loop().call_later(self._idle_for, self._sweep)
+                    self._sweeping = asyncio.get_running_loop().call_later(self.idle, self._sweep)
         if isinstance(error, MemoryError):
-            raise _too_expensive(f"it took more than {self._memory >> 20} MiB")
+            raise _too_expensive(f"it took more than {self.memory >> 20} MiB")
         if error is not None:
             raise error if not isinstance(error, RuntimeError) else ServerError(str(error))
         return value
@@ -156,7 +153,7 @@ class Pool:
     async def _child(self, key: Hashable) -> _Child:
         """One that has nothing to do: the last to have worked for this key, else a new one, else any."""
         found = next((child for child in reversed(self._idle) if child.key == key), None)
-        if found is None and self.children >= self._size:
+        if found is None and self.children >= self.size:
             found = self._idle[0]  # the longest idle; there is one, since this is the caller's turn
         if found is not None:
             self._idle.remove(found)
@@ -172,7 +169,7 @@ class Pool:
         try:
             return await self._fork()
         except (OSError, asyncio.IncompleteReadError) as error:
-            self._template.stop()
+            self.template.stop()
             if again:  # an old template may have died since the last child
                 return await self._start(again=False)
             raise ServerError(
@@ -180,7 +177,7 @@ class Pool:
             ) from error
 
     async def _fork(self) -> _Child:
-        ours = self._template.fork(self._memory, self._nice)
+        ours = self.template.fork(self.memory, self.nice)
         reader, writer = await asyncio.open_connection(sock=ours)
         try:
             async with asyncio.timeout(STARTS_WITHIN):
@@ -194,16 +191,16 @@ class Pool:
         child.kill()
         self.children -= 1
         if self.children == 0:
-            self._unused(child.since)
+            self.unused(child.since)
 
     def _sweep(self) -> None:
         """Ends the children that have been idle for long, and looks again when the next will have been."""
         self._sweeping = None
         now = time.monotonic()
-        while self._idle and self._idle[0].since + self._idle_for <= now + 0.01:
+        while self._idle and self._idle[0].since + self.idle <= now + 0.01:
             self._let_go(self._idle.pop(0))
         if self._idle:
-            later = self._idle[0].since + self._idle_for - now
+            later = self._idle[0].since + self.idle - now
             self._sweeping = asyncio.get_running_loop().call_later(later, self._sweep)
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ from starlette.types import Receive, Scope, Send
 
 from specshield.service import examples
 from specshield.service.access.owners import Owner, scoped
+from specshield.service.problems import until_gone
 from specshield.service.routes.sessions import GONE, PathId, SessionKey
 from specshield.service.schemas.base import ID
 from specshield.service.sessions import chain
@@ -36,9 +37,8 @@ class EventStream(Response):
         self._stream = stream
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def until_gone() -> None:
-            while (await receive())["type"] != "http.disconnect":
-                pass
+        async def end_when_gone() -> None:
+            await until_gone(receive)
             group.cancel_scope.cancel()
 
         async def until_refused(reading: anyio.CancelScope) -> None:
@@ -48,7 +48,7 @@ class EventStream(Response):
 
         start = {"type": "http.response.start", "status": 200, "headers": self.raw_headers}
         async with anyio.create_task_group() as group:
-            group.start_soon(until_gone)
+            group.start_soon(end_when_gone)
             await send(start)
             with anyio.CancelScope() as reading:
                 group.start_soon(until_refused, reading)

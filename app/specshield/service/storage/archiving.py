@@ -103,7 +103,9 @@ class ArchivingStore(Store):
     async def everything(
         self, owner: str, after: str | None, limit: int
     ) -> tuple[list[tuple[bytes, bytes]], str | None]:
-        """As `page`, of store and archive. owner: what comes before the id in a key, as in `alice@`."""
+        """A page of (config, state), from store and archive, and the id to go on after. owner: what comes
+        before the id in a key, as in `alice@`.
+        """
         entries = await self.in_thread(lambda: list(islice(self.archive.after(owner, after), limit)))
         archived = {entry.key: entry for entry in entries}
         async with self._reaching():

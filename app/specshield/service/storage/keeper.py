@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 LOCK = "keeper.lock"
@@ -22,6 +23,17 @@ def follow_parent() -> None:
     """Linux: this process is told to stop when the one that started it is gone, however it went."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+
+def at_end_of_input(action: Callable[[], object]) -> None:
+    """Calls it, in a thread, when standard input ends: a pipe from whoever started this process."""
+
+    def wait() -> None:
+        while os.read(0, 4096):
+            pass
+        action()
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _as_store() -> None:
@@ -46,13 +58,11 @@ def main(folder: Path, command: list[str]) -> int:
             preexec_fn=_as_store,
         )
 
-    def watch() -> None:
-        while os.read(0, 4096):
-            pass
+    def stop() -> None:
         store.terminate()
         threading.Timer(GRACE, store.kill).start()
 
-    threading.Thread(target=watch, daemon=True).start()
+    at_end_of_input(stop)
     status = store.wait()
     os._exit(status if status >= 0 else 128 - status)  # do not wait for the timer
 

@@ -23,7 +23,7 @@ from specshield.policy.options import read_options
 from specshield.service.settings import Settings
 from specshield.service.storage.connect import connect_to_jobs
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.service.storage.keeper import follow_parent
+from specshield.service.storage.keeper import at_end_of_input, follow_parent
 from specshield.service.storage.marker import check_files
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, learns, queue_of
 from specshield.service.watch import logs
@@ -53,7 +53,7 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
         check_files(url, settings.files_at, settings.store_timeout)
     jobs = Jobs(url, settings)
     if until_eof:
-        threading.Thread(target=_stop_at_eof, daemon=True).start()
+        at_end_of_input(lambda: os.kill(os.getpid(), signal.SIGTERM))
     methods = available()  # what is installed later is made by the next worker, whose queues include it
     learning = [name for name in methods if learns(name)]
     if learner:
@@ -240,9 +240,3 @@ def _regularly(action: Callable[[], object]) -> Iterator[None]:
     finally:
         over.set()
         thread.join(1.0)
-
-
-def _stop_at_eof() -> None:
-    while os.read(sys.stdin.fileno(), 4096):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
