@@ -1,4 +1,4 @@
-"""The poses that a search over exact motions has come to, and how it came to each."""
+"""The poses that a search over exact motions has come to, how it came to each, and those to go on from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ import numpy as np
 
 from specshield.arrays import Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, kernel, leaf
-from specshield.policy.heap import Heap
+
+
+class Heap(NamedTuple):
+    """A binary heap in arrays, the least rank first. row [N]: the rows in it; rank [N]: of each. What follows
+    its size is scratch.
+    """
+
+    row: Int32s
+    rank: Floats
 
 
 class Tree(NamedTuple):
@@ -105,3 +113,31 @@ def trace(tree: Tree, row: int, motions: Ints) -> None:
     while tree.parent[row] >= 0:
         motions[tree.made[row] - 1] = tree.motion[row]
         row = tree.parent[row]
+
+
+@inlined
+def push(heap: Heap, size: int, row: int, rank: float) -> int:
+    """Puts a row into a heap of `size`; its new size."""
+    at = size
+    while at > 0 and heap.rank[(at - 1) // 2] > rank:
+        heap.row[at], heap.rank[at] = heap.row[(at - 1) // 2], heap.rank[(at - 1) // 2]
+        at = (at - 1) // 2
+    heap.row[at], heap.rank[at] = row, rank
+    return size + 1
+
+
+@inlined
+def pop(heap: Heap, size: int) -> int:
+    """Takes row[0] out of a heap of `size`; its new size."""
+    size -= 1
+    row, rank, at = heap.row[size], heap.rank[size], 0
+    while 2 * at + 1 < size:
+        child = 2 * at + 1
+        if child + 1 < size and heap.rank[child + 1] < heap.rank[child]:
+            child += 1
+        if heap.rank[child] >= rank:
+            break
+        heap.row[at], heap.rank[at] = heap.row[child], heap.rank[child]
+        at = child
+    heap.row[at], heap.rank[at] = row, rank
+    return size

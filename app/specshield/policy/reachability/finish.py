@@ -14,11 +14,10 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
-from specshield.policy.heap import pop, push
 from specshield.policy.progress import ALWAYS, PENDING, SETTLED, Rules, advance
 from specshield.policy.reachability.guide import copy_progress, due, predicate_at, read_due
 from specshield.policy.reachability.tables import UNKNOWN, Guide, Scratch, is_broken, slack_at
-from specshield.policy.tree import is_new, make_tree, put, trace
+from specshield.policy.tree import is_new, make_tree, pop, push, put, trace
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.narrow measures what they find.

@@ -54,17 +54,16 @@ def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str
     sets = 1 << len(goals_of(rules))
     if task.robot.wait_motion < 0:
         cell, bits = named_arrays(tensors, {f"{of}cell": (np.int32, 2), f"{of}bits": (np.uint8, 4)})
-        headings = _checked_headings(bits.shape[2])
-        size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, headings, -(-state_count(rules) // 8))
-        _check_fit(cell, side_of(task.grid, pitch), bits.shape[1], bits.shape == size, f"bits {list(size)}")
+        size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, bits.shape[2], -(-state_count(rules) // 8))
+        _check_fit(cell, task, pitch, bits, bits.shape == size, f"bits {list(size)}")
         return step_tables(rules, task.horizon, cell, bits, pitch)
     cell, code, table = named_arrays(
         tensors, {f"{of}cell": (np.int32, 2), f"{of}code": (np.uint16, 3), f"{of}table": (np.int32, 2)}
     )
-    phases, headings = phases_of(rules, task.horizon), _checked_headings(code.shape[2])
+    phases = phases_of(rules, task.horizon)
     fits = table.shape == (len(phases), sets) and table.min() >= -1 and table.max() < code.shape[0]
-    wanted = f"code [tables, cells, {headings}], table [{len(phases)}, {sets}]"
-    _check_fit(cell, side_of(task.grid, pitch), code.shape[1], fits, wanted)
+    wanted = f"code [tables, cells, {code.shape[2]}], table [{len(phases)}, {sets}]"
+    _check_fit(cell, task, pitch, code, fits, wanted)
     return time_tables(rules, phases, cell, code, table, pitch)
 
 
@@ -74,26 +73,10 @@ def _pitch_of(tensors: Tensors, task: Task, asked: float) -> float:
     if kept is not None:
         found = float(kept[0]) if kept.dtype == np.float64 and kept.shape == (1,) else math.nan
         if not asked <= found <= COARSEST * asked:
-            raise PolicyError(
-                "the array 'pitch' is of another kind",
-                path="weights.pitch",
-                got=found,
-                expected=f"float64, one number from {asked:g} to {COARSEST * asked:g}",
-            )
+            raise _other_kind("pitch", found, f"float64, one number from {asked:g} to {COARSEST * asked:g}")
         return found
     fine = asked / 3.0
     return fine if cell is not None and cell.shape == side_of(task.grid, fine) else asked
-
-
-def _checked_headings(headings: int) -> int:
-    if not 4 <= headings <= MAX_HEADINGS:
-        raise PolicyError(
-            "the tables do not fit the task",
-            path="weights",
-            got=f"{headings} headings",
-            expected=f"4 to {MAX_HEADINGS} headings",
-        )
-    return headings
 
 
 def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
@@ -101,21 +84,22 @@ def _narrow_of(tensor: NDArray[Any] | None, count: int) -> Bools:
     if tensor is None:
         return np.zeros(count, np.bool_)
     if tensor.dtype != np.uint8 or tensor.shape != (count,):
-        raise PolicyError(
-            "the array 'narrow' is of another kind",
-            path="weights.narrow",
-            got=f"{tensor.dtype} {list(tensor.shape)}",
-            expected=f"uint8 [{count}]",
-        )
+        raise _other_kind("narrow", f"{tensor.dtype} {list(tensor.shape)}", f"uint8 [{count}]")
     narrow: Bools = tensor == 1
     return narrow
 
 
-def _check_fit(cell: Int32s, shape: tuple[int, int], rows: int, fits: bool, wanted: str) -> None:
-    if not fits or cell.shape != shape or cell.min(initial=-1) < -1 or cell.max(initial=-1) >= rows:
-        raise PolicyError(
-            "the tables do not fit the task",
-            path="weights",
-            got=f"cell {list(cell.shape)} and tables of {rows} cells",
-            expected=f"cell {list(shape)}, {wanted}",
-        )
+def _other_kind(name: str, got: float | str, expected: str) -> PolicyError:
+    message = f"the array {name!r} is of another kind"
+    return PolicyError(message, path=f"weights.{name}", got=got, expected=expected)
+
+
+def _check_fit(cell: Int32s, task: Task, pitch: float, table: NDArray[Any], fits: bool, wanted: str) -> None:
+    """table [.., cells, headings, ..]: those of it that `cell` refers to."""
+    shape, (rows, headings) = side_of(task.grid, pitch), table.shape[1:3]
+    got, expected = f"{headings} headings", f"4 to {MAX_HEADINGS} headings"
+    if 4 <= headings <= MAX_HEADINGS:
+        if fits and cell.shape == shape and cell.min(initial=-1) >= -1 and cell.max(initial=-1) < rows:
+            return
+        got, expected = f"cell {list(cell.shape)} and tables of {rows} cells", f"cell {list(shape)}, {wanted}"
+    raise PolicyError("the tables do not fit the task", path="weights", got=got, expected=expected)

@@ -19,7 +19,6 @@ import numpy as np
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import join
-from specshield.policy.heap import pop, push
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
 from specshield.policy.progress.recall import resume
@@ -43,7 +42,7 @@ from specshield.policy.reachability.tables import (
     slack_at,
 )
 from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, STUCK, climb
-from specshield.policy.tree import Tree, first_slot, make_tree, put, trace
+from specshield.policy.tree import Tree, first_slot, make_tree, pop, push, put, trace
 from specshield.policy.undo import IMPOSSIBLE
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import (
