@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -58,6 +59,11 @@ def check_main_task(over: bool, told: bool) -> None:
             got=False,
             expected="true",
         )
+
+
+def finite(value: float) -> float | None:
+    """As it is told in JSON: None for what has no number there."""
+    return value if math.isfinite(value) else None
 
 
 def rule_told(about: Mapping[str, Any], begins: int, origin: int, clock: str, status: str) -> dict[str, Any]:

@@ -322,13 +322,12 @@ def _decision(
     body: Mapping[str, Any], info: SessionInfo, over: bool, timings: Mapping[str, float]
 ) -> Decision:
     residual, told = body.get("residual"), body.get("explanations")
+    explained = [None if why is None else build(Explanation, why) for why in told or ()]
     return build(
         Decision,
         body,
         residual=None if residual is None else build(Residual, residual),
-        explanations=None
-        if told is None
-        else tuple(None if why is None else build(Explanation, why) for why in told),
+        explanations=None if told is None else tuple(explained),
         timings=timings,
         execute=execute_of(body, info.terminal_actions, over),
         action_names=info.actions,

@@ -272,12 +272,8 @@ def error_of(reply: Reply) -> SpecshieldError:
         document = {"title": f"status {reply.status}, and no more", "expected": "a specshield server there"}
     default = _BY_STATUS.get(reply.status) or (InputError if 400 <= reply.status < 500 else ServerError)
     cls = _BY_TYPE.get(str(document.get("type")), default)
-    error = cls(
-        str(document.get("detail") or document.get("title") or f"status {reply.status}"),
-        path=document.get("path"),
-        got=document.get("got"),
-        expected=document.get("expected"),
-    )
+    message = str(document.get("detail") or document.get("title") or f"status {reply.status}")
+    error = cls(message, **{name: document.get(name) for name in ("path", "got", "expected")})
     told = {"title", "detail", "path", "got", "expected"} | (
         {"type"} if cls.type == document.get("type") else set()
     )

@@ -209,7 +209,7 @@ class LocalSession:
         status, bounds = self._rule.verdict(poses, self._held({}, len(poses)))
         self.closed = self.finished = self._over = True
         self.spec_status = status
-        low, high = (value if math.isfinite(value) else None for value in bounds)
+        low, high = map(handover.finite, bounds)
         return Verdict(status, (low, high))
 
     def trajectory(self) -> tuple[TrajectoryItem, ...]:
@@ -305,8 +305,6 @@ def _explained(made: core.Decision) -> tuple[Explanation | None, ...]:
     return tuple(
         None
         if why is None
-        else Explanation(
-            why.conjunct, why.robustness if math.isfinite(why.robustness) else None, why.late_by, why.detail
-        )
+        else Explanation(why.conjunct, handover.finite(why.robustness), why.late_by, why.detail)
         for why in made.explanations
     )

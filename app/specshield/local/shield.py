@@ -105,15 +105,8 @@ class LocalShield:
                 expected="a folder with card.json and policy.safetensors",
             ) from None
         grid, rooms = _read_world(world)
-        spec = card["spec"]
-        task = make_task(
-            grid,
-            robot_from_json(card["robot"]),
-            spec["formula"],
-            spec.get("regions"),
-            rooms,
-            spec.get("signals"),
-        )
+        robot, spec = robot_from_json(card["robot"]), card["spec"]
+        task = make_task(grid, robot, spec["formula"], spec.get("regions"), rooms, spec.get("signals"))
         return LocalShield(make_shield([load_policy(weights, card, task)]), card, weights)
 
     @staticmethod

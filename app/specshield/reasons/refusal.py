@@ -12,7 +12,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
-from specshield.handover import begun
+from specshield.handover import begun, finite
 from specshield.reasons.bound import proof
 from specshield.reasons.lateness import later, when
 from specshield.reasons.relaxation import Conjunct, relaxations
@@ -43,7 +43,7 @@ class Refusal:
             {
                 "formula": str(each.formula)[:LONGEST],
                 "feasible_alone": each.feasible_alone,
-                "robustness": each.robustness if math.isfinite(each.robustness) else None,
+                "robustness": finite(each.robustness),
                 "late_by": each.late_by,
             }
             for each in self.conjuncts[:MOST_SHOWN]

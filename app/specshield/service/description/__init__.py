@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
 
 from specshield.errors import tree
 from specshield.service import problems
@@ -59,13 +58,7 @@ WRONG = {  # what of bad input an operation has of its own
 def described(app: FastAPI) -> dict[str, Any]:
     """OpenAPI, made once."""
     if app.openapi_schema is None:
-        schema = get_openapi(
-            title=app.title,
-            version=app.version,
-            description=app.description,
-            routes=app.routes,
-            tags=app.openapi_tags,
-        )
+        schema = FastAPI.openapi(app)
         schemas = schema["components"]["schemas"]
         for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which never leave it
             schemas.pop(name, None)

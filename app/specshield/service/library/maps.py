@@ -161,11 +161,9 @@ class Maps(Claimed):
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
         """One page of an owner's maps and those of all, as JSON, had without reading the cells."""
+        keys = [*self._named, *self._own(owner)]
         keys, following = files.page(
-            [*self._named, *self._own(owner)],
-            after,
-            limit,
-            lambda key: files.size(self._folder / key / "map.json"),
+            keys, after, limit, lambda key: files.size(self._folder / key / "map.json")
         )
         names, shown = self.claims.names("maps", owner), []
         for key in keys:

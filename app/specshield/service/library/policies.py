@@ -253,12 +253,12 @@ class Policies(Claimed):
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[Record], str | None]:
         """One page of an owner's policies and those of all."""
-        keys, following = files.page(
-            [*self._named, *self.claims.ids("policies", owner)],
-            after,
-            limit,
-            lambda key: sum(files.size(self._folder / key / name) for name in SMALL) or NOT_COPIED,
-        )
+
+        def size(key: str) -> int:
+            return sum(files.size(self._folder / key / name) for name in SMALL) or NOT_COPIED
+
+        keys = [*self._named, *self.claims.ids("policies", owner)]
+        keys, following = files.page(keys, after, limit, size)
         with ThreadPoolExecutor(AT_ONCE) as pool:  # those behind a URL that are not copied yet take long
             found = list(pool.map(self.made_here, keys))  # None: not written to the end, or deleted by now
         return [record for record in found if record is not None], following

@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
+from specshield.handover import finite
 from specshield.service.schemas.answers import Explanation, Residual, StepAnswer
 from specshield.service.sessions.packing import COLUMNS, full, pack_table, sparse, unpack_table
 from specshield.shield.decision import Decision
@@ -211,13 +212,9 @@ def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
 
 def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
     return tuple(
-        None if why is None else Explanation(why.conjunct, _finite(why.robustness), why.late_by, why.detail)
+        None if why is None else Explanation(why.conjunct, finite(why.robustness), why.late_by, why.detail)
         for why in decision.explanations
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def answer(record: StepRecord, row: Floats, names: Sequence[str]) -> StepAnswer:

@@ -170,8 +170,8 @@ class Sessions:
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue
             self.steps.recent.drop(id)
-            finite = [value if math.isfinite(value) else None for value in bounds]
-            return {**describe(session.rules, state), "robustness_bounds": finite}
+            told = list(map(handover.finite, bounds))
+            return {**describe(session.rules, state), "robustness_bounds": told}
         raise contended(id)
 
     def _closed(self, session: Session) -> tuple[Session, str, tuple[float, float]]:
