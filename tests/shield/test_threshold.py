@@ -1,11 +1,13 @@
 """A threshold over the episode: V beside a model checker's best policy, and asked against kept."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from specshield.local import LocalShield
 from specshield.policy.reachability import policy as reachability
 from specshield.shield.caution.experience import learn
 from specshield.shield.caution.threshold import MOST_SLIPS, _in_time, chances
@@ -151,3 +153,30 @@ def test_being_in_time_is_as_likely_as_in_simulation(blocks, moves, waits, free,
     found = _in_time(noise, 0.0, True, deadlines, motions, WAIT, 0, scratch)
     share = kept_runs / runs
     assert abs(found - share) <= 3.0 * np.sqrt(max(share * (1.0 - share), 1.0 / runs) / runs) + 0.002
+
+
+@pytest.mark.parametrize(
+    ("spare", "expected"), [(0, 0.5 * math.exp(-0.2)), (5, math.exp(-0.2 * math.exp(-1)))]
+)
+def test_noise_makes_late_by_a_normal_deviate_and_now_and_then_by_more(spare, expected):
+    """25 motions at 0.2 steps each: sigma is 1, and 0.04 x 0.2 x 25 times the robot is held up, for 5 steps
+    in the mean.
+    """
+    late, due = np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2)), np.array([[25, spare, 25]])
+    found = _in_time(Noise(0.01, 0.01, 0.0, 0.0, 1.0), 0.2, False, due, np.zeros(25, np.int64), -1, 0, late)
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("over", ["step", "episode"])
+def test_asking_for_all_over_the_episode_keeps_as_much_in_hand_as_asking_at_each_step(over):
+    """The robot is off its way at each step, and its model has no goal. V alone lets time go by: it is as
+    good as 1 until there is hardly any left.
+    """
+    pose, random = (4.5, 5.0, 0.0), np.random.default_rng(0)
+    session = LocalShield.shipped("case1").session(initial_pose=pose, seed=1, threshold_over=over)
+    for _ in range(36):
+        decision = session.step(pose, [None if name == "end" else 0.0 for name in session.info.actions])
+        assert decision.slack >= 19
+        there = decision.next_poses[decision.execute]
+        noise = random.normal(size=3) * (0.01, 0.01, 0.0087) if there != pose else np.zeros(3)
+        pose = tuple((np.array(there) + noise).tolist())

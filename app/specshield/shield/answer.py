@@ -9,7 +9,6 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.portable import exp
 from specshield.shield import shaping
-from specshield.shield.caution import threshold
 from specshield.shield.decision import Mode, Reason, Shield
 from specshield.shield.judgement import Judged
 
@@ -54,7 +53,11 @@ def answer_of(
         shaped = shaping.tilt(conditional, judged.values, config.threshold)
         attainable = bool(judged.values.max() >= config.threshold)
     elif chance is not None and chance.max() > 0.0:
-        shaped = threshold.shaped(conditional, chance, left)
+        shaped = None
+        if left > 1.0 - 1e-9:  # all that can be had is asked for: of what is as good, S_t goes first
+            shaped = shaping.restrict(conditional, judged.feasible & (chance >= chance.max()))
+        if shaped is None:
+            shaped = shaping.tilt(conditional, chance, left * float(chance.max()))
     elif config.threshold == 1.0 or config.threshold_over == "episode":
         wanted = conditional if weights is None else conditional + weights
         shaped = shaping.restrict(wanted, judged.feasible)

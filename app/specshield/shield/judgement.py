@@ -100,19 +100,23 @@ def judge(shield: Shield, now: Situation) -> Judged:
     if lowered or (care.has_slack and _some(best)):
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
-        # With a threshold for the episode all slacks count, not the most alone.
+        # With a threshold for the episode all slacks count, also more than was found to be had.
         by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
         most = aimed.slack or aimed.most
-        if most > 0 and (care.on_way or by_chance) and not violated and True in left.tolist():
-            known, wanted = len(tried.rho), np.ones_like(left) if by_chance else left
-            for steps in range(most, max(most - LESS, 0) if by_chance else most - 1, -1):
+        if (by_chance or (most > 0 and care.on_way)) and not violated and True in left.tolist():
+            known, wanted, more = len(tried.rho), left | by_chance, [most]
+            before: Aimed | None = aimed
+            if by_chance:
+                more = [*range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)]
+                before = None
+            for steps in more:
                 tried = _in_time(shield, prefix, tried, asked, steps, wanted)
             if len(tried.rho) > known:
                 kept = tried.rho
                 if care.barred is not None and not vain:
                     kept = _aside(shield, care.barred, prefix, tried, kept)
                 kept = _with_room(shield, prefix, tried, kept) if roomy else kept
-                aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, aimed)
+                aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, before)
                 values = best_of(tried, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred

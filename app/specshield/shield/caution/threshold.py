@@ -7,10 +7,8 @@ V(a) is a lower bound on the probability of keeping the rule after a, V* the lar
 Where V is never more than what its best successor is expected to have, d_t is expected never to fall, and
 d_t <= V*_t; so the rule is kept with probability delta or more. In an exact world V is J, 0 or 1.
 
-Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost: the
-probability that the robot, which repeats what was not executed, is in time for every deadline, times, over
-the steps at which a G is to hold, the probability that no deviation is longer than its robustness there. With
-slips alone this is a lower bound, what a robot has that keeps to this future (docs/uncertainty.md).
+Where motions differ from f, V(a) is the chance that the best future after a bears what they may cost
+(docs/uncertainty.md): a lower bound with slips alone, and an estimate with noise.
 """
 
 from __future__ import annotations
@@ -24,7 +22,6 @@ from specshield.compiled import kernel, leaf
 from specshield.errors import SampleError
 from specshield.portable import inner
 from specshield.rule.early import ALWAYS, EVENTUALLY, Conjuncts, conjunction_of, find_open
-from specshield.shield import shaping
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.feasibility import Futures, Prefix, rho_of
 from specshield.shield.judgement import Judged
@@ -35,6 +32,9 @@ from specshield.task import Task, kept_with_task
 
 GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
+# Where noise leads it against something, or out of a narrow passage, a robot is held up. By `python -m
+# benchmarks.lateness`: how often in a motion, for each step of `spread_of`; and the mean [steps] of how long.
+HELD_UP, FOR = 0.04, 5.0
 MOST_SLIPS, UNLIKELY = 64, 1e-9  # slips of one future that are looked at, and their probability; by hand
 
 
@@ -153,11 +153,8 @@ def _deadline(
     parts: Conjuncts, a: int, k: int, t: int, margin: float, buffer: Floats
 ) -> tuple[int, int, int]:
     """What conjunct k, whose window begins at a, asks of a future: after how many of its motions the robot is
-    where it has to be, how many steps later that may be, and how many steps from t it has for it. The first
-    is 0 where nothing is asked.
-
-    An F is first kept by `margin`, or else by as little as it is; what is below it may hold for some steps.
-    What is below a G that has yet to begin holds from some step before it begins; one that has begun has no
+    where it has to be, 0 where nothing is asked; how many steps later that may be; and how many steps from t
+    it has for it. An F is first kept by `margin`, or else by as little as it is. A G that has begun has no
     deadline.
     """
     first, b, met = parts.at[k] - parts.a[k], parts.b[k], -1
@@ -183,12 +180,11 @@ def _in_time(
     noise: Noise, spread: float, slips: bool, due: Ints, motions: Ints, wait: int, dwells: int, late: Floats
 ) -> float:
     """The probability that a robot which keeps to a future's motions (T - t,) is in time for all that is due.
+    It repeats what was not executed, and leaves out waits where it is late, but for the first `dwells`.
 
-    due (K, 3): of `_deadline`. slips: whether motions slip. dwells: no wait among the first so
-    many motions is left out. late (MOST_SLIPS + 1, MOST_SLIPS + 2): scratch; how likely it is that so many
-    motions slipped, and the robot is so many steps late and was in time for all that was due before. It
-    repeats what was not executed, and leaves out waits where it is late. More slips, and what is less likely
-    than UNLIKELY, count as being too late.
+    due (K, 3): of `_deadline`. late (MOST_SLIPS + 1, MOST_SLIPS + 2): scratch; how likely it is that so many
+    motions slipped, and the robot is so many steps late and was in time for all that was due before. More
+    slips, and what is less likely than UNLIKELY, count as being too late.
     """
     last, made, top = 0, 0, 0  # top: the most slips that are likely
     for c in range(due.shape[0]):
@@ -222,7 +218,9 @@ def _in_time(
             if due[c, 0] == n:
                 for s in range(top + 1):
                     for k in range(s + 1):
-                        late[s, k] *= 1.0 - above(due[c, 1] - k, spread * math.sqrt(due[c, 2]))
+                        spare, left = due[c, 1] - k, due[c, 2]
+                        longer = HELD_UP * spread * left * math.exp(-spare / FOR)
+                        late[s, k] *= (1.0 - above(spare, spread * math.sqrt(left))) * math.exp(-longer)
     sure = 0.0
     for s in range(top + 1):
         for k in range(s + 1):
@@ -236,11 +234,6 @@ def left_of(shield: Shield, carry: Carry | None, values: Floats | None) -> float
         return carry.threshold_left
     best = 1.0 if values is None else float(values.max())
     return min(shield.config.threshold / best, 1.0) if best > 0.0 else 1.0
-
-
-def shaped(conditional: Floats, values: Floats, left: float) -> Floats | None:
-    """pi_t [A], given that the model does not end; None where it gives what V asks for no mass."""
-    return shaping.tilt(conditional, values, left * float(values.max()))
 
 
 def next_left(left: float, values: Floats, distribution: Floats, terminal: Bools) -> float:
