@@ -24,7 +24,7 @@ from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict, robustness
 
-LESS = 4  # [steps] of slack, down to which V has ways asked for. Chosen by hand.
+LESS = 4  # [steps] V has ways asked for with so much less slack, and in such strides with more. By hand.
 
 
 class Situation(NamedTuple):
@@ -100,7 +100,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
     if lowered or (care.has_slack and _some(best)):
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
-        # With a threshold for the episode all slacks count, also more than was found to be had.
+        # A threshold for the episode weighs ways with any slack, also with more than the first futures have.
         by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
         most = aimed.slack or aimed.most
         if (by_chance or (most > 0 and care.on_way)) and not violated and True in left.tolist():

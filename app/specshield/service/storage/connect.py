@@ -50,9 +50,7 @@ def reaching() -> Iterator[None]:
 
 
 def away(error: Exception) -> StoreError:
-    if isinstance(
-        error, redis.ResponseError
-    ):  # it says why: its memory or disk is full, it is a replica, ...
+    if isinstance(error, redis.ResponseError):  # it says why: its memory is full, it is a replica, ...
         return StoreError(f"the store refuses: {error!s:.200}")
     return StoreError(f"the store cannot be reached: {type(error).__name__}")
 

@@ -32,8 +32,8 @@ from specshield.task import Task, kept_with_task
 
 GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
-# Where noise leads it against something, or out of a narrow passage, a robot is held up. By `python -m
-# benchmarks.lateness`: how often in a motion, for each step of `spread_of`; and the mean [steps] of how long.
+# Longer delays, chosen by hand beside what `python -m benchmarks.lateness` prints: how often a motion has
+# one, for each step of `spread_of` [1 / step], and how long it lasts in the mean [steps].
 HELD_UP, FOR = 0.04, 5.0
 MOST_SLIPS, UNLIKELY = 64, 1e-9  # slips of one future that are looked at, and their probability; by hand
 
