@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
+import psutil
 
 
 @dataclass
@@ -103,6 +104,18 @@ def wait_ready(server: RunningServer) -> None:
             time.sleep(0.05)
             with contextlib.suppress(httpx.TransportError):
                 status = client.get(f"{server.url}/readyz").status_code
+
+
+def children(pid: int) -> list[int]:
+    """Whatever process it has begun that still runs, whichever of its threads began it."""
+    return [child.pid for child in psutil.Process(pid).children()]
+
+
+def command_line(pid: int) -> str:
+    """What it was begun with, as one line. Empty where it has ended."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return " ".join(psutil.Process(pid).cmdline())
+    return ""
 
 
 def wait_for(condition: Callable[[], object]) -> None:

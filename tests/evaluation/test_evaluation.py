@@ -10,7 +10,6 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ from specshield.sim import cases
 from specshield.sim.cases import load_case
 from specshield.world.regions import signed_distance
 from tests.oracles.judge import margin
-from tests.serving import HUNG, wait_for
+from tests.serving import HUNG, children, command_line, wait_for
 
 EXPERIMENT = Experiment("case1", noise="gaussian", seed=5)
 METHODS = ["unmodified", "ours@0.03/8"]
@@ -214,15 +213,9 @@ def worker(url, folder):
     )
 
 
-def children(pid):
-    """Those of all its threads: a process belongs to the thread that started it."""
-    listed = list(Path(f"/proc/{pid}/task").glob("*/children"))
-    return [int(child) for file in listed for child in file.read_text().split()]
-
-
 def learner(worker):
     """A worker's process for what takes hours. It takes a campaign's runs too."""
-    (pid,) = (pid for pid in children(worker) if b"--learner" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    (pid,) = (pid for pid in children(worker) if "--learner" in command_line(pid))
     return pid
 
 

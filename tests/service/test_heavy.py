@@ -6,7 +6,6 @@ import asyncio
 import os
 import time
 from collections.abc import Awaitable, Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +13,7 @@ import pytest
 from specshield.errors import Busy, MapError, ServerError, TooExpensive
 from specshield.service.heavy.pool import Pool, Template
 from specshield.service.heavy.queue import Turns
+from tests.serving import children, wait_for
 
 
 def run(
@@ -86,9 +86,7 @@ def test_a_child_whose_caller_is_gone_says_nothing_of_it(capfd: pytest.CaptureFi
             assert calls.recv(1)
             process = template._process
             assert process is not None
-            forks = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-            while len(forks.read_text().split()) > 1:
-                time.sleep(0.01)
+            wait_for(lambda: len(children(process.pid)) == 1)
     finally:
         template.stop()
     assert capfd.readouterr().err == ""

@@ -15,7 +15,7 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs
 from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
-from tests.serving import serving, wait_for
+from tests.serving import children, command_line, serving, wait_for
 
 pytest.importorskip("torch")
 
@@ -77,21 +77,14 @@ def reach(client, policy, status):
     return found
 
 
-def children(pid):
-    """Those of all its threads: a process belongs to the thread that started it."""
-    threads = list(Path(f"/proc/{pid}/task").iterdir())
-    listed = [child for thread in threads for child in (thread / "children").read_text().split()]
-    return [(int(child), Path(f"/proc/{child}/cmdline").read_bytes()) for child in listed]
-
-
 def worker_of(server):
-    (pid,) = (pid for pid, command in children(server.process.pid) if b"--until-eof" in command)
+    (pid,) = (pid for pid in children(server.process.pid) if "--until-eof" in command_line(pid))
     return pid
 
 
 def learner_of(server):
     """The worker's process for what takes hours."""
-    (pid,) = (pid for pid, command in children(worker_of(server)) if b"--learner" in command)
+    (pid,) = (pid for pid in children(worker_of(server)) if "--learner" in command_line(pid))
     return pid
 
 
@@ -138,7 +131,7 @@ def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
     reach(client, policy, "training")
     wait_for(lambda: read(client, policy)["eta_s"])
     assert 0.0 < read(client, policy)["progress"] < 1.0
-    ((run, _),) = children(learner_of(server))
+    (run,) = children(learner_of(server))
     own = os.getpriority(os.PRIO_PROCESS, 0)
     threads = {int(id): os.getpriority(os.PRIO_PROCESS, int(id)) for id in os.listdir(f"/proc/{run}/task")}
     assert threads[run] == min(own + 10, 19)  # below servers, and this but once
@@ -155,7 +148,7 @@ def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
 def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, client):
     policy = ask(client, options=LONG, seed=2)
     reach(client, policy, "training")
-    ((run, _),) = children(learner_of(server))
+    (run,) = children(learner_of(server))
     os.kill(run, signal.SIGKILL)
     wait_for(lambda: read(client, policy)["status"] == "failed")
     assert "signal 9" in read(client, policy)["error"]
@@ -175,7 +168,7 @@ def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, cli
 def test_a_run_that_gets_no_time_of_the_processor_is_not_taken_for_dead(server, client):
     policy = ask(client, options=LONG, seed=5)
     reach(client, policy, "training")
-    ((run, _),) = children(learner_of(server))
+    (run,) = children(learner_of(server))
     os.kill(run, signal.SIGSTOP)
     time.sleep(SIGN_OF_LIFE + 2.0)  # its last sign of its own has passed
     assert read(client, policy)["status"] == "training"
@@ -186,7 +179,7 @@ def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait
     running, waiting = (ask(client, options=LONG, seed=seed) for seed in (7, 8))
     reach(client, running, "training")
     stopped = learner_of(server)
-    ((run, _),) = children(stopped)
+    (run,) = children(stopped)
     os.kill(stopped, signal.SIGTERM)
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (stopped, run)))
     assert read(client, running)["status"] in ("queued", "training")  # not failed: the next worker has it
@@ -204,7 +197,7 @@ def test_nothing_trains_on_without_its_server(tmp_path):
             policy = ask(client, options=LONG)
             reach(client, policy, "training")
         worker, learner = worker_of(server), learner_of(server)
-        ((run, _),) = children(learner)
+        (run,) = children(learner)
         server.kill()
         wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (worker, learner, run)))
     with serving(tmp_path) as server:  # no worker this time

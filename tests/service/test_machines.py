@@ -19,7 +19,7 @@ from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import HUNG, RunningServer, serving, wait_for
+from tests.serving import HUNG, RunningServer, children, command_line, serving, wait_for
 
 
 @pytest.mark.parametrize("options", [(), ("--workers", "2")], ids=["one process", "two processes"])
@@ -50,8 +50,7 @@ def test_a_server_that_is_told_to_stop_says_so_first_and_goes_on_meanwhile(tmp_p
 
 def processes(server: RunningServer) -> list[int]:
     """Those that serve: it alone, or its children."""
-    listed = Path(f"/proc/{server.process.pid}/task/{server.process.pid}/children").read_text().split()
-    serve = [int(pid) for pid in listed if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    serve = [pid for pid in children(server.process.pid) if "spawn_main" in command_line(pid)]
     return serve or [server.process.pid]
 
 

@@ -18,7 +18,7 @@ from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Change, Record, Store, keys
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import serving, wait_for
+from tests.serving import children, serving, wait_for
 
 
 def begin(client, **options):
@@ -175,10 +175,6 @@ def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_superv
 
 
 STEP = {"t": 0, "poses": [START], "logits": LOGITS}
-
-
-def children(pid):
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def test_a_store_that_is_away_is_said_to_be_and_nothing_hangs(tmp_path):

@@ -13,7 +13,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.serving import RunningServer, serving, wait_for
+from tests.serving import RunningServer, children, command_line, serving, wait_for
 
 START, LOGITS = [4.5, 5.0, 0.0], [0.0] * 20
 SECRET = "a-key-that-no-line-may-hold"
@@ -48,8 +48,7 @@ def ready(server: RunningServer, processes: int) -> None:
 
 
 def workers(server: RunningServer) -> list[int]:
-    listed = Path(f"/proc/{server.process.pid}/task/{server.process.pid}/children").read_text().split()
-    return [int(pid) for pid in listed if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return [pid for pid in children(server.process.pid) if "spawn_main" in command_line(pid)]
 
 
 def test_what_several_processes_count_is_true_and_outlives_each_of_them(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
-from tests.serving import HUNG, wait_for
+from tests.serving import HUNG, children, wait_for
 
 SPECSHIELD = (sys.executable, "-m", "specshield.cli")
 
@@ -21,15 +21,6 @@ def specshield(*arguments, code=0):
     done = subprocess.run([*SPECSHIELD, *arguments], capture_output=True, text=True)
     assert done.returncode == code, done.stderr
     return done
-
-
-def children(pid):
-    """Of whichever thread began them."""
-    return [
-        int(n)
-        for task in Path(f"/proc/{pid}/task").iterdir()
-        for n in (task / "children").read_text().split()
-    ]
 
 
 def gone(pid):
