@@ -45,7 +45,13 @@ def decision(formula, *motions, **config):
         ("x > 0 U[0,4] A", [WAIT], 2, [1, 0, 0, 0], False),
         ("x > 0 U[0,4] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
         ("x > 0 U[0,4] A", [WAIT, WAIT], 0, [1, 0, 0, 1], False),
-        ("F[0,4] A or F[1,3] x > 9", [WAIT], 2, [1, 0, 0, 0], False),  # and so has an `or`
+        ("F[0,4] A or F[1,3] x > 9", [WAIT], 1, [1, 0, 0, 1], False),  # and so has an `or`
+        ("F[0,4] A or F[1,5] x > 9", [WAIT], 2, [1, 0, 0, 0], False),
+        ("G[0,4] F[0,4] A", [], 2, [1, 0, 0, 1], False),  # a patrol
+        ("G[0,4] F[0,4] A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("G[0,4] F[0,4] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
+        ("G[0,4] (x < 0.2 -> F[0,4] A)", [WAIT], 2, [1, 0, 0, 0], False),  # what is to follow something
+        ("F[0,4] (x < 0.2 and F[0,4] A)", [WAIT] * 3, 2, [1, 0, 0, 1], False),  # one after the other
     ],
 )
 def test_slack_asks_for_deadlines_early_and_for_the_most_that_can_be_had(

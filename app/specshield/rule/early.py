@@ -1,7 +1,9 @@
-"""What a prefix leaves open of a formula, with each F of the conjunction met some steps early.
+"""What a prefix leaves open of a formula, with each F and U met some steps early.
 
-What the prefix has settled is left out. An F is asked for so many steps before its window ends, a G from the
-first step on at which its child is open: read off the leaves' values, so no formula is compiled at a step.
+What the prefix has settled is left out. An F or U is asked for so many steps before its window ends, or where
+it is met already; a G from the first step on at which its child is open: read off the leaves' values, so no
+formula is compiled at a step. Where a `not` stands above an F, that asks for less, but nothing counts that
+does not keep the whole rule.
 """
 
 from __future__ import annotations
@@ -14,11 +16,12 @@ from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.rule.residual import joined
 from specshield.rule.values import places
-from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Or, Until, conjuncts
-from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_value
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, conjuncts
+from specshield.stl.conjunction import is_predicate
+from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, apply, bounds_at, compile_tree, slide, until
 from specshield.task import Task, kept_with_task
 
-OTHER, EVENTUALLY, ALWAYS = 0, 1, 2
+OTHER = -1  # beside a tree's operators
 
 
 class Conjuncts(NamedTuple):
@@ -26,7 +29,8 @@ class Conjuncts(NamedTuple):
 
     below: the tree without the F or G at the top of each conjunct, and the `and`. kind [K]: what that is;
     OTHER: none, all is in `below`. at [K]: where in the buffer values begin that it ranges over. a, b [K]:
-    its window. horizon [K]: of what is below. plain [K]: whether that is a predicate, or under F a G of one.
+    its window. horizon [K]: of what is below. half [K]: of the longest window of an F or U in it [steps].
+    plain [K]: whether what is below is a predicate, or under F a G of one. owner [n]: each node's conjunct.
     """
 
     below: Tree
@@ -35,41 +39,31 @@ class Conjuncts(NamedTuple):
     a: Ints
     b: Ints
     horizon: Ints
+    half: Ints
     plain: Bools
+    owner: Ints
 
 
 @kept_with_task
 def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
     """The formula itself where it is a plain conjunction, else one that is equal; and its conjuncts."""
-    above, slots = conjuncts(formula) if is_temporal(formula) else (formula,), places(task)  # as in the tree
-    parts = [each for part in above for each in _with_deadline(part)]
-    whole = formula if joined(parts) == formula else joined(parts)
+    above, slots = (formula,) if is_predicate(formula) else conjuncts(formula), places(task)  # as in the tree
+    whole = formula if joined(above) == formula else joined(above)
     tree = compile_tree(whole, slots)
-    rows, kept, node, size = [], np.ones(len(tree.op), np.bool_), 0, 0
-    for k, part in enumerate(parts):
-        own = compile_tree(part, slots)
-        node += len(own.op)
-        row = (OTHER, size, 0, 0, 0)
+    rows, kept, owner, size = list[tuple[int, ...]](), list[bool](), list[int](), 0
+    for k, part in enumerate(above):
+        own, row = compile_tree(part, slots), (OTHER, size, 0, 0, part.horizon)
+        rest = len(own.op)
         if isinstance(part, (Always, Eventually)):
-            kept[node - 1] = False
-            kind = EVENTUALLY if isinstance(part, Eventually) else ALWAYS
-            row = (kind, size, part.a, part.b, part.child.horizon)
-        rows.append(row)
-        kept[node : node + (k > 0)] = False  # the `and`
-        node, size = node + (k > 0), size + own.size
-    below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:6]})  # of its nodes
-    kind_of, at, a, b, horizon = np.array(rows, np.int64).T.copy()
-    return whole, Conjuncts(below, kind_of, at, a, b, horizon, np.array([*map(_is_plain, parts)], np.bool_))
-
-
-def _with_deadline(part: Formula) -> tuple[Formula, ...]:
-    """A conjunct, and for an `until`, or an `or` of F, the F that follows from it, which can be met early."""
-    if isinstance(part, Until):
-        return part, Eventually(part.a, part.b, part.right)
-    ways = [each for each in part.parts if isinstance(each, Eventually)]
-    if not isinstance(part, Or) or len(ways) < len(part.children):
-        return (part,)
-    return part, Eventually(min(w.a for w in ways), max(w.b for w in ways), Or(tuple(w.child for w in ways)))
+            rest, row = rest - 1, (own.op[-1], size, part.a, part.b, part.child.horizon)
+        halves = (own.b - own.a)[np.isin(own.op, (EVENTUALLY, UNTIL))] // 2
+        rows.append((*row, halves.max(initial=0)))
+        kept += [True] * rest + [False] * (len(own.op) - rest + (k > 0))  # without the `and`
+        owner += [k] * rest
+        size += own.size
+    below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:7]})  # of its nodes
+    columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
+    return whole, Conjuncts._make((below, *columns, plain, np.array(owner, np.int64)))
 
 
 def _is_plain(part: Formula) -> bool:
@@ -80,35 +74,53 @@ def _is_plain(part: Formula) -> bool:
 @kernel
 def find_open(parts: Conjuncts, known: Floats, t: int, still: Bools) -> None:
     """Writes which conjuncts x_{0:t} has not settled into still (K,). known (size,): the leaves to step t."""
-    tree, low = parts.below, known.copy()
-    for n in range(tree.leaf_at.shape[0]):
-        for step in range(max(t + 1, tree.leaf_start[n]), tree.leaf_stop[n]):
-            low[tree.leaf_at[n] + step - tree.leaf_start[n]] = tree.low[n]
-    tree_value(tree, low)
+    low = known.copy()
+    bounds_at(parts.below, t, low, known.copy())
     for k in range(still.shape[0]):
         still[k] = not _value(parts, k, parts.a[k], parts.b[k], low) > SATISFIED_ABOVE
 
 
 @kernel
 def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Floats, rho: Floats) -> None:
-    """rho (N,) of the conjuncts that are `still` (K,) open, each F met early (K,) steps before its end.
+    """rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before its end,
+    though a window keeps at least half its length.
 
     leaves (N, size): the leaves along N trajectories. Where nothing is open, rho is that of the whole.
     """
-    buffer, some = np.empty(leaves.shape[1]), still.any()
+    buffer, scratch, some = np.empty(leaves.shape[1]), np.empty(leaves.shape[1]), still.any()
     for f in range(leaves.shape[0]):
         copy_row(leaves[f], buffer)
-        tree_value(parts.below, buffer)
+        for n in range(parts.owner.shape[0]):
+            _apply_early(parts.below, n, t, early[parts.owner[n]] if some else 0, buffer, scratch)
         least = np.inf
         for k in range(still.shape[0]):
             a, b = parts.a[k], parts.b[k]
             if some and parts.kind[k] == EVENTUALLY:
-                b -= early[k]
+                b = max(b - min(early[k], (b - a) // 2), min(b, t))
             elif some and parts.kind[k] == ALWAYS:
                 a = max(a, min(t + 1 - parts.horizon[k], b))
             if still[k] or not some:
                 least = min(least, _value(parts, k, a, b, buffer))
         rho[f] = least
+
+
+@leaf
+def _apply_early(tree: Tree, n: int, t: int, early: int, buffer: Floats, scratch: Floats) -> None:
+    """Applies node n below the conjuncts. scratch (size,): for a copy."""
+    op, at, count, a, b = tree.op[n], tree.at[n], tree.length[n], tree.a[n], tree.b[n]
+    sooner, past = min(early, (b - a) // 2), t - tree.start[n]
+    if op == UNTIL:
+        for i in range(count):
+            buffer[at + i] = until(buffer, at + i, tree.right[n] + i, a, max(b - sooner, min(b, past - i)))
+    elif op != EVENTUALLY or sooner == 0:
+        apply(tree, n, buffer)
+    else:
+        length = b - a + 1 - sooner
+        copy_row(buffer, scratch)
+        slide(buffer, at, count, length, False)
+        for i in range(min(count, past - a - length + 1)):
+            for j in range(i + length, min(i + length + sooner, past - a + 1)):
+                buffer[at + i] = max(buffer[at + i], scratch[at + j])
 
 
 @leaf

@@ -12,8 +12,9 @@ from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import inlined, kernel
 from specshield.rule.values import REGIONS, fill_pose, fill_region, places, regions_of
 from specshield.stl import Always, And, Formula, Node, Until
+from specshield.stl.conjunction import is_predicate
 from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
-from specshield.stl.tree import Tree, compile_tree, is_temporal, tree_bounds, tree_value
+from specshield.stl.tree import Tree, bounds_at, compile_tree, tree_value
 from specshield.task import Task, kept_with_task
 from specshield.world.regions import PackedRegions, turns_with_robot
 
@@ -50,7 +51,7 @@ def view_of(task: Task, formula: Formula) -> View:
 
 def _binding(formula: Node, binds: bool) -> Iterator[bool]:
     """`View.binds`, in the order of the tree's leaves."""
-    if not is_temporal(formula):
+    if is_predicate(formula):
         yield binds
         return
     if isinstance(formula, Until):
@@ -132,16 +133,10 @@ def look(view: View, poses: Floats, signals: Floats, known: Floats) -> tuple[flo
 
     poses (t + 1, 3), signals (t + 1, S). known (tree.size,): the leaves at the steps to t are written there.
     """
-    tree, stop = view.tree, poses.shape[0]
     values = np.empty(value_count(view, signals))
     if not _read(view, poses, signals, 0, values, np.empty(STACK_SIZE), known):
         return math.nan, math.nan
-    low, high = known.copy(), known.copy()
-    for n in range(tree.leaf_at.shape[0]):
-        at = tree.leaf_at[n] - tree.leaf_start[n]
-        for t in range(max(stop, tree.leaf_start[n]), tree.leaf_stop[n]):
-            low[at + t], high[at + t] = tree.low[n], tree.high[n]
-    return tree_bounds(tree, low, high)
+    return bounds_at(view.tree, poses.shape[0] - 1, known.copy(), known.copy())
 
 
 @inlined

@@ -97,7 +97,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         best = best_of(tried, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
-    if lowered or (care.has_slack and _some(best)):
+    if lowered or (care.has_slack and best.robustness.max() > SATISFIED_ABOVE):
         aimed = aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
         # A threshold for the episode weighs ways with any slack, also with more than the first futures have.
@@ -265,10 +265,6 @@ def _holds_now(prefix: Prefix, formula: Always) -> bool:
     return bool(robustness(formula.child, {n: now[n] for n in formula.child.names}) > SATISFIED_ABOVE)
 
 
-def _some(best: Best) -> bool:
-    return bool(max(best.robustness.tolist()) > SATISFIED_ABOVE)
-
-
 @kernel
 def _kept(robustness: Floats, asked: float) -> tuple[Bools, bool]:
     """Which motions keep the margin asked for, or else the largest there is; whether it was lowered.
@@ -313,19 +309,9 @@ def j_values_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ..
     if judged is None:
         return (None,) * len(robot.actions)
     if shield.config.evaluation == "feasibility":
-        values = np.empty(len(robot.actions))
-        _write_j(robot.terminal, judged.feasible, values)
-        return tuple(values.tolist())
+        values = judged.feasible | robot.terminal if judged.some else judged.feasible
+        return tuple(values.astype(np.float64).tolist())
     return _as_numbers(np.where(robot.terminal, judged.values.max(), judged.values))
-
-
-@leaf
-def _write_j(terminal: Bools, feasible: Bools, values: Floats) -> None:
-    some = False
-    for a in range(values.shape[0]):
-        some = some or feasible[a]
-    for a in range(values.shape[0]):
-        values[a] = 1.0 if feasible[a] or (terminal[a] and some) else 0.0
 
 
 def robustness_of(shield: Shield, judged: Judged | None) -> tuple[float | None, ...]:

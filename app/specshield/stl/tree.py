@@ -14,7 +14,8 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints
 from specshield.compiled import inlined, leaf
-from specshield.stl.formula import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until
+from specshield.stl.conjunction import is_predicate
+from specshield.stl.formula import Always, And, Eventually, Formula, Implies, Not, Or, Until
 from specshield.stl.program import Programs, compile_predicates
 from specshield.stl.robustness import unseen_bounds
 
@@ -26,6 +27,7 @@ class Tree(NamedTuple):
 
     op [n]: the operator. at, right [n]: where in the buffer its first and second operand's values begin.
     length [n]: how many values it has, written from `at` on. a, b [n]: its window, in steps.
+    start [n]: the step of its first value.
     leaf_at, leaf_start, leaf_stop [l]: where a leaf's values begin in the buffer, and from which step up to
     which (excluded) they are. low, high [l]: bounds on a leaf's value at a step whose samples are to come.
     size: of the buffer.
@@ -37,6 +39,7 @@ class Tree(NamedTuple):
     a: Ints
     b: Ints
     right: Ints
+    start: Ints
     leaf_at: Ints
     leaf_start: Ints
     leaf_stop: Ints
@@ -53,13 +56,11 @@ def compile_tree(formula: Formula, slots: Mapping[str, int]) -> Tree:
     """
     builder = _Builder()
     builder.add(formula, 0, 1)
-    op, at, length, a, b, right = np.array(builder.nodes, np.int64).reshape(-1, 6).T.copy()
+    nodes = np.array(builder.nodes, np.int64).reshape(-1, 7).T.copy()
     leaf_at, leaf_start, leaf_stop = np.array(builder.leaves, np.int64).T.copy()
     low, high = np.array([unseen_bounds(each) for each in builder.predicates]).T.copy()
     programs = compile_predicates(builder.predicates, slots)
-    return Tree(
-        op, at, length, a, b, right, leaf_at, leaf_start, leaf_stop, low, high, programs, builder.size
-    )
+    return Tree._make((*nodes, leaf_at, leaf_start, leaf_stop, low, high, programs, builder.size))
 
 
 class _Builder:
@@ -71,29 +72,28 @@ class _Builder:
 
     def add(self, formula: Formula, start: int, stop: int) -> int:
         """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin."""
-        count = stop - start
         match formula:
-            case _ if not is_temporal(formula):
+            case _ if is_predicate(formula):
                 return self._leaf(formula, start, stop)
             case Not(child):
-                return self._node(NOT, self.add(child, start, stop), count)
+                return self._node(NOT, self.add(child, start, stop), start, stop)
             case And(children) | Or(children):
                 op = AND if isinstance(formula, And) else OR
                 at = self.add(children[0], start, stop)
                 for child in children[1:]:
-                    self._node(op, at, count, right=self.add(child, start, stop))
+                    self._node(op, at, start, stop, right=self.add(child, start, stop))
                 return at
             case Implies(left, right):
-                at = self._node(NOT, self.add(left, start, stop), count)
-                return self._node(OR, at, count, right=self.add(right, start, stop))
+                at = self._node(NOT, self.add(left, start, stop), start, stop)
+                return self._node(OR, at, start, stop, right=self.add(right, start, stop))
             case Always(a, b, child) | Eventually(a, b, child):
                 op = ALWAYS if isinstance(formula, Always) else EVENTUALLY
-                return self._node(op, self.add(child, start + a, stop + b), count, a, b)
+                return self._node(op, self.add(child, start + a, stop + b), start, stop, a, b)
             case Until(_, 0, _, right):
                 return self.add(right, start, stop)
             case Until(a, b, left, right):
                 at = self.add(left, start, stop - 1 + b)
-                return self._node(UNTIL, at, count, a, b, self.add(right, start + a, stop + b))
+                return self._node(UNTIL, at, start, stop, a, b, self.add(right, start + a, stop + b))
         raise TypeError(f"not a formula: {formula!r}")
 
     def _leaf(self, formula: Formula, start: int, stop: int) -> int:
@@ -102,26 +102,27 @@ class _Builder:
         self.predicates.append(formula)
         return at
 
-    def _node(self, op: int, at: int, count: int, a: int = 0, b: int = 0, right: int = -1) -> int:
-        self.nodes.append((op, at, count, a, b, right))
+    def _node(self, op: int, at: int, start: int, stop: int, a: int = 0, b: int = 0, right: int = -1) -> int:
+        self.nodes.append((op, at, stop - start, a, b, right, start))
         return at
-
-
-def is_temporal(formula: Node) -> bool:
-    """Whether an `always`, `eventually` or `until` is anywhere in the formula."""
-    return isinstance(formula, (Always, Eventually, Until)) or any(map(is_temporal, formula.parts))
 
 
 @inlined
 def tree_value(tree: Tree, buffer: Floats) -> float:
     """rho from the leaves' values in `buffer` (size,), which is overwritten."""
     for n in range(tree.op.shape[0]):
-        if tree.op[n] == NOT:
-            for i in range(tree.at[n], tree.at[n] + tree.length[n]):
-                buffer[i] = -buffer[i]
-        else:
-            _apply(tree, n, buffer)
+        apply(tree, n, buffer)
     return float(buffer[0] + 0.0)  # -0.0 becomes 0.0, as in `robustness`
+
+
+@leaf
+def bounds_at(tree: Tree, t: int, low: Floats, high: Floats) -> tuple[float, float]:
+    """(lo, hi) of rho after x_{0:t}. low, high (size,): the leaves to step t; both are overwritten."""
+    for n in range(tree.leaf_at.shape[0]):
+        at = tree.leaf_at[n] - tree.leaf_start[n]
+        for step in range(max(t + 1, tree.leaf_start[n]), tree.leaf_stop[n]):
+            low[at + step], high[at + step] = tree.low[n], tree.high[n]
+    return tree_bounds(tree, low, high)
 
 
 @leaf
@@ -132,16 +133,19 @@ def tree_bounds(tree: Tree, low: Floats, high: Floats) -> tuple[float, float]:
             for i in range(tree.at[n], tree.at[n] + tree.length[n]):
                 low[i], high[i] = -high[i], -low[i]
         else:
-            _apply(tree, n, low)
-            _apply(tree, n, high)
+            apply(tree, n, low)  # monotone
+            apply(tree, n, high)
     return float(low[0] + 0.0), float(high[0] + 0.0)
 
 
 @inlined
-def _apply(tree: Tree, n: int, buffer: Floats) -> None:
-    """Applies a monotone operator to one end, in place: no value is written before its last use."""
+def apply(tree: Tree, n: int, buffer: Floats) -> None:
+    """Applies node n in place: no value is written before its last use."""
     op, at, count, right = tree.op[n], tree.at[n], tree.length[n], tree.right[n]
-    if op == AND:
+    if op == NOT:
+        for i in range(at, at + count):
+            buffer[i] = -buffer[i]
+    elif op == AND:
         for i in range(count):
             buffer[at + i] = min(buffer[at + i], buffer[right + i])
     elif op == OR:
@@ -149,13 +153,13 @@ def _apply(tree: Tree, n: int, buffer: Floats) -> None:
             buffer[at + i] = max(buffer[at + i], buffer[right + i])
     elif op == UNTIL:
         for i in range(count):
-            buffer[at + i] = _until(buffer, at + i, right + i, tree.a[n], tree.b[n])
+            buffer[at + i] = until(buffer, at + i, right + i, tree.a[n], tree.b[n])
     else:
-        _slide(buffer, at, count, tree.b[n] - tree.a[n] + 1, op == ALWAYS)
+        slide(buffer, at, count, tree.b[n] - tree.a[n] + 1, op == ALWAYS)
 
 
 @inlined
-def _slide(buffer: Floats, at: int, count: int, width: int, least: bool) -> None:
+def slide(buffer: Floats, at: int, count: int, width: int, least: bool) -> None:
     """The extremum of every `width` neighbours, in log2(width) passes, as `robustness._sliding`."""
     if count == 1:
         best = buffer[at]
@@ -175,7 +179,7 @@ def _slide(buffer: Floats, at: int, count: int, width: int, least: bool) -> None
 
 
 @leaf
-def _until(buffer: Floats, left: int, right: int, a: int, b: int) -> float:
+def until(buffer: Floats, left: int, right: int, a: int, b: int) -> float:
     """max over k in [a, b] of min(right[k - a], min left[0 : k])."""
     kept, best = np.inf, -np.inf
     for k in range(a):

@@ -16,7 +16,7 @@ import numpy as np
 from specshield.arrays import Ints
 from specshield.rule.view import View, view_of
 from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until
-from specshield.stl.tree import is_temporal
+from specshield.stl.conjunction import is_predicate
 from specshield.task import Task, kept_with_task
 
 Ends = frozenset[tuple[Formula, int]]
@@ -132,7 +132,7 @@ def _leaves(
     The last is None for a leaf that need not hold for a while, and empty where nothing but time ends that.
     """
     match formula:
-        case _ if not is_temporal(formula):
+        case _ if is_predicate(formula):
             yield formula, positive, ends
         case Not(child):
             yield from _leaves(child, not positive, ends)

@@ -13,11 +13,12 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
-from specshield.rule.early import EVENTUALLY, Conjuncts, conjunction_of, find_open, rate_open
+from specshield.rule.early import Conjuncts, conjunction_of, find_open, rate_open
 from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
+from specshield.stl.tree import EVENTUALLY
 
 
 class Aimed(NamedTuple):
@@ -102,16 +103,18 @@ class Open(NamedTuple):
 
 @kernel
 def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chance: float) -> tuple[int, int]:
-    """Fills `now`, whose `asked` is 0. The steps of the F whose deadline is next, and the most of any. A
-    window keeps at least half its length.
+    """Fills `now`, whose `asked` is 0. The steps at the deadline that is next, and the most at any. A window
+    keeps at least half its length.
     """
     parts, still, asked, t = now
     find_open(parts, known, t, still)
     soonest, first = -1, 0
     for k in range(still.shape[0]):
-        if still[k] and parts.kind[k] == EVENTUALLY:
+        half = parts.half[k]
+        if still[k] and half > 0:
             left = parts.b[k] + parts.horizon[k] - t
-            half = (parts.b[k] - parts.a[k]) // 2
+            if parts.kind[k] != EVENTUALLY:  # the first that its child is asked for
+                left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             if soonest < 0 or left < first:
                 soonest, first = k, left

@@ -21,13 +21,13 @@ from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.errors import SampleError
 from specshield.portable import inner
-from specshield.rule.early import ALWAYS, EVENTUALLY, Conjuncts, conjunction_of, find_open
+from specshield.rule.early import Conjuncts, conjunction_of, find_open
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.feasibility import Futures, Prefix, rho_of
 from specshield.shield.judgement import Judged
 from specshield.shield.uncertainty import Care, Noise, above, spread_of
 from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts
-from specshield.stl.tree import tree_value
+from specshield.stl.tree import ALWAYS, EVENTUALLY, tree_value
 from specshield.task import Task, kept_with_task
 
 GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
