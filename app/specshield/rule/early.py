@@ -1,9 +1,9 @@
 """What a prefix leaves open of a formula, with each F and U met some steps early.
 
 What the prefix has settled is left out. An F or U is asked for so many steps before its window ends, or where
-it is met already; a G from the first step on at which its child is open: read off the leaves' values, so no
-formula is compiled at a step. Where a `not` stands above an F, that asks for less, but nothing counts that
-does not keep the whole rule.
+it is met already; a G of a predicate that has yet to begin so many steps before; any other G from the first
+step on at which its child is open. All is read off the leaves' values, so no formula is compiled at a step.
+Where a `not` stands above an F, that asks for less, but nothing counts that does not keep the whole rule.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.rule.residual import joined
 from specshield.rule.values import places
-from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Always, Arithmetic, Eventually, Formula, Node, conjuncts
 from specshield.stl.conjunction import is_predicate
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, apply, bounds_at, compile_tree, slide, until
 from specshield.task import Task, kept_with_task
@@ -29,7 +29,8 @@ class Conjuncts(NamedTuple):
 
     below: the tree without the F or G at the top of each conjunct, and the `and`. kind [K]: what that is;
     OTHER: none, all is in `below`. at [K]: where in the buffer values begin that it ranges over. a, b [K]:
-    its window. horizon [K]: of what is below. half [K]: of the longest window of an F or U in it [steps].
+    its window. horizon [K]: of what is below. half [K]: of the longest window of an F or U in it [steps], or
+    of the time until a G begins, whose values are in the buffer from step 0 on.
     plain [K]: whether what is below is a predicate, or under F a G of one. owner [n]: each node's conjunct.
     """
 
@@ -46,24 +47,41 @@ class Conjuncts(NamedTuple):
 
 @kept_with_task
 def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
-    """The formula itself where it is a plain conjunction, else one that is equal; and its conjuncts."""
+    """The formula's conjuncts, and the one that has their leaves: itself, or an equal one but for its G that
+    begin later, which it has from step 0 on.
+    """
     above, slots = (formula,) if is_predicate(formula) else conjuncts(formula), places(task)  # as in the tree
-    whole = formula if joined(above) == formula else joined(above)
+    wide = [_from_now_on(part) for part in above]
+    whole = formula if joined(wide) == formula else joined(wide)
     tree = compile_tree(whole, slots)
     rows, kept, owner, size = list[tuple[int, ...]](), list[bool](), list[int](), 0
     for k, part in enumerate(above):
-        own, row = compile_tree(part, slots), (OTHER, size, 0, 0, part.horizon)
+        own, row, early = compile_tree(wide[k], slots), (OTHER, size, 0, 0, part.horizon), wide[k] is not part
         rest = len(own.op)
         if isinstance(part, (Always, Eventually)):
-            rest, row = rest - 1, (own.op[-1], size, part.a, part.b, part.child.horizon)
+            at = size + part.a * early
+            rest, row = rest - 1, (own.op[-1], at, part.a, part.b, part.child.horizon)
         halves = (own.b - own.a)[np.isin(own.op, (EVENTUALLY, UNTIL))] // 2
-        rows.append((*row, halves.max(initial=0)))
+        rows.append((*row, halves.max(initial=row[2] // 2 * early)))
         kept += [True] * rest + [False] * (len(own.op) - rest + (k > 0))  # without the `and`
         owner += [k] * rest
         size += own.size
     below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:7]})  # of its nodes
     columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
     return whole, Conjuncts._make((below, *columns, plain, np.array(owner, np.int64)))
+
+
+def _from_now_on(part: Formula) -> Formula:
+    """A conjunct; for a G of a predicate that begins later, the one that begins at step 0. A predicate that
+    computes may have no value before.
+    """
+    if isinstance(part, Always) and part.a > 1 and is_predicate(part.child) and not _computes(part):
+        return Always(0, part.b, part.child)
+    return part
+
+
+def _computes(node: Node) -> bool:
+    return isinstance(node, Arithmetic) or any(map(_computes, node.parts))
 
 
 def _is_plain(part: Formula) -> bool:
@@ -98,7 +116,8 @@ def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Float
             if some and parts.kind[k] == EVENTUALLY:
                 b = max(b - min(early[k], (b - a) // 2), min(b, t))
             elif some and parts.kind[k] == ALWAYS:
-                a = max(a, min(t + 1 - parts.horizon[k], b))
+                sooner = min(early[k], a // 2) if parts.half[k] > 0 and parts.plain[k] else 0
+                a = max(a - sooner, min(t + 1 - parts.horizon[k], b))
             if still[k] or not some:
                 least = min(least, _value(parts, k, a, b, buffer))
         rho[f] = least

@@ -18,7 +18,7 @@ from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
-from specshield.stl.tree import EVENTUALLY
+from specshield.stl.tree import ALWAYS, EVENTUALLY
 
 
 class Aimed(NamedTuple):
@@ -110,8 +110,8 @@ def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chan
     find_open(parts, known, t, still)
     soonest, first = -1, 0
     for k in range(still.shape[0]):
-        half = parts.half[k]
-        if still[k] and half > 0:
+        half, begun = parts.half[k], parts.plain[k] and parts.kind[k] == ALWAYS and parts.a[k] <= t
+        if still[k] and half > 0 and not begun:
             left = parts.b[k] + parts.horizon[k] - t
             if parts.kind[k] != EVENTUALLY:  # the first that its child is asked for
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])

@@ -19,16 +19,14 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
-from specshield.errors import SampleError
 from specshield.portable import inner
 from specshield.rule.early import Conjuncts, conjunction_of, find_open
 from specshield.shield.decision import Carry, Shield
-from specshield.shield.feasibility import Futures, Prefix, rho_of
+from specshield.shield.feasibility import Prefix, rho_of
 from specshield.shield.judgement import Judged
 from specshield.shield.uncertainty import Care, Noise, above, spread_of
-from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts
+from specshield.stl import SATISFIED_ABOVE
 from specshield.stl.tree import ALWAYS, EVENTUALLY, tree_value
-from specshield.task import Task, kept_with_task
 
 GRID = 100  # V is rounded down to 1 / GRID: a bound still, and actions that are as good as equal are equal
 
@@ -51,16 +49,11 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # what is set aside does not count
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     find_open(parts, prefix.known, prefix.t, still)
-    begins, noise = parts.a, care.noise
-    later = still & (parts.kind == ALWAYS) & (begins > prefix.t)
-    if later.any() and (noise.slips > 0.0 or noise.move > 0.0 or noise.turn > 0.0):
-        parts, leaves = _from_now_on(parts, leaves, prefix, tried)
     _chances(
         parts,
-        begins,
         still,
         prefix.t,
-        noise,
+        care.noise,
         care.stride,
         care.margin,
         leaves,
@@ -75,35 +68,9 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     return np.where(motion_of >= 0, np.floor(GRID * values)[motion_of] / GRID, 0.0)
 
 
-def _from_now_on(
-    parts: Conjuncts, leaves: Floats, prefix: Prefix, tried: Futures
-) -> tuple[Conjuncts, Floats]:
-    """The conjuncts with each G from the first step on, and their leaves: they say since when a G that has
-    yet to begin would hold. As they are where the arithmetic is not finite before it begins, and where
-    signals are taken to change after x_t.
-    """
-    wide = _widened(prefix.task, prefix.formula)
-    if wide == prefix.formula or not np.array_equal(prefix.held, prefix.rows[-1:]):
-        return parts, leaves
-    try:
-        rho, wider = rho_of(prefix.of(wide), tried)
-    except SampleError:
-        return parts, leaves
-    if np.isneginf(rho[tried.rho > SATISFIED_ABOVE]).any():
-        return parts, leaves
-    return conjunction_of(prefix.task, wide)[1], wider
-
-
-@kept_with_task
-def _widened(task: Task, formula: Formula) -> Formula:
-    parts = tuple(Always(0, p.b, p.child) if isinstance(p, Always) else p for p in conjuncts(formula))
-    return parts[0] if len(parts) == 1 else And(parts)
-
-
 @kernel
 def _chances(
     parts: Conjuncts,
-    begins: Ints,
     still: Bools,
     t: int,
     noise: Noise,
@@ -115,9 +82,7 @@ def _chances(
     wait: int,
     values: Floats,
 ) -> None:
-    """Writes V of each motion (M,), which is zero where no future keeps the rule. begins (K,): the first step
-    of each conjunct's window; a G of `parts` may begin before it.
-    """
+    """Writes V of each motion (M,), which is zero where no future keeps the rule."""
     count, spread = still.shape[0], spread_of(noise, stride)
     sigma = math.hypot(noise.move, stride * noise.turn)
     buffer, late = np.empty(leaves.shape[1]), np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2))
@@ -132,13 +97,13 @@ def _chances(
             due[k, 0] = 0
             if not still[k]:
                 continue
-            due[k, 0], due[k, 1], due[k, 2] = _deadline(parts, begins[k], k, t, margin, buffer)
+            due[k, 0], due[k, 1], due[k, 2] = _deadline(parts, k, t, margin, buffer)
             if parts.kind[k] == EVENTUALLY and parts.horizon[k] > 0:
                 dwells = max(dwells, due[k, 0])
             if not parts.plain[k] and (noise.slips > 0.0 or spread > 0.0):
                 chance = 0.0
             if sigma > 0.0 and parts.kind[k] == ALWAYS:
-                for step in range(max(begins[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
+                for step in range(max(parts.a[k], t + 1 - parts.horizon[k]), parts.b[k] + 1):
                     deep = max(buffer[parts.at[k] + step - parts.a[k]], 0.0)
                     chance *= 1.0 - math.exp(-0.5 * (deep / sigma) ** 2)
         if chance > 0.0 and (noise.slips > 0.0 or spread > 0.0):
@@ -149,15 +114,12 @@ def _chances(
 
 
 @leaf
-def _deadline(
-    parts: Conjuncts, a: int, k: int, t: int, margin: float, buffer: Floats
-) -> tuple[int, int, int]:
-    """What conjunct k, whose window begins at a, asks of a future: after how many of its motions the robot is
-    where it has to be, 0 where nothing is asked; how many steps later that may be; and how many steps from t
-    it has for it. An F is first kept by `margin`, or else by as little as it is. A G that has begun has no
-    deadline.
+def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -> tuple[int, int, int]:
+    """What conjunct k asks of a future: after how many of its motions the robot is where it has to be, or 0
+    where nothing is asked; how many steps later that may be; and how many steps from t it has for it. An F is
+    first kept by `margin`, or else by as little as it is. A G that has begun has no deadline.
     """
-    first, b, met = parts.at[k] - parts.a[k], parts.b[k], -1
+    a, b, first, met = parts.a[k], parts.b[k], parts.at[k] - parts.a[k], -1
     if parts.kind[k] == EVENTUALLY:
         for step in range(a, b + 1):
             if buffer[first + step] > SATISFIED_ABOVE + margin:
@@ -170,7 +132,7 @@ def _deadline(
     if a <= t:
         return 0, 0, 0
     met = a
-    while met > max(t, parts.a[k]) and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
+    while met > (t if parts.half[k] > 0 else a) and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
         met -= 1
     return met - t, a - met, a - t
 
