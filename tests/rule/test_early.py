@@ -30,6 +30,7 @@ RULES = [
     "(x > -1) and F[0,8] (x > 0.4 or y > 0.6) and (y < 9 U[0,7] x > 0.3)",
     "not G[0,6] x < 0.5 and not (F[0,9] y > 1.2 or F[0,3] x > 2)",
     "F[2,7] x > 0.6",
+    "G[4,9] y > 0.3 and not F[6,8] x < 0.4 and G[9,9] G[0,1] x > 0.3 and G[1,9] x > -1",
     "x > 0.5 and not y > 0.4",  # nothing is left open of it, and it has conjuncts all the same
 ]
 
@@ -70,7 +71,9 @@ def left_open(formula, samples, t, early):
         ):
             continue
         if isinstance(part, Always):
-            part = Always(max(part.a, min(t + 1 - part.child.horizon, part.b)), part.b, part.child)
+            later = part.a > max(t, 1) and part.child.horizon == 0
+            begins = part.a - min(early, part.a // 2) if later else min(t + 1 - part.child.horizon, part.b)
+            part = Always(begins if later else max(part.a, begins), part.b, part.child)
         found.append(met_early(part, 0, samples, t, early))
     return min(found) if found else float(robustness(formula, samples))
 

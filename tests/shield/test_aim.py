@@ -50,6 +50,10 @@ def decision(formula, *motions, **config):
         ("G[0,4] F[0,4] A", [], 2, [1, 0, 0, 1], False),  # a patrol
         ("G[0,4] F[0,4] A", [WAIT], 2, [1, 0, 0, 0], False),
         ("G[0,4] F[0,4] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
+        ("G[4,6] A", [WAIT], 2, [1, 0, 0, 0], False),  # what is yet to begin
+        ("G[4,6] A", [WAIT], 0, [1, 1, 1, 1], False),
+        ("G[4,6] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
+        ("G[4,6] 1 / (1 + x) < 0.8", [WAIT], 2, [1, 1, 1, 1], False),  # it may have no value before
         ("G[0,4] (x < 0.2 -> F[0,4] A)", [WAIT], 2, [1, 0, 0, 0], False),  # what is to follow something
         ("F[0,4] (x < 0.2 and F[0,4] A)", [WAIT] * 3, 2, [1, 0, 0, 1], False),  # one after the other
     ],

@@ -116,8 +116,8 @@ def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Float
             if some and parts.kind[k] == EVENTUALLY:
                 b = max(b - min(early[k], (b - a) // 2), min(b, t))
             elif some and parts.kind[k] == ALWAYS:
-                sooner = min(early[k], a // 2) if parts.half[k] > 0 and parts.plain[k] else 0
-                a = max(a - sooner, min(t + 1 - parts.horizon[k], b))
+                later = a > t and parts.plain[k]
+                a = a - min(early[k], parts.half[k]) if later else max(a, min(t + 1 - parts.horizon[k], b))
             if still[k] or not some:
                 least = min(least, _value(parts, k, a, b, buffer))
         rho[f] = least

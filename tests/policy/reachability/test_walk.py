@@ -92,6 +92,15 @@ def test_a_climb_turns_goes_and_stays(visit):
     np.testing.assert_allclose(poses[-1, :2], pose(5)[:2])
 
 
+def test_a_climb_is_in_time_for_what_is_yet_to_begin():
+    """It does not wait before A for step 8, as the tables would have it: their latest time there is 7."""
+    guide = guide_of(make_corridor("G[8,10] A", A=3))
+    motions, poses, scratch = begun(guide, pose(0), WAIT)
+    outcome, _ = climb(guide, 0, 1, motions, poses, scratch, True)
+    assert outcome == SETTLED_ALL
+    assert motions[:7].tolist() == [WAIT] + [FORWARD] * 3 + [WAIT] * 3
+
+
 def test_a_way_is_rejoined_after_a_turn_is_undone(visit):
     """The base goes on in two cells; a left turn costs two steps, which come off its last waits."""
     base, led, scratch = begun(visit, pose(4), FORWARD)

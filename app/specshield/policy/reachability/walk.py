@@ -23,6 +23,7 @@ from specshield.policy.reachability.guide import (
 )
 from specshield.policy.reachability.tables import (
     HOPELESS,
+    SAFE,
     Guide,
     Scratch,
     goals_settled,
@@ -81,6 +82,10 @@ def climb(
                     best = m
             if scores[wait] > HOPELESS and scores[wait] > scores[best] - TIE:
                 waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - PHASE_END
+                ready = _readier(guide, t + n, x, y, theta, scratch) if waits_for_phase else -1
+                if ready >= 0:
+                    scores[ready] = SAFE
+                    continue
                 goal = _pays_to_wait(rules, t + n, x, y, theta, scratch)
                 if waits_for_phase or goal >= 0:
                     break
@@ -160,16 +165,37 @@ def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scra
     return True
 
 
+@leaf
+def _readier(guide: Guide, t: int, x: float, y: float, theta: float, scratch: Scratch) -> int:
+    """The motion from x_t after which each G that is still to begin holds by the most; -1 where that is no
+    more than here, or enough here.
+    """
+    chosen, deepest = -1, _readiness(guide.rules, t, x, y, theta, scratch) + DEPTH_GAIN
+    for m in range(scratch.scores.shape[0] if deepest < DEPTH_WANTED else 0):
+        nx, ny, nth = step(guide.body, x, y, theta, m)
+        ready = _readiness(guide.rules, t, nx, ny, nth, scratch)
+        ready = ready if not is_barred(guide.barred, x, y, theta, m) else -np.inf
+        if ready > deepest and _keeps(guide.rules, t + 1, nx, ny, nth, scratch):
+            chosen, deepest = m, ready
+    return chosen
+
+
+@inlined
+def _readiness(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> float:
+    least = np.inf
+    for k in range(rules.kind.shape[0]):
+        if rules.kind[k] == ALWAYS and rules.a[k] > t + 1:
+            least = min(least, predicate_at(rules, k, x, y, theta, scratch))
+    return least
+
+
 @inlined
 def _pays_to_wait(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> int:
     """A goal that holds here and whose window is still to open, or a dwell under way; -1 for none."""
     for k in range(rules.kind.shape[0]):
         useful = rules.kind[k] == EVENTUALLY_ALWAYS or (rules.kind[k] != ALWAYS and rules.a[k] > t)
-        if (
-            useful
-            and scratch.status[k] == PENDING
-            and predicate_at(rules, k, x, y, theta, scratch) > rules.margin
-        ):
+        useful = useful and scratch.status[k] == PENDING
+        if useful and predicate_at(rules, k, x, y, theta, scratch) > rules.margin:
             return k
     return -1
 
