@@ -72,9 +72,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
 
 
 def _from_now_on(part: Formula) -> Formula:
-    """A conjunct; for a G of a predicate that begins later, the one that begins at step 0. A predicate that
-    computes may have no value before.
-    """
+    """A conjunct; a G of a predicate from step 0 on, unless it computes: it may be no number before."""
     if isinstance(part, Always) and part.a > 1 and is_predicate(part.child) and not _computes(part):
         return Always(0, part.b, part.child)
     return part

@@ -79,7 +79,8 @@ class SessionRequest(_Policies):
         0,
         ge=0,
         le=1000,
-        description="Steps to keep in hand: each F of the conjunction is met so much earlier, if it can be.",
+        description="Steps to keep in hand: what each F or U wants is done so much before its window ends, "
+        "and what a G wants before it begins, if it can be.",
     )
     evaluation: Literal["feasibility", "robustness"] = Field(
         "feasibility",

@@ -16,9 +16,10 @@ import numpy as np
 from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.robot.dynamics import Body, in_collision, unhindered, wrap
+from specshield.rule.early import conjunction_of
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.uncertainty import CHANCE, Care, Noise, Uncertainty, margin_for
-from specshield.stl import Eventually, conjuncts
+from specshield.stl.tree import EVENTUALLY
 from specshield.task import Task, kept_with_task
 
 ASSUMED = Uncertainty()
@@ -119,9 +120,13 @@ def was_stopped(shield: Shield, carry: Carry, poses: Floats, halts: int = 0) -> 
 
 @kept_with_task
 def _measures(task: Task) -> tuple[float, int]:
-    """The longest move [m], and how many deadlines the formula has, both at least 1 where there is none."""
+    """The longest move [m], and how many deadlines the formula has, both at least 1 where there is none. What
+    is no F has one in each longest window, as a patrol does.
+    """
     longest = max((abs(move) for move, _ in task.robot.motions), default=0.0)
-    return longest or 1.0, max(sum(isinstance(part, Eventually) for part in conjuncts(task.formula)), 1)
+    parts = conjunction_of(task, task.formula)[1]
+    windows = (parts.b + parts.horizon) // np.maximum(2 * parts.half, 1) * (parts.half > 0)
+    return longest or 1.0, max(int(np.where(parts.kind == EVENTUALLY, 1, windows).sum()), 1)
 
 
 def remember(
