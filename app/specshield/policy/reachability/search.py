@@ -253,19 +253,8 @@ def _beam_out(
     while roots.shape[0] > 0:
         some, rest = roots[:few], roots[few:]
         way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
-        beam_search(
-            guide,
-            t + 1,
-            poses[some, 0],
-            starts.status[some],
-            starts.run[some],
-            share,
-            band,
-            np.inf,
-            scratch,
-            way,
-            taken,
-        )
+        here, status, run = poses[some, 0], starts.status[some], starts.run[some]
+        beam_search(guide, t + 1, here, status, run, share, band, np.inf, scratch, way, taken)
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:

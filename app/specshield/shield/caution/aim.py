@@ -2,7 +2,8 @@
 
 The margin is asked of the whole trajectory first. Where no future keeps it there, or where slack is asked for
 too, it is asked of what the formula still leaves open. Where both cannot be had, the slack is lowered first,
-to the most steps with which the margin can be had, or with which as much of it can be had as without slack.
+to the most steps with which the margin can be had, or with which as much of it can be had as without slack;
+and then that of the next deadline is raised again as far as can be.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ class Aimed(NamedTuple):
 
     margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
     than the session's settings ask for; what is asked for beside them is had where it can be. most [steps]:
-    no deadline is asked for more steps early than that.
+    no other deadline is asked for more steps early than that.
     """
 
     best: Best
@@ -61,35 +62,43 @@ def aim(
         prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried)
     still = Open(parts, np.empty(len(parts.kind), np.bool_), np.zeros(len(parts.kind), np.int64), prefix.t)
-    next_due, high = _ask(still, prefix.known, care.noise, care.stride, care.least, care.chance)
+    soonest, high = _ask(still, prefix.known, care.noise, care.stride, care.least, care.chance)
+    next_due = int(still.asked[soonest]) if soonest >= 0 else 0
 
-    def at(most: int) -> tuple[Best, bool]:
-        rows, robustness = np.empty(motions, np.int64), np.empty(motions)
-        highest = _best_open(still, most, leaves, whole, tried.motions, follows, margin, rows, robustness)
+    def at(most: int, first: int) -> tuple[Best, bool]:
+        early, rows, robustness = (
+            np.minimum(still.asked, most),
+            np.empty(motions, np.int64),
+            np.empty(motions),
+        )
+        if soonest >= 0:
+            early[soonest] = min(first, next_due)
+        highest = _best_open(still, early, leaves, whole, tried.motions, follows, margin, rows, robustness)
         return Best(robustness, rows), highest > margin
+
+    def most_had(best: Best, low: int, high: int, most: int | None = None) -> tuple[Best, int]:
+        while high - low > 1:
+            middle = (low + high) // 2
+            tighter, had = at(middle if most is None else most, middle)
+            best, low, high = (tighter, middle, high) if had else (best, low, middle)
+        return best, low
 
     motions = len(task.robot.motions)
     if before is not None:
         margin = min(margin, SATISFIED_ABOVE + before.margin)
-        best, _ = at(before.most)
+        best, _ = at(before.most, before.slack)
         return before._replace(best=best, kept=best.robustness > margin)
-    best, had = at(high)
+    best, had = at(high, high)
     if had:
         return Aimed(best, best.robustness > margin, care.margin, next_due, False, high)
-    low = 0  # slack `high` cannot be had
-    best, had = at(low)
+    best, had = at(0, 0)  # slack `high` cannot be had
     if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
         margin, high = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE), high + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        tighter, had = at(middle)
-        if had:
-            low, best = middle, tighter
-        else:
-            high = middle
+    best, low = most_had(best, 0, high)
+    best, first = most_had(best, min(low, next_due), next_due + 1, low)
     margin_had = margin - SATISFIED_ABOVE
     lowered = low < shield.config.slack or margin_had < shield.config.margin
-    return Aimed(best, best.robustness > margin, margin_had, min(low, next_due), lowered, low)
+    return Aimed(best, best.robustness > margin, margin_had, first, lowered, low)
 
 
 class Open(NamedTuple):
@@ -103,8 +112,8 @@ class Open(NamedTuple):
 
 @kernel
 def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chance: float) -> tuple[int, int]:
-    """Fills `now`, whose `asked` is 0. The steps at the deadline that is next, and the most at any. A window
-    keeps at least half its length.
+    """Fills `now`, whose `asked` is 0. The conjunct whose deadline is next, -1 for none, and the most steps
+    that any is asked for. A window keeps at least half its length.
     """
     parts, still, asked, t = now
     find_open(parts, known, t, still)
@@ -118,13 +127,13 @@ def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chan
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             if soonest < 0 or left < first:
                 soonest, first = k, left
-    return (asked[soonest] if soonest >= 0 else 0), (asked.max() if asked.size else 0)
+    return soonest, (asked.max() if asked.size else 0)
 
 
 @kernel
 def _best_open(
     now: Open,
-    most: int,
+    early: Ints,
     leaves: Floats,
     whole: Floats,
     motions: Ints,
@@ -139,7 +148,7 @@ def _best_open(
     be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
     """
     rho, stays = np.empty(whole.shape[0]), -1
-    rate_open(now.parts, now.still, now.t, np.minimum(now.asked, most), leaves, rho)
+    rate_open(now.parts, now.still, now.t, early, leaves, rho)
     rows[:] = -1
     robustness[:] = -np.inf
     for f in range(whole.shape[0]):
