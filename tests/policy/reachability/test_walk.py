@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,8 +15,8 @@ from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.policy.reachability.search import continue_all
 from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
-from specshield.robot.dynamics import motion_count
-from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, WAIT
+from specshield.robot.dynamics import motion_count, step
+from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
 from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, WEST, guide_of, make_corridor, pose
 
 
@@ -99,6 +101,18 @@ def test_a_climb_is_in_time_for_what_is_yet_to_begin():
     outcome, _ = climb(guide, 0, 1, motions, poses, scratch, True)
     assert outcome == SETTLED_ALL
     assert motions[:7].tolist() == [WAIT] + [FORWARD] * 3 + [WAIT] * 3
+
+
+def test_a_climb_waits_where_what_leads_deeper_is_cut_short():
+    """A wall leaves 1.5 cm of the move ahead, which counts for none."""
+    guide = guide_of(make_corridor("G[8,10] x > 1.0", robot=replace(ROBOT, on_contact="stop")))
+    end = step(guide.body, *pose(5), FORWARD)
+    here = np.array([end[0] - 0.015, *end[1:]])
+    assert step(guide.body, *here, FORWARD)[0] == pytest.approx(end[0], abs=1e-3)
+    motions, poses, scratch = begun(guide, here, WAIT)
+    outcome, _ = climb(guide, 0, 1, motions, poses, scratch, True)
+    assert outcome == SETTLED_ALL
+    assert FORWARD not in motions
 
 
 def test_a_way_is_rejoined_after_a_turn_is_undone(visit):

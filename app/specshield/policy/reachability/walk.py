@@ -74,7 +74,7 @@ def climb(
         elif n - high_n >= STUCK_AFTER:
             return STUCK, high_n
         phase = tables.phase[t + n + 1]
-        chosen, goal, waits_for_phase = -1, -1, False
+        chosen, goal, waits_for_phase, looked = -1, -1, False, False
         while True:
             best = wait
             for m in range(scores.shape[0]):
@@ -82,10 +82,11 @@ def climb(
                     best = m
             if scores[wait] > HOPELESS and scores[wait] > scores[best] - TIE:
                 waits_for_phase = phase < last_phase and scores[wait] >= tables.end[phase] - PHASE_END
-                ready = _readier(guide, t + n, x, y, theta, scratch) if waits_for_phase else -1
-                if ready >= 0:
-                    scores[ready] = SAFE
-                    continue
+                if waits_for_phase and not looked:
+                    ready, looked = _readier(guide, t + n, x, y, theta, scratch), True
+                    if ready >= 0:
+                        scores[ready] = SAFE
+                        continue
                 goal = _pays_to_wait(rules, t + n, x, y, theta, scratch)
                 if waits_for_phase or goal >= 0:
                     break
@@ -106,6 +107,7 @@ def climb(
             motions[n] = chosen
             poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
             n += 1
+            high_n = n if looked else high_n  # it has time, and is not stuck
             if goal >= 0:  # it is settled; where there is time, the robot goes deeper into it
                 spare = slack(guide, x, y, theta, t + n, scratch) - SPARE
                 n = _deepen(guide, t, n, goal, min(rules.b[goal], t + n + spare), motions, poses, scratch)
