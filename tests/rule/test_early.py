@@ -70,6 +70,8 @@ def left_open(formula, samples, t, early):
             > SATISFIED_ABOVE
         ):
             continue
+        if isinstance(part, Always) and isinstance(part.child, Always):
+            part = Always(part.a + part.child.a, part.b + part.child.b, part.child.child)
         if isinstance(part, Always):
             later = part.a > max(t, 1) and part.child.horizon == 0
             begins = part.a - min(early, part.a // 2) if later else min(t + 1 - part.child.horizon, part.b)

@@ -39,7 +39,7 @@ def decision(formula, *motions, **config):
         ("F[0,4] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),  # step 3 is the earliest, then
         ("F[0,4] A", [WAIT, WAIT], 0, [1, 0, 0, 1], False),
         ("F[0,4] A and F[2,4] x > 0", [FORWARD], 2, [1, 1, 1, 1], False),  # A is done with
-        ("F[2,2] A", [], 5, [1, 0, 0, 1], False),
+        ("F[2,2] A", [], 5, [1, 0, 0, 0], False),
         ("not G[0,4] not A", [WAIT], 2, [1, 0, 0, 0], False),
         ("x > 0 U[0,4] A", [], 2, [1, 0, 0, 1], False),  # an `until` has a deadline too
         ("x > 0 U[0,4] A", [WAIT], 2, [1, 0, 0, 0], False),
@@ -53,6 +53,9 @@ def decision(formula, *motions, **config):
         ("G[4,6] A", [WAIT], 2, [1, 0, 0, 0], False),  # what is yet to begin
         ("G[4,6] A", [WAIT], 0, [1, 1, 1, 1], False),
         ("G[4,6] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
+        ("F[4,4] A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("G[1,2] G[3,4] A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("G[4,6] abs(2 * x - 1) < 0.6", [WAIT], 2, [1, 0, 0, 0], False),
         ("G[4,6] 1 / (1 + x) < 0.8", [WAIT], 2, [1, 1, 1, 1], False),  # it may have no value before
         ("G[0,4] (x < 0.2 -> F[0,4] A)", [WAIT], 2, [1, 0, 0, 0], False),  # what is to follow something
         ("F[0,4] (x < 0.2 and F[0,4] A)", [WAIT] * 3, 2, [1, 0, 0, 1], False),  # one after the other
@@ -143,6 +146,14 @@ class Everything:
     def propose(self, history, signals, margin):
         rows = ways(self.task.horizon + 1 - len(history))
         return Proposal(rows, WAIT)
+
+
+def test_a_deadline_that_cannot_come_earlier_leaves_the_others_their_slack():
+    """Column 2 is closed until step 5, when the robot has to be there."""
+    cells = Cells("F[0,4] A and G[0,4] x < 0.4 and G[5,5] x > 0.4", None, {"A": (1, 0)})
+    found = decide(make_shield([Everything(cells)], Config(slack=2)), [cells.pose(0, 0, 0)], EVEN)
+    assert (found.slack, found.reason) == (2, "margin_unattainable")
+    assert list(found.j_values[:4]) == [1, 0, 0, 1]
 
 
 def tables(task):

@@ -16,8 +16,8 @@ from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.rule.residual import joined
 from specshield.rule.values import places
-from specshield.stl import SATISFIED_ABOVE, Always, Arithmetic, Eventually, Formula, Node, conjuncts
-from specshield.stl.conjunction import is_predicate
+from specshield.stl import SATISFIED_ABOVE, Always, Arithmetic, Eventually, Formula, Node, Number, conjuncts
+from specshield.stl.conjunction import flat, is_predicate
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, apply, bounds_at, compile_tree, slide, until
 from specshield.task import Task, kept_with_task
 
@@ -51,6 +51,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
     begin later, which it has from step 0 on.
     """
     above, slots = (formula,) if is_predicate(formula) else conjuncts(formula), places(task)  # as in the tree
+    above = tuple(flat(part) if isinstance(part, Always) else part for part in above)
     wide = [_from_now_on(part) for part in above]
     whole = formula if joined(wide) == formula else joined(wide)
     tree = compile_tree(whole, slots)
@@ -72,14 +73,18 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
 
 
 def _from_now_on(part: Formula) -> Formula:
-    """A conjunct; a G of a predicate from step 0 on, unless it computes: it may be no number before."""
-    if isinstance(part, Always) and part.a > 1 and is_predicate(part.child) and not _computes(part):
-        return Always(0, part.b, part.child)
-    return part
+    """A conjunct; a G, or F[a,a], of a predicate from step 0 on, unless that may be no number before."""
+    if not isinstance(part, (Always, Eventually)) or part.a <= 1 or not is_predicate(part.child):
+        return part
+    can = (isinstance(part, Always) or part.a == part.b) and not _may_fail(part.child)
+    return Always(0, part.b, part.child) if can else part
 
 
-def _computes(node: Node) -> bool:
-    return isinstance(node, Arithmetic) or any(map(_computes, node.parts))
+def _may_fail(node: Node) -> bool:
+    match node:
+        case Arithmetic("+" | "-") | Arithmetic("*", Number()) | Arithmetic("*" | "/", _, Number()):
+            return any(map(_may_fail, node.parts))
+    return isinstance(node, Arithmetic) or any(map(_may_fail, node.parts))
 
 
 def _is_plain(part: Formula) -> bool:

@@ -40,14 +40,6 @@ class Layer(NamedTuple):
     parent: Ints
 
 
-def flat(formula: Always) -> Always:
-    """A G whose child is a G, written as one G."""
-    while isinstance(formula.child, Always):
-        inner = formula.child
-        formula = Always(formula.a + inner.a, formula.b + inner.b, inner.child)
-    return formula
-
-
 def is_place(task: Task, formula: Always) -> bool:
     """Whether the robot's pose alone decides at each step if a G is kept, as in "never enter a place"."""
     return formula.child.horizon == 0 and any(name not in task.signals for name in formula.child.names)

@@ -17,12 +17,13 @@ from specshield.rule.residual import again, joined, left_over
 from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
-from specshield.shield.escape import escape, flat, is_place
+from specshield.shield.escape import escape, is_place
 from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, rho_of, simulated, together
 from specshield.shield.proposal import adapted, ask
 from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict, robustness
+from specshield.stl.conjunction import flat
 
 LESS = 4  # [steps] V has ways asked for with so much less slack, and in such strides with more. By hand.
 
@@ -102,7 +103,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
         # A threshold for the episode weighs ways with any slack, also with more than the first futures have.
         by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
-        most = aimed.slack or aimed.most
+        most = aimed.slack or int(aimed.early.max(initial=0))
         if (by_chance or (most > 0 and care.on_way)) and not violated and True in left.tolist():
             known, wanted, more = len(tried.rho), left | by_chance, [most]
             before: Aimed | None = aimed

@@ -38,6 +38,14 @@ def signed(formula: Formula, negated: bool) -> Formula:
     return Not(formula) if negated else formula
 
 
+def flat(formula: Always) -> Always:
+    """A G whose child is a G, written as one G."""
+    while isinstance(formula.child, Always):
+        inner = formula.child
+        formula = Always(formula.a + inner.a, formula.b + inner.b, inner.child)
+    return formula
+
+
 def is_predicate(node: Node) -> bool:
     """Whether `node` has no temporal operator."""
     return not isinstance(node, Windowed) and all(is_predicate(part) for part in node.parts)

@@ -169,14 +169,11 @@ def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scra
 
 @leaf
 def _readier(guide: Guide, t: int, x: float, y: float, theta: float, scratch: Scratch) -> int:
-    """The motion from x_t after which each G that is still to begin holds by the most; -1 where that is no
-    more than here, or enough here.
-    """
+    """The motion that leaves time, after which the next G to begin holds by the most; -1: here is enough."""
     chosen, deepest = -1, _readiness(guide.rules, t, x, y, theta, scratch) + DEPTH_GAIN
     for m in range(scratch.scores.shape[0] if deepest < DEPTH_WANTED else 0):
         nx, ny, nth = step(guide.body, x, y, theta, m)
-        ready = _readiness(guide.rules, t, nx, ny, nth, scratch)
-        ready = ready if not is_barred(guide.barred, x, y, theta, m) else -np.inf
+        ready = _readiness(guide.rules, t, nx, ny, nth, scratch) if scratch.scores[m] >= t + 1 else -np.inf
         if ready > deepest and _keeps(guide.rules, t + 1, nx, ny, nth, scratch):
             chosen, deepest = m, ready
     return chosen
@@ -184,10 +181,11 @@ def _readier(guide: Guide, t: int, x: float, y: float, theta: float, scratch: Sc
 
 @inlined
 def _readiness(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scratch) -> float:
-    least = np.inf
+    least, begins = np.inf, np.inf
     for k in range(rules.kind.shape[0]):
-        if rules.kind[k] == ALWAYS and rules.a[k] > t + 1:
-            least = min(least, predicate_at(rules, k, x, y, theta, scratch))
+        if rules.kind[k] == ALWAYS and t + 1 < rules.a[k] <= begins:
+            depth = predicate_at(rules, k, x, y, theta, scratch)
+            least, begins = min(least, depth) if rules.a[k] == begins else depth, float(rules.a[k])
     return least
 
 

@@ -3,7 +3,7 @@
 The margin is asked of the whole trajectory first. Where no future keeps it there, or where slack is asked for
 too, it is asked of what the formula still leaves open. Where both cannot be had, the slack is lowered first,
 to the most steps with which the margin can be had, or with which as much of it can be had as without slack;
-and then that of the next deadline is raised again as far as can be.
+and then raised again as far as can be, one deadline after the other.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
 from specshield.stl.tree import ALWAYS, EVENTUALLY
 
+NEVER = 1 << 40  # in place of a number of steps
+
 
 class Aimed(NamedTuple):
     """best: the best future of each motion. kept [M]: those that keep as much as can be had of what is asked.
 
     margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
-    than the session's settings ask for; what is asked for beside them is had where it can be. most [steps]:
-    no other deadline is asked for more steps early than that.
+    than the session's settings ask for; what is asked for beside them is had where it can be. early (K,)
+    [steps]: of each conjunct.
     """
 
     best: Best
@@ -35,7 +37,7 @@ class Aimed(NamedTuple):
     margin: float
     slack: int
     lowered: bool
-    most: int = 0
+    early: Ints = np.zeros(0, np.int64)
 
 
 def aim(
@@ -61,73 +63,66 @@ def aim(
     if formula is not prefix.formula:  # it is written as a plain conjunction, and may have other leaves
         prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried)
-    still = Open(parts, np.empty(len(parts.kind), np.bool_), np.zeros(len(parts.kind), np.int64), prefix.t)
-    soonest, high = _ask(still, prefix.known, care.noise, care.stride, care.least, care.chance)
-    next_due = int(still.asked[soonest]) if soonest >= 0 else 0
+    count, motions = len(parts.kind), len(task.robot.motions)
+    now = Open._make((parts, np.empty(count, np.bool_), *np.zeros((2, count), np.int64), prefix.t))
+    _ask(now, prefix.known, care.noise, care.stride, care.least, care.chance)
 
-    def at(most: int, first: int) -> tuple[Best, bool]:
-        early, rows, robustness = (
-            np.minimum(still.asked, most),
-            np.empty(motions, np.int64),
-            np.empty(motions),
-        )
-        if soonest >= 0:
-            early[soonest] = min(first, next_due)
-        highest = _best_open(still, early, leaves, whole, tried.motions, follows, margin, rows, robustness)
+    def at(early: Ints) -> tuple[Best, bool]:
+        rows, robustness = np.empty(motions, np.int64), np.empty(motions)
+        highest = _best_open(now, early, leaves, whole, tried.motions, follows, margin, rows, robustness)
         return Best(robustness, rows), highest > margin
 
-    def most_had(best: Best, low: int, high: int, most: int | None = None) -> tuple[Best, int]:
-        while high - low > 1:
-            middle = (low + high) // 2
-            tighter, had = at(middle if most is None else most, middle)
-            best, low, high = (tighter, middle, high) if had else (best, low, middle)
-        return best, low
-
-    motions = len(task.robot.motions)
     if before is not None:
         margin = min(margin, SATISFIED_ABOVE + before.margin)
-        best, _ = at(before.most, before.slack)
+        best, _ = at(before.early)
         return before._replace(best=best, kept=best.robustness > margin)
-    best, had = at(high, high)
-    if had:
-        return Aimed(best, best.robustness > margin, care.margin, next_due, False, high)
-    best, had = at(0, 0)  # slack `high` cannot be had
-    if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
-        margin, high = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE), high + 1
-    best, low = most_had(best, 0, high)
-    best, first = most_had(best, min(low, next_due), next_due + 1, low)
-    margin_had = margin - SATISFIED_ABOVE
-    lowered = low < shield.config.slack or margin_had < shield.config.margin
-    return Aimed(best, best.robustness > margin, margin_had, first, lowered, low)
+    early = now.asked
+    best, had = at(early)
+    if not had:
+        early = np.zeros(count, np.int64)
+        best, had = at(early)
+        if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
+            margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
+        for of in (early == 0, *(np.arange(count) == k for k in np.argsort(now.left, kind="stable"))):
+            low, high = int(early[of].max()), int(now.asked[of].max()) + 1
+            while high - low > 1:
+                middle = (low + high) // 2
+                more = np.where(of, np.minimum(now.asked, middle), early)
+                tighter, had = at(more)
+                best, early = (tighter, more) if had else (best, early)
+                low, high = (middle, high) if had else (low, middle)
+    margin_had, slack = margin - SATISFIED_ABOVE, int(early[np.argmin(now.left)])
+    less = (early < np.minimum(now.asked, shield.config.slack)).any()
+    lowered = bool(less or margin_had < shield.config.margin)
+    return Aimed(best, best.robustness > margin, margin_had, slack, lowered, early)
 
 
 class Open(NamedTuple):
-    """The conjuncts at step t: which are still open (K,), and how early each F is asked for (K,) [steps]."""
+    """The conjuncts at step t: which are still open (K,), how early each is asked for (K,), and in how many
+    steps it is due (K,), NEVER where it is not.
+    """
 
     parts: Conjuncts
     still: Bools
     asked: Ints
+    left: Ints
     t: int
 
 
 @kernel
-def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chance: float) -> tuple[int, int]:
-    """Fills `now`, whose `asked` is 0. The conjunct whose deadline is next, -1 for none, and the most steps
-    that any is asked for. A window keeps at least half its length.
-    """
-    parts, still, asked, t = now
+def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chance: float) -> None:
+    """Fills `now`, whose `asked` is 0. A window keeps at least half its length."""
+    parts, still, asked, due, t = now
     find_open(parts, known, t, still)
-    soonest, first = -1, 0
     for k in range(still.shape[0]):
         half, begun = parts.half[k], parts.plain[k] and parts.kind[k] == ALWAYS and parts.a[k] <= t
+        due[k] = NEVER
         if still[k] and half > 0 and not begun:
             left = parts.b[k] + parts.horizon[k] - t
             if parts.kind[k] != EVENTUALLY:  # the first that its child is asked for
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
-            if soonest < 0 or left < first:
-                soonest, first = k, left
-    return soonest, (asked.max() if asked.size else 0)
+            due[k] = left
 
 
 @kernel
