@@ -174,17 +174,17 @@ class _Motion:
                 "would have to stop the robot in time"
             )
         judged, own = self.judged, self.judged.tried.motions[:, 0] == self.motion
-        if judged.tried.rho[own].max(initial=0.0) > SATISFIED_ABOVE >= judged.kept[own].max(initial=0.0):
+        found = judged.tried.rho[own].max(initial=0.0) > SATISFIED_ABOVE
+        if found and judged.kept[own].max(initial=0.0) <= SATISFIED_ABOVE:
             return (
                 f"the rule could still be kept, but every way that was found leads closer than {ROOM:g} m to "
                 "an obstacle, where a robot that cannot drive backwards may get stuck"
             )
-        told = "a way is known that keeps the rule, but the policies did not find it"
-        margin, slack = judged.margin, judged.slack
-        if not margin and not slack:
-            return told
+        if not found:
+            return "a way is known that keeps the rule, but the policies did not find it"
         return (
-            f"{told}, or it leaves less to spare than the session asks for ({margin:.2g} m, {steps(slack)})"
+            "the rule could still be kept, but no way that was found leaves as much to spare as the session "
+            f"asks for ({judged.margin:.2g} m, and {steps(judged.slack)} at the next deadline)"
         )
 
     def futures(self) -> Iterator[tuple[int, Ints]]:
