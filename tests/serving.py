@@ -111,6 +111,14 @@ def children(pid: int) -> list[int]:
     return [child.pid for child in psutil.Process(pid).children()]
 
 
+def runs(pid: int) -> bool:
+    """Whether a process is there, and is no zombie."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
 def command_line(pid: int) -> str:
     """What it was begun with, as one line. Empty where it has ended."""
     with contextlib.suppress(psutil.NoSuchProcess):

@@ -6,10 +6,10 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import httpx
 import numpy as np
+import psutil
 import pytest
 import redis
 
@@ -18,7 +18,7 @@ from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Change, Record, Store, keys
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import children, serving, wait_for
+from tests.serving import children, runs, serving, wait_for
 
 
 def begin(client, **options):
@@ -40,15 +40,7 @@ def store_pid(data_dir):
 
 
 def keeper_pid(data_dir):
-    return int(Path(f"/proc/{store_pid(data_dir)}/stat").read_text().split()[3])
-
-
-def runs(pid):
-    """Whether a process is there, and is no zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+    return psutil.Process(store_pid(data_dir)).ppid()
 
 
 def test_what_was_acknowledged_survives_the_kill_of_store_and_server(tmp_path):

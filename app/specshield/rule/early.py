@@ -29,8 +29,8 @@ class Conjuncts(NamedTuple):
 
     below: the tree without the F or G at the top of each conjunct, and the `and`. kind [K]: what that is;
     OTHER: none, all is in `below`. at [K]: where in the buffer values begin that it ranges over. a, b [K]:
-    its window. horizon [K]: of what is below. half [K]: of the longest window of an F or U in it [steps], or
-    of the time until a G begins, whose values are in the buffer from step 0 on.
+    its window [steps]. horizon [K]: of what is below [steps]. half [K]: half of the longest window of an F or
+    U in it [steps]; of a G whose values are in the buffer from step 0 on, half of the time until it begins.
     plain [K]: whether what is below is a predicate, or under F a G of one. owner [n]: each node's conjunct.
     """
 
@@ -103,8 +103,8 @@ def find_open(parts: Conjuncts, known: Floats, t: int, still: Bools) -> None:
 
 @kernel
 def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Floats, rho: Floats) -> None:
-    """rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before its end,
-    though a window keeps at least half its length.
+    """rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before its end
+    and each G that is to begin kept so many steps before, though a window keeps at least half its length.
 
     leaves (N, size): the leaves along N trajectories. Where nothing is open, rho is that of the whole.
     """
@@ -128,7 +128,7 @@ def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Float
 
 @leaf
 def _apply_early(tree: Tree, n: int, t: int, early: int, buffer: Floats, scratch: Floats) -> None:
-    """Applies node n below the conjuncts. scratch (size,): for a copy."""
+    """Applies node n below the conjuncts as `rate_open` says. buffer, scratch (size,): both overwritten."""
     op, at, count, a, b = tree.op[n], tree.at[n], tree.length[n], tree.a[n], tree.b[n]
     sooner, past = min(early, (b - a) // 2), t - tree.start[n]
     if op == UNTIL:

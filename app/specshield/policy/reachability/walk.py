@@ -169,7 +169,7 @@ def _keeps(rules: Rules, t: int, x: float, y: float, theta: float, scratch: Scra
 
 @leaf
 def _readier(guide: Guide, t: int, x: float, y: float, theta: float, scratch: Scratch) -> int:
-    """The motion that leaves time, after which the next G to begin holds by the most; -1: here is enough."""
+    """The motion after which the next G to begin holds by the most, if there is time for it; -1 to stay."""
     chosen, deepest = -1, _readiness(guide.rules, t, x, y, theta, scratch) + DEPTH_GAIN
     for m in range(scratch.scores.shape[0] if deepest < DEPTH_WANTED else 0):
         nx, ny, nth = step(guide.body, x, y, theta, m)

@@ -60,7 +60,7 @@ def aim(
     task, margin = shield.task, SATISFIED_ABOVE + care.margin
     own = prefix.formula is task.formula
     formula, parts = shield.conjunction if own else conjunction_of(task, prefix.formula)
-    if formula is not prefix.formula:  # it is written as a plain conjunction, and may have other leaves
+    if formula is not prefix.formula:  # the conjuncts read the leaves of another
         prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried)
     count, motions = len(parts.kind), len(task.robot.motions)
@@ -83,7 +83,7 @@ def aim(
         best, had = at(early)
         if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
             margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
-        for of in (early == 0, *(np.arange(count) == k for k in np.argsort(now.left, kind="stable"))):
+        for of in (early == 0, *(np.arange(count) == k for k in np.argsort(now.due, kind="stable"))):
             low, high = int(early[of].max()), int(now.asked[of].max()) + 1
             while high - low > 1:
                 middle = (low + high) // 2
@@ -91,7 +91,7 @@ def aim(
                 tighter, had = at(more)
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
-    margin_had, slack = margin - SATISFIED_ABOVE, int(early[np.argmin(now.left)])
+    margin_had, slack = margin - SATISFIED_ABOVE, int(early[np.argmin(now.due)])
     less = (early < np.minimum(now.asked, shield.config.slack)).any()
     lowered = bool(less or margin_had < shield.config.margin)
     return Aimed(best, best.robustness > margin, margin_had, slack, lowered, early)
@@ -105,13 +105,13 @@ class Open(NamedTuple):
     parts: Conjuncts
     still: Bools
     asked: Ints
-    left: Ints
+    due: Ints
     t: int
 
 
 @kernel
 def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chance: float) -> None:
-    """Fills `now`, whose `asked` is 0. A window keeps at least half its length."""
+    """Fills in `still`, `asked` and `due` of `now`, whose `asked` is 0. A window keeps half its length."""
     parts, still, asked, due, t = now
     find_open(parts, known, t, still)
     for k in range(still.shape[0]):
