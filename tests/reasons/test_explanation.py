@@ -9,7 +9,7 @@ import pytest
 from specshield.reasons.explanation import explanations
 from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
-from tests.oracles.cells import MOTIONS, WAIT, Exhaustive, Scripted
+from tests.oracles.cells import MOTIONS, WAIT, Cells, Exhaustive, Scripted
 from tests.reasons.rules_on_cells import dwells, until, visits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (2, 2)}
@@ -174,3 +174,23 @@ def test_a_way_that_the_policies_missed_is_not_denied(motion):
     assert decision.j_values[motion] == 0.0
     assert why.robustness > 0.0
     assert why.detail == "a way is known that keeps the rule, but the policies did not find it"
+
+
+def test_where_slack_is_lacking_the_conjunct_is_named_that_lacks_it_however_deep_its_window_is():
+    def keeps(inside):
+        early, late = inside["A"][..., :3].any(axis=-1), inside["C"].any(axis=-1)
+        answered = [~inside["A"][..., t] | inside["B"][..., t : t + 5].any(axis=-1) for t in range(3)]
+        return early & np.all(answered, axis=0) & ~late
+
+    visit, answer, lacking = "F[0,2] A", "G[0,2] (A -> F[0,4] B)", {}
+    places = {"A": (2, 0), "B": (2, 2), "C": (3, 0)}
+    cells = Cells(f"G[0,6] not C and {visit} and {answer}", keeps, places)
+    for state in np.ndindex(3, 2, 4):
+        poses = [cells.pose(*state)]
+        shield = make_shield([Exhaustive(cells)], Config(slack=1))
+        decision, (motions, kept) = decide(shield, poses, EVEN, explain=explanations), cells.futures(poses)
+        for motion, why in enumerate(decision.explanations[:MOTIONS]):
+            if why is not None and kept[motions[:, 0] == motion].any():
+                lacking[why.conjunct] = lacking.get(why.conjunct, 0) + 1
+                assert why.robustness > 0.0
+    assert set(lacking) == {visit, answer}, lacking

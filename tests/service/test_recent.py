@@ -52,8 +52,8 @@ def test_a_session_of_a_large_rule_takes_the_place_of_many(large):
 
 
 async def _held(many):
-    """The ids of the sessions in memory. A thread lets go of a session a moment after it has answered, so this
-    waits until no more than so many are left; it gives up after 10 s.
+    """The ids of the sessions in memory. A thread lets go of a session a moment after it has answered, so
+    this waits until no more than so many are left; it gives up after 10 s.
     """
     for _ in range(200):
         gc.collect()

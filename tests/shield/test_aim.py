@@ -131,7 +131,7 @@ def test_what_a_nested_rule_still_asks():
     cells = Cells("G[0,10] F[0,6] x > 0.1 and G[0,9] x > -1", None, {})
     history = np.array([cells.pose(0, 0, 0)] * 9)
     task = cells.task
-    left = still_open(task, task.formula, history, np.empty((9, 0)), 0)
+    left = still_open(task, task.formula, history, np.empty((9, 0)))
     assert str(left) == "G[3,10] F[0,6] x > 0.1 and G[9,9] x > -1"
 
 

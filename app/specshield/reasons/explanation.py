@@ -14,22 +14,20 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
-from specshield.reasons.lateness import in_words, late_by, samples_of, steps, values_of
-from specshield.reasons.still_open import still_open
+from specshield.reasons.lateness import driven, in_words, late_by, later, steps, values_of, when
 from specshield.robot.dynamics import motion_count, step
 from specshield.robot.room import ROOM
+from specshield.rule.early import conjunction_of, find_open, rate_open
 from specshield.rule.residual import again, left_over
 from specshield.shield.decision import Explanation, Shield
-from specshield.shield.feasibility import Prefix
+from specshield.shield.feasibility import Prefix, rho_of
 from specshield.shield.judgement import Judged
 from specshield.shield.proposal import ask
-from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Until
-from specshield.stl.conjunction import is_predicate
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
 # Chosen by hand; an explanation costs some 10 ms.
 DEPTH = 2  # motions after which a witness is met again
@@ -37,14 +35,7 @@ EARLIER = (1, 2, 4, 8, 16, 32)  # steps by which the proposers' clock is put bac
 SAME = 1e-6  # [m] and [rad]: poses this near are one pose
 
 Rank = tuple[int, float]
-KEEPS_ALL, KEPT, LATE, BROKEN, SEVERAL, NOTHING = range(6)  # what a future shows, the most telling first
-
-
-class _Part(NamedTuple):
-    """A conjunct as the formula has it, and what J asks for in its place."""
-
-    conjunct: Formula
-    asked: Formula
+KEPT, KEEPS_ALL, LATE, BROKEN, SEVERAL, NOTHING = range(6)  # what a future shows, the most telling first
 
 
 def explanations(
@@ -76,17 +67,19 @@ class _Motion:
     doubtful: bool
 
     def explained(self) -> Explanation:
-        """By its most telling future: one that keeps all conjuncts; else all but one, the least late or else
-        the most robust; else the one that comes nearest to keeping all, and the conjunct that it keeps least.
+        """By its most telling future: one that keeps all conjuncts, first of all one that does not as J asks;
+        else all but one, the least late or else the most robust; else the one that comes nearest to keeping
+        all, and the conjunct that it keeps least.
         """
         parts = self.parts()
-        best, rank = Explanation(str(parts[0].conjunct), -math.inf, None), (NOTHING, math.inf)
+        best, rank = Explanation(str(parts[0]), -math.inf, None), (NOTHING, math.inf)
         for earlier, rows in self.futures():
             if rank[0] == KEEPS_ALL or (rank[0] in (KEPT, LATE) and rank[1] <= earlier):
                 break  # what comes now is as late or later
-            samples = samples_of(self.shield, self.prefix.poses, self.prefix.foreseen, rows)
-            rho = np.array([values_of(part.conjunct, samples) for part in parts])  # [parts, rows]
-            asked = np.array([values_of(part.asked, samples) for part in parts])
+            poses = driven(self.shield, self.prefix.poses, rows)
+            samples = self.shield.task.samples(poses, self.prefix.foreseen)
+            rho = np.array([values_of(part, samples) for part in parts])  # [parts, rows]
+            asked = self.asked(parts, rho, poses)
             for n in range(len(rows)):
                 row = {name: values[n] for name, values in samples.items()}
                 order, told = self.shows(parts, rho[:, n], asked[:, n], row)
@@ -94,51 +87,59 @@ class _Motion:
                     best, rank = told, order
         return best
 
-    def parts(self) -> list[_Part]:
+    def parts(self) -> list[Formula]:
         """The conjuncts that can still be kept, and the broken G that are enforced again."""
-        prefix, slack = self.prefix, self.judged.slack
+        prefix = self.prefix
         samples = prefix.task.samples(prefix.poses, prefix.signals)
         kept, broken = left_over(prefix.formula, samples, prefix.t)
-        parts = [
-            _Part(each, still_open(prefix.task, each, prefix.poses, prefix.rows, slack) if slack else each)
-            for each in kept
-        ]
-        parts += [_Part(each, each) for lost in broken for each in again([lost], prefix.t + 1)]
-        return parts or [_Part(prefix.formula, prefix.formula)]
+        return [*kept, *again(broken, prefix.t + 1)] or [prefix.formula]
+
+    def asked(self, parts: Sequence[Formula], rho: Floats, poses: Floats) -> Floats:
+        """What J is made of: rho [parts, n], or with slack what is asked of each conjunct that is open in its
+        place. poses [n, t + 1 + m, 3]: along which rho is.
+        """
+        part, early, t, asked = self.judged.part, self.judged.aimed.early, self.prefix.t, rho.copy()
+        if early.any():
+            whole, joint = conjunction_of(part.task, part.formula)
+            seen, still = part.of(whole), np.empty(len(early), np.bool_)
+            _, leaves = rho_of(seen, np.ascontiguousarray(poses[:, t + 1 :]))
+            find_open(joint, seen.known, t, still)
+            for k, each in enumerate(conjuncts(part.formula)):
+                if still[k] and each in parts:
+                    only = np.arange(len(still)) == k
+                    rate_open(joint, only, t, early, leaves, asked[parts.index(each)])
+        return asked
 
     def shows(
-        self, parts: Sequence[_Part], rho: Floats, asked: Floats, row: dict[str, Floats]
+        self, parts: Sequence[Formula], rho: Floats, asked: Floats, row: dict[str, Floats]
     ) -> tuple[Rank, Explanation]:
-        """What a future shows, and how telling that is. rho, asked [parts]: of the conjuncts, and of what J
-        asks for; row {name: [m]}: what the formula reads along it.
+        """What a future shows, and how telling that is. rho, asked [parts]: of the conjuncts, and what J is
+        made of; row {name: [m]}: what the formula reads along it.
         """
-        above, now = SATISFIED_ABOVE + self.judged.margin, self.prefix.t
         failing = np.flatnonzero(rho <= SATISFIED_ABOVE)
         if not len(failing):
-            i, lacking = int(np.argmin(asked)), bool((asked <= above).any()) and not self.doubtful
-            late = late_by(parts[i].asked, row, now, above) if lacking else None
-            order = (KEPT, math.inf if late is None else late) if lacking else (KEEPS_ALL, 0.0)
-            detail = self.holds_back(parts[i], late) if lacking else self.known()
-            return order, Explanation(str(parts[i].conjunct), float(rho[i]), late, detail)
+            i = int(np.argmin(asked))
+            whole = self.doubtful or asked[i] > SATISFIED_ABOVE + self.judged.aimed.margin
+            known = None, self.known(self.judged.aimed.slack)
+            late, detail = known if whole else self.lacks(parts[i], row)
+            order = (KEEPS_ALL if whole else KEPT), late or 0
+            return order, Explanation(str(parts[i]), float(rho[i]), late, detail)
         i = int(np.argmin(rho))
-        conjunct = parts[i].conjunct
-        late = late_by(conjunct, row, now, SATISFIED_ABOVE) if len(failing) == 1 else None
-        told = Explanation(str(conjunct), float(rho[i]), late, self.fails(parts, i, rho, row, late))
+        late = late_by(parts[i], row, self.prefix.t, SATISFIED_ABOVE) if len(failing) == 1 else None
+        told = Explanation(str(parts[i]), float(rho[i]), late, self.fails(parts, i, rho, row, late))
         if late is not None:
             return (LATE, late), told
         return (BROKEN if len(failing) == 1 else SEVERAL, -told.robustness), told
 
     def fails(
-        self, parts: Sequence[_Part], i: int, rho: Floats, row: dict[str, Floats], late: int | None
+        self, parts: Sequence[Formula], i: int, rho: Floats, row: dict[str, Floats], late: int | None
     ) -> str | None:
         """How conjunct i fails on a future, and what becomes of the others; None where `late` and the
         robustness say it all. rho [parts], row: as in `shows`.
         """
-        conjunct, task = parts[i].conjunct, self.prefix.task
+        conjunct, task = parts[i], self.prefix.task
         words = in_words(conjunct, row, self.prefix.t, late)
-        others = [
-            f"'{part.conjunct}'" for n, part in enumerate(parts) if n != i and rho[n] <= SATISFIED_ABOVE
-        ]
+        others = [f"'{part}'" for n, part in enumerate(parts) if n != i and rho[n] <= SATISFIED_ABOVE]
         unit = " m" if set(conjunct.names) <= {"x", "y", *task.areas} else ""
         missed = f"it misses it by {abs(rho[i]):.3g}{unit}"
         if words is None:
@@ -152,22 +153,27 @@ class _Motion:
             return f"{words}, and it does not keep {' and '.join(others)} either"
         return f"{words}, while the rest of the rule is kept" if len(parts) > 1 else words
 
-    def holds_back(self, part: _Part, late: int | None) -> str | None:
-        """What is asked of a conjunct that could be kept, and is not met as soon as that."""
-        asked, slack = part.asked, self.judged.slack
-        whole = (Eventually, Until)
-        if late is None or not slack or not (isinstance(asked, whole) and isinstance(part.conjunct, whole)):
-            return None
-        goal = asked.child if isinstance(asked, Eventually) else asked.right
-        does = "is met" if is_predicate(goal) else "begins"
-        return (
-            f"a way was found after it that keeps the rule, but none with the {steps(slack)} in reserve that "
-            f"the session asks for: on the best one '{goal}' {does} at step {asked.b + late}; the rule needs "
-            f"that by step {part.conjunct.b}, and with the reserve by step {asked.b}"
-        )
+    def lacks(self, part: Formula, row: dict[str, Floats]) -> tuple[int | None, str]:
+        """Of a conjunct that is kept along `row`, but not as J asks: how many steps late it is for that, None
+        where steps are no measure of it; and what is lacking, in words.
+        """
+        aimed, above = self.judged.aimed, SATISFIED_ABOVE + self.judged.aimed.margin
+        reserves = zip(conjuncts(self.judged.part.formula), aimed.early.tolist(), strict=False)
+        reserve = dict(reserves).get(part, 0)
+        asked = later(part, -reserve) if reserve else None
+        if asked is not None and float(values_of(asked, row)) <= above:  # it is not a window deeper in it
+            late = late_by(asked, row, self.prefix.t, above)
+            if late is not None:
+                return late, (
+                    f"a way was found after it that keeps the rule, but none with the {steps(reserve)} in "
+                    f"reserve that the session asks for: on the best one {when(asked, late)} for that"
+                )
+        return None, self.known(reserve)
 
-    def known(self) -> str:
-        """Why a motion is forbidden of which a future is known that keeps all that is asked."""
+    def known(self, reserve: int) -> str:
+        """Why a motion is forbidden of which a future is known that keeps the rule. reserve [steps]: what is
+        asked for in hand.
+        """
         if self.doubtful:
             return (
                 "the rule could still be kept, but only by what led nowhere before, or by an obstacle that "
@@ -184,7 +190,7 @@ class _Motion:
             return "a way is known that keeps the rule, but the policies did not find it"
         return (
             "the rule could still be kept, but no way that was found leaves as much to spare as the session "
-            f"asks for ({judged.margin:.2g} m, and {steps(judged.slack)} at the next deadline)"
+            f"asks for ({judged.aimed.margin:.2g} m, and {steps(reserve)} at the next deadline)"
         )
 
     def futures(self) -> Iterator[tuple[int, Ints]]:
@@ -215,7 +221,7 @@ class _Motion:
     def rejoined(self, x_next: Floats) -> dict[int, list[Ints]]:
         """Goes on by another action's witness from where that is met again: ways by the steps they lose."""
         shield, tried, found = self.shield, self.judged.tried, dict[int, list[Ints]]()
-        x_t, rows = self.prefix.poses[-1:], self.judged.best.row[self.judged.feasible_motion].tolist()
+        x_t, rows = self.prefix.poses[-1:], self.judged.aimed.best.row[self.judged.feasible_motion].tolist()
         ways = [(tried.motions[row], np.concatenate([x_t, tried.poses[row]])) for row in rows]
         front = [(x_next, [self.motion])]
         for depth in range(DEPTH + 1 if ways else 0):

@@ -17,15 +17,13 @@ from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Implies
 from specshield.stl.conjunction import is_predicate
 
 
-def samples_of(
-    shield: Shield, history: Floats, signals: Mapping[str, Floats], motions: Ints
-) -> dict[str, Floats]:
-    """What the formula reads along x_0..x_t and each row of motions [n, m]: {name: [n, t + 1 + m]}."""
+def driven(shield: Shield, history: Floats, motions: Ints) -> Floats:
+    """The poses [n, t + 1 + m, 3] of x_0..x_t and of each row of motions [n, m]."""
     poses = np.empty((len(motions), len(history) + motions.shape[1], 3))
     poses[:, : len(history)] = history
     for row, joined in zip(motions, poses, strict=True):
         simulate(shield.body, history[-1], np.ascontiguousarray(row, np.int64), joined[len(history) :])
-    return shield.task.samples(poses, signals)
+    return poses
 
 
 def values_of(formula: Formula, samples: Mapping[str, Floats]) -> Floats:

@@ -17,7 +17,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.reasons.course import Course, course
 from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known
-from specshield.reasons.lateness import late_by, later, may_be_late, samples_of, values_of
+from specshield.reasons.lateness import driven, late_by, later, may_be_late, values_of
 from specshield.reasons.needs import Alternatives, Need, Reader
 from specshield.reasons.search import Wanted, search
 from specshield.robot.dynamics import calmest_motion
@@ -79,7 +79,10 @@ def way(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Ints 
     ground = make_ground(shield.task, shield.body, known.held)
     needed = Reader(known.now, known.constant).alternatives(formula)
     for found in _found(shield, known, ground, needed, ()):
-        if float(values_of(formula, samples_of(shield, history, signals, found))[0]) > SATISFIED_ABOVE:
+        if (
+            float(values_of(formula, shield.task.samples(driven(shield, history, found), signals))[0])
+            > SATISFIED_ABOVE
+        ):
             return np.asarray(found[0])
     return None
 
@@ -112,7 +115,9 @@ class _Gathered:
 
     def judge(self, motions: Ints) -> None:
         """motions [n, m]: from x_t to the horizon, or to some steps after it."""
-        samples = samples_of(self.shield, self.known.history, self.known.signals, motions)
+        samples = self.shield.task.samples(
+            driven(self.shield, self.known.history, motions), self.known.signals
+        )
         rows = [{name: values[n] for name, values in samples.items()} for n in range(len(motions))]
         rho = np.array([values_of(part, samples) for part in self.parts])
         keeps = np.flatnonzero((rho > SATISFIED_ABOVE).all(axis=0))

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from specshield.arrays import Floats
 from specshield.rule.residual import joined
 from specshield.rule.view import look, view_of
-from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, Until, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 from specshield.task import Task
 
 
-def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats, slack: int) -> Formula:
-    """What x_{0:t} leaves open of the formula, with each F and U of the conjunction met `slack` steps early.
+def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats) -> Formula:
+    """What x_{0:t} leaves open of the formula; the formula itself where nothing is open.
 
     poses [t + 1, 3], rows [t + 1, S]: the signals. A G is asked from the first step on at which its child is
-    open. A window keeps half its length or more. Where nothing is open the result is the formula itself.
+    open.
     """
     t, kept = len(poses) - 1, list[Formula]()
     for conjunct in conjuncts(formula):
@@ -26,8 +24,6 @@ def still_open(task: Task, formula: Formula, poses: Floats, rows: Floats, slack:
         match conjunct:
             case Always(a, b, child):
                 kept.append(Always(max(a, min(t + 1 - child.horizon, b)), b, child))
-            case Eventually(a, b) | Until(a, b):
-                kept.append(replace(conjunct, b=b - min(slack, (b - a) // 2)))
             case _:
                 kept.append(conjunct)
     return joined(kept) if kept else formula

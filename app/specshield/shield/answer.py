@@ -38,7 +38,7 @@ def answer_of(
     """
     terminal = shield.task.robot.terminal
     any_feasible = judged.some
-    said: Reason | None = "margin_unattainable" if judged.margin_unattainable else None
+    said: Reason | None = "margin_unattainable" if judged.aimed.lowered else None
     certified = np.zeros(len(terminal))
     certified[judged.completion] = 1.0
     conditional, ending = (None, 0.0) if log_prior is None else shaping.going_on(log_prior, terminal)

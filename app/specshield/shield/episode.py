@@ -186,7 +186,7 @@ def decide(
         left = next_left(left, chance, answer.distribution, robot.terminal)
     elif shield.config.threshold_over == "episode":
         left = left_of(shield, carry, None)
-    margin, slack = (care.margin, care.least) if judged is None else (judged.margin, judged.slack)
+    margin, slack = (care.margin, care.least) if judged is None else (judged.aimed.margin, judged.aimed.slack)
     remembered = None
     if seen is not None:
         follows = shield.config.learn_map and taught.followed.surely

@@ -173,12 +173,10 @@ def together(tried: Futures, more: Futures) -> Futures:
     )
 
 
-def rho_of(prefix: Prefix, tried: Futures) -> tuple[Floats, Floats]:
-    """The robustness (N,) of each future by another formula than it was tried with, a part of it, and the
-    leaves (N, size) of that formula.
-    """
-    values, leaves = np.empty(len(tried.motions)), np.empty((len(tried.motions), prefix.view.tree.size))
-    rate(prefix.view, prefix.known, prefix.t, tried.poses, prefix.held, values, leaves)
+def rho_of(prefix: Prefix, poses: Floats) -> tuple[Floats, Floats]:
+    """The robustness (N,) of futures, poses [N, T - t, 3], by another formula, and its leaves (N, size)."""
+    values, leaves = np.empty(len(poses)), np.empty((len(poses), prefix.view.tree.size))
+    rate(prefix.view, prefix.known, prefix.t, poses, prefix.held, values, leaves)
     return np.where(np.isnan(values), -np.inf, values), leaves
 
 

@@ -18,7 +18,7 @@ from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
 from specshield.shield.escape import escape, is_place
-from specshield.shield.feasibility import Best, Futures, Prefix, best_of, futures, rho_of, simulated, together
+from specshield.shield.feasibility import Futures, Prefix, best_of, futures, rho_of, simulated, together
 from specshield.shield.proposal import adapted, ask
 from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
@@ -47,15 +47,12 @@ class Judged(NamedTuple):
     tried: Futures
     part: Prefix  # as what can still be kept sees it
     kept: Floats  # [N], rho of that along each future; -inf where it is set aside
-    best: Best
+    aimed: Aimed  # how much can be had of what is asked for
     feasible_motion: Bools  # [M]
     feasible: Bools  # [A], S_t; false for a terminal action
     values: Floats  # [A], J if real-valued: rho of what can still be kept; -inf where nothing was evaluated
     robustness: Floats  # [A], rho of the whole formula along the same trajectories; -inf likewise
     completion: int
-    margin: float  # [m] and
-    slack: int  # [steps]: how much of what was asked for can be had
-    margin_unattainable: bool  # it is less
     vain: bool  # whether no future keeps the rule without what led nowhere before
     left_out: Bools  # [M]: only futures with that keep the rule, and others without it do
 
@@ -78,7 +75,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
     kept, leaves, part, vain = tried.rho, tried.leaves, prefix, False
     if violated:
         tried, part = _left(shield, prefix, tried)
-        kept, leaves = rho_of(part, tried)
+        kept, leaves = rho_of(part, tried.poses)
     best, left_out = best_of(tried, kept, motions), np.zeros(motions, np.bool_)
     if care.barred is not None:
         others = _aside(shield, care.barred, prefix, tried, kept)
@@ -129,8 +126,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         first = int(np.argmax(np.where(feasible, best.robustness, -np.inf)))
     completion = int(robot.representative[first])
     by_action = _by_action(robot.motion_of, feasible, values, best.row, tried.rho)
-    asked_and_had = aimed.margin, aimed.slack, aimed.lowered
-    return Judged(tried, part, kept, best, feasible, *by_action, completion, *asked_and_had, vain, left_out)
+    return Judged(tried, part, kept, aimed, feasible, *by_action, completion, vain, left_out)
 
 
 def _aside(shield: Shield, barred: Floats, prefix: Prefix, tried: Futures, kept: Floats) -> Floats:
@@ -182,14 +178,13 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
             rho = np.where(keeps.row >= 0, judged.tried.rho[keeps.row], -np.inf)
             robustness = np.append(rho, -np.inf)[robot.motion_of]
             less = shield.config.margin > 0.0 or shield.config.slack > 0
-            judged = judged._replace(
-                best=keeps, robustness=robustness, margin=0.0, slack=0, margin_unattainable=less
-            )
+            judged = judged._replace(aimed=Aimed(keeps, sure, 0.0, 0, less), robustness=robustness)
     if not sure.any() or np.array_equal(sure, judged.feasible_motion):
         return judged
     completion = judged.completion
     if not sure[robot.motion_of[completion]]:
-        completion = int(robot.representative[np.argmax(np.where(sure, judged.best.robustness, -np.inf))])
+        most = np.where(sure, judged.aimed.best.robustness, -np.inf)
+        completion = int(robot.representative[np.argmax(most)])
     feasible = (robot.motion_of >= 0) & sure[robot.motion_of]
     return judged._replace(feasible_motion=sure, feasible=feasible, completion=completion)
 
@@ -255,7 +250,7 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
     part = prefix
     for parts in filter(None, options()):
         part = prefix.of(joined(parts))
-        if rho_of(part, tried)[0].max() > SATISFIED_ABOVE:
+        if rho_of(part, tried.poses)[0].max() > SATISFIED_ABOVE:
             break
     return tried, part
 
@@ -285,7 +280,7 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
         return (None,) * len(shield.task.robot.motions)
     motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()
     rows, n = np.empty((len(feasible), motions.shape[1] - 1), np.uint8), motions.shape[1] - 1
-    _take_rests(motions, judged.best.row, rows)
+    _take_rests(motions, judged.aimed.best.row, rows)
     content = rows.tobytes()
     return tuple([content[m * n : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
 

@@ -147,7 +147,7 @@ class PlannerPolicy(Carded):
         lost = any(SATISFIED_ABOVE < high <= margin for _, high in bounds)
         if not lost and not any(SATISFIED_ABOVE < low <= margin for low, _ in bounds):
             return (formula,)
-        left = still_open(self.task, formula, history, rows, 0)
+        left = still_open(self.task, formula, history, rows)
         return (left,) if lost else (formula, left)
 
     def _plan_in(

@@ -62,7 +62,7 @@ def aim(
     formula, parts = shield.conjunction if own else conjunction_of(task, prefix.formula)
     if formula is not prefix.formula:  # the conjuncts read the leaves of another
         prefix = prefix.of(formula)
-        _, leaves = rho_of(prefix, tried)
+        _, leaves = rho_of(prefix, tried.poses)
     count, motions = len(parts.kind), len(task.robot.motions)
     now = Open._make((parts, np.empty(count, np.bool_), *np.zeros((2, count), np.int64), prefix.t))
     _ask(now, prefix.known, care.noise, care.stride, care.least, care.chance)

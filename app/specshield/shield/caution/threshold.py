@@ -45,7 +45,7 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     leaves = tried.leaves
     if formula is not prefix.formula:
         prefix = prefix.of(formula)
-        _, leaves = rho_of(prefix, tried)
+        _, leaves = rho_of(prefix, tried.poses)
     rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # what is set aside does not count
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
     find_open(parts, prefix.known, prefix.t, still)

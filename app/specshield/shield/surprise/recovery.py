@@ -35,7 +35,7 @@ def most_kept(
     left, said, lost = np.ones(len(whole), np.bool_), list[str](), list[Formula]()
     nearest = np.zeros(len(whole))
     for part in sorted(conjuncts(prefix.formula), key=_order):
-        rho, _ = rho_of(prefix.of(part), futures)
+        rho, _ = rho_of(prefix.of(part), futures.poses)
         keeps = left & (rho > SATISFIED_ABOVE)
         if keeps.any():
             left = keeps
