@@ -31,9 +31,9 @@ def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None
         plan.footprints(shielded.poses[: case.task.horizon + 1], SHIELDED)
     plan.way(unshielded.poses, UNSHIELDED, 2.2)
     plan.way(shielded.poses, SHIELDED, 3.0)
-    for t, pose in _visits(case, shielded.poses):
+    for n, (t, pose) in enumerate(_visits(case, shielded.poses)):
         plan.dot(pose, 5.0, SHIELDED, colors.PAPER)
-        plan.text(pose, f"t={t}", 12, SHIELDED, shift=(9, -9), anchor="ls")
+        plan.text(pose, f"t={t}", 12, SHIELDED, shift=(9, 18 if n % 2 else -9), anchor="ls")  # two may meet
     plan.start(shielded.start)
     plan.dot(case.target, 8.0, colors.TARGET, colors.INK)
     sought = case.instruction.split()[-1]
