@@ -119,6 +119,8 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
         assert "forbidden" in forbidden.inner_text()
         assert re.search(r"misses (it )?by|too late|does not hold", forbidden.inner_text())
         assert "got 0.0 %" in forbidden.locator(".bars").get_attribute("aria-label")
+        reasons = [each for each in page.locator(".cannot").all_inner_texts() if "same reason as" not in each]
+        assert len(reasons) == len(set(reasons))  # each is written out once
         look(page, "forbidden")
 
         step = page.get_by_role("button", name="Step", exact=True)

@@ -105,25 +105,26 @@ export class Panel {
     const { actions, robot } = this.session;
     if (decision.distribution.length !== actions.length) return el("p", {}, "Decided for another robot, before a switch.");
     const groups = alike(robot.actions);
-    const rows = groups.map((group) => this.row(group.map((i) => actions[i]), robot.actions[group[0]], group, decision, wanted));
+    const said = new Map(); // each reason, and the action that it was written out for
+    const row = (group) => this.row(group.map((i) => actions[i]), robot.actions[group[0]], group, decision, wanted, said);
     const sum = (values, group) => (values ? group.reduce((total, i) => total + values[i], 0) : 0);
-    const shares = groups.map((group) => Math.max(sum(decision.distribution, group), sum(wanted, group)));
-    const seen = groups.map((group, k) => shares[k] >= SEEN || group.includes(decision.action));
+    const share = (group) => Math.max(sum(decision.distribution, group), sum(wanted, group));
+    const seen = (group) => share(group) >= SEEN || group.includes(decision.action);
     const heads = ["Action", "Wanted and got", "Then the rule"].map((name) => el("th", { scope: "col" }, name));
     const table = (some) =>
       el("table", { class: "actions" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, some));
-    const rest = rows.filter((_, i) => !seen[i]);
+    const [most, rest] = [groups.filter(seen).map(row), groups.filter((group) => !seen(group)).map(row)];
     return el(
       "div",
       {},
       el("p", { class: "key" }, el("i", { class: "wanted" }), "what the model wants ", el("i", { class: "got" }), "what it gets"),
-      table(rows.filter((_, i) => seen[i])),
+      table(most),
       rest.length ? el("details", {}, el("summary", {}, `${rest.length} more that are below 0.1 %`), table(rest)) : null,
     );
   }
 
-  /** group: the actions that do the same; they share a row. */
-  row(names, action, group, decision, wanted) {
+  /** group: the actions that do the same; they share a row. said: see `verdict`. */
+  row(names, action, group, decision, wanted, said) {
     const sum = (values) => group.reduce((total, i) => total + values[i], 0);
     const [want, get] = [wanted ? sum(wanted) : null, sum(decision.distribution)];
     const bars = el(
@@ -135,7 +136,7 @@ export class Panel {
     const drawn = group.includes(decision.action) ? el("span", { class: "drawn", title: "The action drawn at this step" }, "drawn") : null;
     const head = el("th", { scope: "row", title: names.join(", ") }, names[0], names.length > 1 ? ` and ${names.length - 1} more` : "", drawn);
     head.append(el("small", { class: "does" }, does(action)));
-    return el("tr", {}, head, bars, verdict(decision, group[0], action));
+    return el("tr", {}, head, bars, verdict(decision, group[0], action, names[0], said));
   }
 }
 
@@ -151,12 +152,16 @@ function bar(kind, share) {
   return el("span", {}, line, el("small", {}, percent(share)));
 }
 
-function verdict(decision, i, action) {
+/** said: the reasons that have been written out, each with the name of its action; a new one is added. */
+function verdict(decision, i, action, name, said) {
   if (action.terminal) return el("td", { class: "told" }, "ends the model's task");
   const [j, value] = [decision.j_values[i], decision.robustness[i]];
   if (j === null) return el("td", { class: "told" }, "was not looked at");
   if (j > 0 || (j !== 0 && value > 0)) return el("td", { class: "told can" }, "can be kept", el("small", {}, ` by ${metres(value)}`));
-  return el("td", { class: "told cannot" }, el("strong", {}, "forbidden: "), whyNot(decision, i));
+  const why = whyNot(decision, i);
+  const first = said.get(why);
+  if (!first) said.set(why, name);
+  return el("td", { class: "told cannot" }, el("strong", {}, "forbidden: "), first ? `for the same reason as ${first}` : why);
 }
 
 /** What an action does, in words. */
