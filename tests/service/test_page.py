@@ -121,6 +121,7 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
         assert "got 0.0 %" in forbidden.locator(".bars").get_attribute("aria-label")
         reasons = [each for each in page.locator(".cannot").all_inner_texts() if "same reason as" not in each]
         assert len(reasons) == len(set(reasons))  # each is written out once
+        assert page.get_by_role("columnheader", name="Then the rule").count() == 1  # the other is folded away
         look(page, "forbidden")
 
         step = page.get_by_role("button", name="Step", exact=True)

@@ -110,9 +110,9 @@ export class Panel {
     const sum = (values, group) => (values ? group.reduce((total, i) => total + values[i], 0) : 0);
     const share = (group) => Math.max(sum(decision.distribution, group), sum(wanted, group));
     const seen = (group) => share(group) >= SEEN || group.includes(decision.action);
-    const heads = ["Action", "Wanted and got", "Then the rule"].map((name) => el("th", { scope: "col" }, name));
+    const heads = () => ["Action", "Wanted and got", "Then the rule"].map((name) => el("th", { scope: "col" }, name));
     const table = (some) =>
-      el("table", { class: "actions" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, some));
+      el("table", { class: "actions" }, el("thead", {}, el("tr", {}, heads())), el("tbody", {}, some));
     const [most, rest] = [groups.filter(seen).map(row), groups.filter((group) => !seen(group)).map(row)];
     return el(
       "div",
