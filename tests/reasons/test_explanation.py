@@ -9,7 +9,7 @@ import pytest
 from specshield.reasons.explanation import explanations
 from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
-from tests.oracles.cells import MOTIONS, WAIT, Cells, Exhaustive, Scripted
+from tests.oracles.cells import FORWARD, MOTIONS, WAIT, Cells, Exhaustive, Scripted
 from tests.reasons.rules_on_cells import dwells, until, visits
 
 PLACES = {"A": (2, 0), "B": (0, 2), "C": (2, 2)}
@@ -194,3 +194,22 @@ def test_where_slack_is_lacking_the_conjunct_is_named_that_lacks_it_however_deep
                 lacking[why.conjunct] = lacking.get(why.conjunct, 0) + 1
                 assert why.robustness > 0.0
     assert set(lacking) == {visit, answer}, lacking
+
+
+@pytest.mark.parametrize(
+    ("rule", "place", "motions"),
+    [
+        ("F[4,4] A", (2, 0), []),
+        ("F[4,5] A", (2, 0), []),
+        ("F[0,1] (A and F[1,7] A)", (0, 0), [FORWARD, WAIT]),
+    ],
+)
+def test_a_slack_that_is_longer_than_the_window_is_explained_all_the_same(rule, place, motions):
+    cells = Cells(rule, lambda inside: inside["A"][..., 2:].any(axis=-1), {"A": place})
+    poses = [cells.pose(0, 0, 0)]
+    for motion in motions:
+        poses.append(cells.pose(*cells.after(cells.state(poses[-1]), motion)))
+    decision = decide(make_shield([Exhaustive(cells)], Config(slack=2)), poses, EVEN, explain=explanations)
+    lacking = [why for why in decision.explanations if why is not None and why.robustness > 0.0]
+    assert lacking
+    assert all(why.late_by is None and why.detail is not None for why in lacking)

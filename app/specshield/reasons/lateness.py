@@ -62,8 +62,8 @@ def later(part: Formula, late: int) -> Formula | None:
     that of its G over a predicate beginning so much later.
     """
     match part:
-        case Eventually() | Until():
-            return replace(part, b=part.b + late)
+        case Eventually(a, b) | Until(a, b):
+            return replace(part, b=b + late) if -late <= (b - a) // 2 else None
         case Always(a, b, child) if is_predicate(child):
             return replace(part, a=min(a + late, b)) if a < b else None
         case Always(child=child) if inner := later(child, late):
