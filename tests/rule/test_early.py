@@ -1,5 +1,7 @@
 """What is left open of a rule, met some steps early: beside the definition, worked out step by step."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,8 @@ RULES = [
     "not G[0,6] x < 0.5 and not (F[0,9] y > 1.2 or F[0,3] x > 2)",
     "F[2,7] x > 0.6",
     "G[4,9] y > 0.3 and not F[6,8] x < 0.4 and G[9,9] G[0,1] x > 0.3 and G[1,9] x > -1",
+    "F[8,9] x > 0.5 and F[7,9] G[0,2] y > 0.3 and F[5,5] G[1,3] x > 0.1",  # short windows that are far away
+    "(G[4,9] y > 0.3 and F[0,5] x > 0.4) or not F[2,8] x < 0.4",
     "x > 0.5 and not y > 0.4",  # nothing is left open of it, and it has conjuncts all the same
 ]
 
@@ -58,7 +62,16 @@ def met_early(formula, start, samples, t, early):
             return max(-at(left, [0])[0], at(right, [0])[0])
         case Not(child):
             return -at(child, [0])[0]
-    return float(robustness(formula, {name: samples[name][start : start + 1] for name in formula.names}))
+    rho = float(robustness(formula, {name: samples[name][start : start + 1] for name in formula.names}))
+    return rho if start > t else math.copysign(math.inf, rho if rho > SATISFIED_ABOVE else -1.0)
+
+
+def met_far_away(part, samples, t, early):
+    """rho where what an F asks for in its short window is there so many steps before, if need be."""
+    sooner = min(early, (part.b - part.a) // 2)
+    lead = min(early, part.b // 2) - sooner
+    at = [met_early(part.child, step, samples, t, early) for step in range(part.b + 1)]
+    return max(min(at[step - lead : step + 1]) for step in range(part.a, part.b - sooner + 1))
 
 
 def left_open(formula, samples, t, early):
@@ -72,6 +85,9 @@ def left_open(formula, samples, t, early):
             continue
         if isinstance(part, Always) and isinstance(part.child, Always):
             part = Always(part.a + part.child.a, part.b + part.child.b, part.child.child)
+        if isinstance(part, Eventually) and part.a > max(t, 1) and part.b - part.a < part.a // 2:
+            found.append(met_far_away(part, samples, t, early))
+            continue
         if isinstance(part, Always):
             later = part.a > max(t, 1) and part.child.horizon == 0
             begins = part.a - min(early, part.a // 2) if later else min(t + 1 - part.child.horizon, part.b)

@@ -54,6 +54,12 @@ def decision(formula, *motions, **config):
         ("G[4,6] A", [WAIT], 0, [1, 1, 1, 1], False),
         ("G[4,6] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
         ("F[4,4] A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("F[4,5] A", [WAIT], 2, [1, 0, 0, 1], False),  # a short window that is far away
+        ("F[4,5] A", [WAIT, WAIT], 2, [1, 0, 0, 0], False),
+        ("F[4,5] A", [WAIT, WAIT], 0, [1, 1, 1, 1], False),
+        ("F[4,5] G[0,1] A", [WAIT, WAIT], 2, [1, 0, 0, 0], False),
+        ("F[4,4] G[0,1] A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("F[4,5] 1 / (1 + x) < 0.8", [WAIT, WAIT], 2, [1, 1, 1, 1], False),  # it may have no value before
         ("G[1,2] G[3,4] A", [WAIT], 2, [1, 0, 0, 0], False),
         ("G[4,6] abs(2 * x - 1) < 0.6", [WAIT], 2, [1, 0, 0, 0], False),
         ("G[4,6] 1 / (1 + x) < 0.8", [WAIT], 2, [1, 1, 1, 1], False),  # it may have no value before
@@ -85,7 +91,10 @@ def test_slack_is_kept_beside_as_much_of_the_margin_as_can_be_had(slack, feasibl
     assert found.margin == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("formula", ["G[0,3] x > 0.05", "not F[0,3] x <= 0.05", "not not G[0,3] x > 0.05"])
+KEPT_FROM_X_0 = ("G[0,3] x > 0.05", "not F[0,3] x <= 0.05", "not not G[0,3] x > 0.05")
+
+
+@pytest.mark.parametrize("formula", [*KEPT_FROM_X_0, "G[0,3] x > 0.05 or G[0,1] y > 9"])
 def test_a_margin_lost_to_what_was_driven_is_asked_of_what_is_to_come(formula):
     """At x_0 the rule is kept by 0.05 m alone; one cell on, by 0.25 m."""
     found = decision(formula, margin=0.1)

@@ -1,8 +1,8 @@
 """What a prefix leaves open of a formula, with each F and U met some steps early.
 
 What the prefix has settled is left out. An F or U is asked for so many steps before its window ends, or where
-it is met already; a G of a predicate that has yet to begin so many steps before; any other G from the first
-step on at which its child is open. All is read off the leaves' values, so no formula is compiled at a step.
+it is met already; a G of a predicate that has yet to begin, or what a short window far away asks for, so many
+steps before; any other G from the first step on at which its child is open. All is read off leaves' values.
 Where a `not` stands above an F, that asks for less, but nothing counts that does not keep the whole rule.
 """
 
@@ -60,8 +60,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
         own, row, early = compile_tree(wide[k], slots), (OTHER, size, 0, 0, part.horizon), wide[k] is not part
         rest = len(own.op)
         if isinstance(part, (Always, Eventually)):
-            at = size + part.a * early
-            rest, row = rest - 1, (own.op[-1], at, part.a, part.b, part.child.horizon)
+            rest, row = rest - 1, (own.op[-1], size + part.a * early, part.a, part.b, part.child.horizon)
         halves = (own.b - own.a)[np.isin(own.op, (EVENTUALLY, UNTIL))] // 2
         rows.append((*row, halves.max(initial=row[2] // 2 * early)))
         kept += [True] * rest + [False] * (len(own.op) - rest + (k > 0))  # without the `and`
@@ -73,11 +72,14 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
 
 
 def _from_now_on(part: Formula) -> Formula:
-    """A conjunct; a G, or F[a,a], of a predicate from step 0 on, unless that may be no number before."""
-    if not isinstance(part, (Always, Eventually)) or part.a <= 1 or not is_predicate(part.child):
+    """A conjunct; from step 0 on if it is a G of a predicate, or an F of one or of such a G whose window is
+    short and far away, unless the predicate may be no number before.
+    """
+    if not isinstance(part, (Always, Eventually)) or part.a <= 1 or not _is_plain(part) or _may_fail(part):
         return part
-    can = (isinstance(part, Always) or part.a == part.b) and not _may_fail(part.child)
-    return Always(0, part.b, part.child) if can else part
+    if isinstance(part, Always) or (part.a == part.b and is_predicate(part.child)):
+        return Always(0, part.b, part.child)
+    return Eventually(0, part.b, part.child) if part.b - part.a < part.a // 2 else part
 
 
 def _may_fail(node: Node) -> bool:
@@ -111,13 +113,21 @@ def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Float
     buffer, scratch, some = np.empty(leaves.shape[1]), np.empty(leaves.shape[1]), still.any()
     for f in range(leaves.shape[0]):
         copy_row(leaves[f], buffer)
+        for n in range(parts.below.leaf_at.shape[0] if some else 0):  # what is settled asks for no margin
+            first = parts.below.leaf_at[n] - parts.below.leaf_start[n]
+            for i in range(parts.below.leaf_at[n], first + min(parts.below.leaf_stop[n], t + 1)):
+                buffer[i] = np.inf if buffer[i] > SATISFIED_ABOVE else -np.inf
         for n in range(parts.owner.shape[0]):
             _apply_early(parts.below, n, t, early[parts.owner[n]] if some else 0, buffer, scratch)
         least = np.inf
         for k in range(still.shape[0]):
             a, b = parts.a[k], parts.b[k]
             if some and parts.kind[k] == EVENTUALLY:
-                b = max(b - min(early[k], (b - a) // 2), min(b, t))
+                sooner = min(early[k], (b - a) // 2)
+                b = max(b - sooner, min(b, t))
+                lead = min(early[k], parts.half[k]) - sooner if parts.plain[k] and a > t else 0
+                for i in range(parts.at[k] + b - a, parts.at[k] - 1, -1):
+                    buffer[i] = buffer[i - lead : i + 1].min()
             elif some and parts.kind[k] == ALWAYS:
                 later = a > t and parts.plain[k]
                 a = a - min(early[k], parts.half[k]) if later else max(a, min(t + 1 - parts.horizon[k], b))

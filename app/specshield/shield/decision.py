@@ -10,12 +10,11 @@ from typing import Literal, NamedTuple
 from specshield.arrays import Floats
 from specshield.errors import InputError, PolicyError
 from specshield.robot.dynamics import Body, make_body
-from specshield.rule.early import Conjuncts, conjunction_of
 from specshield.rule.view import View, view_of
 from specshield.shield.preference import Preference
 from specshield.shield.proposal import Proposer
 from specshield.shield.uncertainty import Uncertainty
-from specshield.stl import Formula, Verdict
+from specshield.stl import Verdict
 from specshield.task import Task
 
 Mode = Literal["prior", "shaped", "completion", "fallback", "violated"]
@@ -93,7 +92,6 @@ class Config:
 class Shield:
     """A task, the policies that propose futures for it and a session's settings, prepared once.
 
-    conjunction: the formula as `conjunction_of` has it.
     Raises InputError where a preference is given to a session that does not choose within S_t.
     """
 
@@ -102,7 +100,6 @@ class Shield:
     config: Config
     body: Body = field(repr=False)
     view: View = field(repr=False)
-    conjunction: tuple[Formula, Conjuncts] = field(repr=False)
     preference: Preference | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -142,15 +139,8 @@ def make_shield(
                 got=policy.task.content_hash,
                 expected=f"task {task.content_hash}, as policy_ids[0]",
             )
-    return Shield(
-        task,
-        tuple(proposers),
-        config or Config(),
-        make_body(task.robot, task.grid),
-        view_of(task, task.formula),
-        conjunction_of(task, task.formula),
-        preference,
-    )
+    body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
+    return Shield(task, tuple(proposers), config or Config(), body, view, preference)
 
 
 # A pose, and a motion that led nowhere from it; ~motion where it did nothing and may only have slipped.

@@ -14,7 +14,6 @@ import msgspec
 from specshield.arrays import Floats
 from specshield.lookahead.preferences import AHEADS, PROJECTION, prepare
 from specshield.robot.dynamics import make_body
-from specshield.rule.early import conjunction_of
 from specshield.rule.view import view_of
 from specshield.service.heavy.background import Background
 from specshield.service.heavy.tables import Tables
@@ -104,7 +103,7 @@ class Shields:
         """A task made anew for each verdict would stay for as long as what is prepared of it (`view_of`)."""
         task = self.policies.task(Description(map_id, robot, spec, "", 0, {}))
         body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
-        return Shield(task, (), Config(), body, view, conjunction_of(task, task.formula))
+        return Shield(task, (), Config(), body, view)
 
     def settled(self, session: Session) -> Session:
         """The session, with the verdicts of the rules that its last switch ended once its x_t is known."""

@@ -19,7 +19,7 @@ from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
-from specshield.stl.tree import ALWAYS, EVENTUALLY
+from specshield.stl.tree import EVENTUALLY
 
 NEVER = 1 << 40  # in place of a number of steps
 
@@ -58,8 +58,7 @@ def aim(
     which no more is asked.
     """
     task, margin = shield.task, SATISFIED_ABOVE + care.margin
-    own = prefix.formula is task.formula
-    formula, parts = shield.conjunction if own else conjunction_of(task, prefix.formula)
+    formula, parts = conjunction_of(task, prefix.formula)
     if formula is not prefix.formula:  # the conjuncts read the leaves of another
         prefix = prefix.of(formula)
         _, leaves = rho_of(prefix, tried.poses)
@@ -115,9 +114,10 @@ def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chan
     parts, still, asked, due, t = now
     find_open(parts, known, t, still)
     for k in range(still.shape[0]):
-        half, begun = parts.half[k], parts.plain[k] and parts.kind[k] == ALWAYS and parts.a[k] <= t
-        due[k] = NEVER
-        if still[k] and half > 0 and not begun:
+        half, due[k] = parts.half[k], NEVER
+        if parts.plain[k] and parts.a[k] <= t:  # its window has begun
+            half = (parts.b[k] - parts.a[k]) // 2 if parts.kind[k] == EVENTUALLY else 0
+        if still[k] and half > 0:
             left = parts.b[k] + parts.horizon[k] - t
             if parts.kind[k] != EVENTUALLY:  # the first that its child is asked for
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
