@@ -3,11 +3,13 @@
 import asyncio
 import multiprocessing
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import httpx
 
 from specshield.client import bounded
+from tests.serving import HUNG
 
 
 class _Port(BaseHTTPRequestHandler):
@@ -40,6 +42,29 @@ def test_a_forked_process_opens_connections_of_its_own():
         child.join()
         assert its[0] == its[1] != first  # it keeps its own, too
         assert client.get("/").text == first
+    server.shutdown()
+    server.server_close()
+
+
+def test_event_loops_that_run_at_once_keep_connections_of_their_own():
+    """They ask in turn, so that each would lose what it has if the other's took its place."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _Port)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = httpx.URL(f"http://127.0.0.1:{server.server_port}")
+    client = httpx.AsyncClient(base_url=url, transport=bounded.AsyncTransport(url))
+    turns = threading.Barrier(2)
+
+    async def ports():
+        asked = []
+        for _ in range(3):
+            turns.wait(HUNG)
+            asked.append((await client.get("/")).text)
+        return asked
+
+    with ThreadPoolExecutor(2) as threads:
+        first, second = threads.map(lambda _: asyncio.run(ports()), range(2))
+    assert len(set(first)) == len(set(second)) == 1
+    assert first != second
     server.shutdown()
     server.server_close()
 

@@ -190,8 +190,8 @@ class Transport(httpx.HTTPTransport):
         return super().handle_request(request)
 
 
-class AsyncTransport(httpx.AsyncHTTPTransport):
-    """The same for asyncio. Connections are their event loop's, so in another loop it opens its own."""
+class AsyncTransport(threading.local, httpx.AsyncHTTPTransport):
+    """The same for asyncio. Connections are their event loop's: another loop, and each thread, has its own."""
 
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())
