@@ -17,7 +17,7 @@ pytest.importorskip("minigrid")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from examples import minigrid_rooms  # noqa: E402
-from specshield.errors import InfeasibleStart, InputError, RobotError  # noqa: E402
+from specshield.errors import InfeasibleStart, InputError, LogitsError, RobotError  # noqa: E402
 from specshield.integrations import minigrid  # noqa: E402
 from specshield.integrations.gymnasium import ShieldWrapper  # noqa: E402
 from specshield.local import LocalShield  # noqa: E402
@@ -95,8 +95,8 @@ def test_a_maze_in_which_the_rule_cannot_be_kept_is_refused() -> None:
 class House(gymnasium.Env[Any, Any]):
     """A case's apartment; its task is done when the robot says so."""
 
-    def __init__(self, actions: int = 20) -> None:
-        self.action_space = gymnasium.spaces.Discrete(actions)
+    def __init__(self) -> None:
+        self.action_space = gymnasium.spaces.Discrete(20)
         self.observation_space = gymnasium.spaces.Discrete(1)
         self.executed: list[int] = []
 
@@ -131,13 +131,29 @@ def test_an_action_that_there_is_not_does_not_reach_the_environment() -> None:
     house = House()
     env = ShieldWrapper(house, LocalShield.shipped("case1"), lambda env: START)
     env.reset()
-    for action in (-1, 20):
+    for action in (-1, 20, 1.7, float("nan"), None, "m", np.array([0, 1])):
         with pytest.raises(InputError, match="0 to 19"):
             env.step(action)
     assert house.executed == []
 
 
-def test_other_actions_than_the_robots_are_refused() -> None:
-    env = ShieldWrapper(House(7), LocalShield.shipped("case1"), lambda env: START)
-    with pytest.raises(RobotError, match=r"Discrete\(20\)"):
+@pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(7), gymnasium.spaces.Discrete(20, start=1)])
+def test_other_actions_than_the_robots_are_refused(space: Any) -> None:
+    """Also those that are counted from another number: each would be taken for the next."""
+    house = House()
+    house.action_space = space
+    env = ShieldWrapper(house, LocalShield.shipped("case1"), lambda env: START)
+    with pytest.raises(RobotError, match=r"expected Discrete\(20\)"):
         env.reset()
+
+
+def test_a_model_may_answer_with_whatever_a_session_takes_for_logits() -> None:
+    torch = pytest.importorskip("torch")
+    answers = iter([[None, *[0.0] * 19], torch.zeros(20, requires_grad=True), None])
+    env = ShieldWrapper(
+        House(), LocalShield.shipped("case1"), lambda env: START, logits=lambda seen, before: next(answers)
+    )
+    assert env.reset()[1]["distribution"][0] == 0.0
+    env.step(1)
+    with pytest.raises(LogitsError, match="these are not numbers; got 'None'"):
+        env.step(1)

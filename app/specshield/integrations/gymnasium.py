@@ -16,13 +16,14 @@ to lie beyond the rule's horizon.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, SupportsIndex
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 
 from specshield.client.models import Decision, Pose
+from specshield.client.wire import Logits, logit_values
 from specshield.errors import InputError, RobotError
 from specshield.local import LocalSession, LocalShield
 
@@ -40,7 +41,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     that the shield knows do not tell all. settings: of the session, as of `LocalShield.session`; by default
     the environment is taken to move exactly as the robot of the shield does.
 
-    Raises RobotError at `reset` where the actions are not as many as the robot's, InfeasibleStart there where
+    Raises RobotError at `reset` unless actions are numbered as the robot's, InfeasibleStart there where
     the rule cannot be kept, and InputError at `step` for an action that there is not.
     """
 
@@ -50,7 +51,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         shield: LocalShield | Callable[[Environment], LocalShield],
         pose_of: Callable[[Environment], Pose],
         *,
-        logits: Callable[[Any, int | None], ArrayLike] | None = None,
+        logits: Callable[[Any, int | None], Logits] | None = None,
         possible: Callable[[Environment], ArrayLike] | None = None,
         **settings: Any,
     ) -> None:
@@ -74,14 +75,10 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     ) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         shield = self._shield if isinstance(self._shield, LocalShield) else self._shield(self.env)
-        actions = getattr(self.env.action_space, "n", None)
-        if actions != len(shield.task.robot.actions):
-            raise RobotError(
-                "the environment's actions are not the robot's",
-                path="action_space",
-                got=str(self.env.action_space),
-                expected=f"Discrete({len(shield.task.robot.actions)})",
-            )
+        space, n = self.env.action_space, len(shield.task.robot.actions)
+        if (getattr(space, "n", None), getattr(space, "start", None)) != (n, 0):
+            what = "the environment's actions are not the robot's"
+            raise RobotError(what, path="action_space", got=str(space), expected=f"Discrete({n})")
         self.session = shield.session(initial_pose=self._pose_of(self.env), **self._settings)
         return observation, {**info, **self._decide(self.session, observation, None, False)}
 
@@ -89,10 +86,10 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         assert self.session is not None, "reset comes before step"
         assert self.decision is not None
         decision, session, over = self.decision, self.session, self.session.main_task_done
-        executed, terminal = int(action), session.info.terminal_actions
-        if not 0 <= executed < len(decision.distribution):
-            expected = f"0 to {len(decision.distribution) - 1}"
-            raise InputError("no such action", path="action", got=executed, expected=expected)
+        n, terminal = len(decision.distribution), session.info.terminal_actions
+        if not (isinstance(action, SupportsIndex) and np.ndim(action) == 0 and 0 <= int(action) < n):
+            raise InputError("no such action", path="action", got=action, expected=f"0 to {n - 1}")
+        executed = int(action)
         ends = executed in terminal and decision.distribution[executed] > 0.0 and not over
         if ends and decision.completion_action is not None:
             executed = decision.completion_action
@@ -114,7 +111,8 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         """Ask the shield about the state that the environment is in; what of it goes into `info`."""
         logits = np.zeros(len(session.info.actions))
         if self._logits is not None and not over:
-            logits = np.array(self._logits(observation, executed), dtype=np.float64)
+            told = logit_values(self._logits(observation, executed))
+            logits = np.array([-np.inf if value is None else value for value in told])
         if self._possible is not None:
             logits[~np.asarray(self._possible(self.env), bool)] = -np.inf
         decision = session.step(self._pose_of(self.env), None if over else logits, main_task_done=over)
