@@ -109,9 +109,9 @@ def post(
 
 
 def path(*segments: str) -> str:
-    """InputError for an id that would lead elsewhere: an empty one, `.` or `..`."""
+    """InputError for an id that would lead elsewhere: an empty one, `.`, `..` or one with a slash."""
     for segment in segments:
-        if not isinstance(segment, str) or segment in ("", ".", ".."):
+        if not isinstance(segment, str) or segment in ("", ".", "..") or "/" in segment:
             raise InputError(
                 "this cannot be an id or a name",
                 path="id",
