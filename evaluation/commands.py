@@ -148,7 +148,7 @@ def curves(
     thresholds: Annotated[
         str, typer.Option(help="Of each step and of the episode, above 0 and at most 1.")
     ] = "0.25,0.5,0.75,0.9,1",
-    metres: Annotated[str, typer.Option(help="Thresholds with J = rho [m].")] = "-0.5,0,0.1,0.2",
+    metres: Annotated[str, typer.Option(help="Thresholds with J = rho, in metres.")] = "-0.5,0,0.1,0.2",
     runs: Annotated[int, typer.Option(help="Runs of each point.", min=1)] = 60,
     seed: Annotated[int, typer.Option(help="Decides starts, model and draws.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the runs; what it holds is not made again.")] = Path(

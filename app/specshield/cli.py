@@ -62,6 +62,10 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
         app()
     except SpecshieldError as error:
         sys.exit(str(error))
+    except OSError as error:
+        if error.filename is None:  # else it is about a file or folder that the caller named
+            raise
+        sys.exit(f"{error.filename} cannot be used: {error.strerror}")
     except ModuleNotFoundError as error:
         missing = (error.name or "").split(".")[0]
         if missing == "torch":
@@ -171,10 +175,10 @@ def verify(
         Path | None, typer.Option(help="A server's data folder, for maps and policies that were sent to it.")
     ] = None,
     models_dir: Annotated[
-        Path | None, typer.Option(help="Policies, one folder each. [default: those shipped]")
+        Path | None, typer.Option(help="Policies, one folder each; by default those shipped.")
     ] = None,
     maps_dir: Annotated[
-        Path | None, typer.Option(help="Maps, <name>.yaml beside its image. [default: those shipped]")
+        Path | None, typer.Option(help="Maps, <name>.yaml beside its image; by default those shipped.")
     ] = None,
 ) -> None:
     """Check a session's record: its chain of hashes, then every decision, made again to the same bytes.
@@ -218,7 +222,7 @@ def train(
     seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
     option: Annotated[list[str] | None, typer.Option(help="A setting, as units=128; repeatable.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write to. [default: in models/]")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write to; by default in models/.")] = None,
     resume: Annotated[bool, typer.Option(help="Take up a run that was killed.")] = False,
 ) -> None:
     """Make a policy for a case. Learning shows how far it is and how often the rule is satisfied."""

@@ -8,10 +8,13 @@ import subprocess
 import sys
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
+from typing import get_type_hints
 
+import pytest
 import yaml
 
 from examples.own_house import HOUSE, REGIONS, ROBOT, RULE, occupancy
+from specshield import cli
 from specshield.client import ShieldClient
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
@@ -68,6 +71,23 @@ def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_
     assert refused.returncode == 1
     (line,) = refused.stderr.strip().splitlines()
     assert line.startswith("--out cannot be used: Not a directory")
+
+
+@pytest.mark.parametrize("asked", [("run", "case1"), ("demo", "--runs", 1), ("train", "--case", 1)])
+def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp_path):
+    (tmp_path / "file").touch()
+    refused = command(*asked, "--out", tmp_path / "file", SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    assert refused.returncode == 1
+    assert refused.stderr.strip() == f"{tmp_path / 'file'} cannot be used: File exists"
+    assert refused.stdout == ""
+
+
+def test_no_help_has_a_word_in_brackets_which_would_be_taken_for_markup_and_not_be_shown():
+    for asked in cli._commands():
+        for of in [each.callback for each in getattr(asked, "registered_commands", [])] or [asked]:
+            for name, kind in get_type_hints(of, include_extras=True).items():
+                for told in getattr(kind, "__metadata__", ()):
+                    assert not re.search(r"\[[a-z#/@]", told.help or ""), (of.__name__, name)
 
 
 def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):

@@ -119,7 +119,6 @@ def _read(path: Path, option: str) -> dict[str, Any]:
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
     if not isinstance(value, dict):
-        raise InputError(
-            f"{path} holds no object", path=option, got=type(value).__name__, expected="an object"
-        )
+        kind = type(value).__name__
+        raise InputError(f"{path} holds no object", path=option, got=kind, expected="an object")
     return value

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # every command line reads this module
 
 def run_policy(
     policy: Annotated[str, typer.Argument(help="Id or name of a policy in SPECSHIELD_DATA_DIR.")],
-    target: Annotated[str | None, typer.Option(help="Where the model goes, as 2.5,1.0 [m].")] = None,
+    target: Annotated[str | None, typer.Option(help="Where the model goes, as 2.5,1.0 in metres.")] = None,
     seed: Annotated[int, typer.Option(help="Decides start, target and model.", min=0)] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
 ) -> None:
@@ -29,6 +29,7 @@ def run_policy(
     from specshield.sim.model import GoalSeeker
     from specshield.sim.progress import StatusLine
 
+    out.mkdir(parents=True, exist_ok=True)
     status = StatusLine()
     with client_of(None, status) as client:
         found = client.policies.get(policy)

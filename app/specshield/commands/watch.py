@@ -16,9 +16,7 @@ HEAD = "    t mode           action       rule  feasible      KL   rho m   off b
 def watch(
     session: Annotated[str, typer.Argument(help="Id of a session.")],
     url: Annotated[str, typer.Option(help="The server.")] = "http://127.0.0.1:8000",
-    after: Annotated[
-        int | None, typer.Option(help="Begin after this step. [default: from the first]")
-    ] = None,
+    after: Annotated[int, typer.Option(help="Begin after this step; -1: from the first.", min=-1)] = -1,
     limit: Annotated[int | None, typer.Option(help="Stop after so many decisions.", min=1)] = None,
 ) -> None:
     """Show the decisions of a session as they are made, a line each."""
@@ -26,7 +24,6 @@ def watch(
 
     with ShieldClient(url, api_key=os.environ.get("SPECSHIELD_API_KEY")) as client:
         found = client.sessions.get(session)
-        after = -1 if after is None else after
         rule = found.rule_at(after + 1)
         print(f"session {found.id}: {rule}")
         print(HEAD, flush=True)

@@ -24,6 +24,7 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
     an episode with the shield broke its rule.
     """
     began, status = time.monotonic(), StatusLine()
+    out.mkdir(parents=True, exist_ok=True)
     status.say("starting the service ...")
     with own_server(say=status.say) as url:
         with robots(url) as several:

@@ -38,13 +38,13 @@ def train(
     checkpoint, status = out / "checkpoint", StatusLine()
     if not resume:
         shutil.rmtree(checkpoint, ignore_errors=True)
+    out.mkdir(parents=True, exist_ok=True)
 
     def show(done: float, seconds_left: float, said: str) -> None:
         status.say(f"{loaded.name}: {said or f'{done:.0%}'}, {duration(seconds_left)} left")
 
     policy = made_by.make(loaded.task, chosen, Run(seed, dict(loaded.spec), checkpoint, show))
     status.clear()
-    out.mkdir(parents=True, exist_ok=True)
     replace_file(out / "policy.safetensors", policy.weights())
     (out / "card.json").write_text(json.dumps(policy.card, indent=1) + "\n")
     shutil.rmtree(checkpoint, ignore_errors=True)
