@@ -87,7 +87,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         assert self.decision is not None
         decision, session, over = self.decision, self.session, self.session.main_task_done
         n, terminal = len(decision.distribution), session.info.terminal_actions
-        if not (isinstance(action, SupportsIndex) and np.ndim(action) == 0 and 0 <= int(action) < n):
+        if not (np.ndim(action) == 0 and isinstance(action, SupportsIndex) and 0 <= int(action) < n):
             raise InputError("no such action", path="action", got=action, expected=f"0 to {n - 1}")
         executed = int(action)
         ends = executed in terminal and decision.distribution[executed] > 0.0 and not over
