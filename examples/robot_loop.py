@@ -115,7 +115,11 @@ def main() -> None:
     robot, model = SimulatedRobot(case, start), GoalSeeker(case.task.robot)
     model.reset(np.random.default_rng(0))
     with ShieldClient(url) as client:
-        verdict = drive(client, robot, model, NOTES)
+        try:
+            verdict = drive(client, robot, model, NOTES)
+        except KeyboardInterrupt:
+            print("stopped" + (": start it again, and it goes on" if NOTES.exists() else ""))
+            sys.exit(130)  # what a shell says of a program that Ctrl-C has ended
     print(f"the rule is {verdict.spec_status}")
 
 

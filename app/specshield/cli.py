@@ -228,7 +228,7 @@ def train(
     """Make a policy for a case. Learning shows how far it is and how often the rule is satisfied."""
     from specshield.sim import training
 
-    raise typer.Exit(training.train(case, method, seed, updates, option or [], out, resume))
+    training.train(case, method, seed, updates, option or [], out, resume)
 
 
 def _check_address(host: str, port: int) -> None:

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.serving import HUNG
+from tests.serving import HUNG, free_port
 
 WITHOUT = """
 import sys
@@ -127,6 +127,20 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
     assert told in line
     assert expected in line.partition("; expected ")[2]
     assert "secret" not in line
+
+
+def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path):
+    run = subprocess.run(
+        [sys.executable, "-m", "specshield.cli", "worker"],
+        env={**os.environ, "REDIS_URL": f"redis://127.0.0.1:{free_port()}"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=HUNG,
+    )
+    assert run.returncode == 1
+    assert run.stderr.splitlines()[-1] == "the store cannot be reached: ConnectionError"
+    assert "Traceback" not in run.stderr
 
 
 @pytest.mark.parametrize("more", [[], ["--workers", "2"]])

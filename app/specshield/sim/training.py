@@ -25,8 +25,8 @@ def train(
     options: Sequence[str],
     out: Path | None,
     resume: bool,
-) -> int:
-    """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`; the exit status.
+) -> None:
+    """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`.
 
     options: "name=value", of the method's options. A method that saves how far it is does so in
     `out`/checkpoint; `resume` goes on from there after a kill.
@@ -52,7 +52,6 @@ def train(
     metrics = policy.card["metrics"]
     shares = [f"{words} {metrics[name]:.1%}" for name, words in measured.items() if name in metrics]
     print(f"{out}: {', '.join(shares)}; {duration(time.monotonic() - began)}")
-    return 0
 
 
 def _parse(texts: Sequence[str]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from specshield.errors import SpecshieldError, StoreError
 from specshield.policy.methods import METHODS, Run, available, missing
 from specshield.policy.options import read_options
 from specshield.service.settings import Settings
-from specshield.service.storage.connect import connect_to_jobs
+from specshield.service.storage.connect import connect_to_jobs, reaching
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import at_end_of_input, follow_parent
 from specshield.service.storage.marker import check_files
@@ -107,6 +107,7 @@ class _Worker(Worker):
     checkpoint, with which the next worker goes on.
     """
 
+    @reaching()
     def __init__(self, url: str, jobs: Jobs, methods: Sequence[str], others: Sequence[str]) -> None:
         self._training = [queue_of(method) for method in methods]
         super().__init__(
