@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from specshield.client import LocalDecision
 from specshield.errors import InputError
 from specshield.integrations.samples import SampleShield, nearest_action
 from specshield.local import LocalShield
@@ -109,3 +110,34 @@ def test_a_lerobot_policy_is_asked_for_samples_and_answers_as_before() -> None:
     assert only.select_action(batch)[0].numpy() == pytest.approx(AHEAD)
     shielded.reset()
     assert policy.asked == 0
+
+
+def test_a_row_that_no_sample_gave_is_like_one_that_is_a_motion() -> None:
+    """The first sample is lost: what it says of a gripper is lost with it."""
+    pytest.importorskip("torch")
+    from specshield.integrations.lerobot import ShieldedPolicy
+
+    policy = Recorded([np.array([0.0, 0.5, 0.7]), np.full(3, np.nan)])
+    shielded = ShieldedPolicy(
+        policy, chooser("F[0,4] x > 1.9"), lambda move, turn, like: [move, turn, like[2]], samples=2
+    )
+    action = shielded.select_action({"observation.state": np.zeros((1, 3))})
+    assert action[0].numpy() == pytest.approx([*AHEAD, 0.7])
+
+
+def test_a_robot_that_has_to_stand_is_given_the_row_that_stands() -> None:
+    """As the SDK's session says it, where the service is away and nothing is certified."""
+    pytest.importorskip("torch")
+    from specshield.integrations.lerobot import ShieldedPolicy
+
+    class Away:
+        main_task_done = False
+
+        def step(self, pose: Any, logits: Any = None, *, main_task_done: bool | None = None) -> LocalDecision:
+            return LocalDecision(0, "stop", None, "the service is away", "pending")
+
+    shield = SampleShield(Away(), ROBOT, lambda seen: (1.0, 2.5, 0.0), lambda row: (row[0], row[1]))
+    shielded = ShieldedPolicy(Recorded([AHEAD]), shield, lambda move, turn, like: [move, turn])
+    action = shielded.select_action({"observation.state": np.zeros((1, 3))})
+    assert action[0].tolist() == [0.0, 0.0]
+    assert isinstance(shielded.decision, LocalDecision)

@@ -55,15 +55,8 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         possible: Callable[[Environment], ArrayLike] | None = None,
         **settings: Any,
     ) -> None:
-        gymnasium.utils.RecordConstructorArgs.__init__(
-            self,
-            shield=shield,
-            pose_of=pose_of,
-            logits=logits,
-            possible=possible,
-            _disable_deepcopy=True,
-            **settings,
-        )
+        given = {"shield": shield, "pose_of": pose_of, "logits": logits, "possible": possible, **settings}
+        gymnasium.utils.RecordConstructorArgs.__init__(self, _disable_deepcopy=True, **given)
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
         self._settings = {"uncertainty": "none", "learn_map": False, **settings}

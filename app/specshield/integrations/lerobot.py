@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from specshield.client.models import Decision
+from specshield.client.models import Decision, LocalDecision
 from specshield.integrations.samples import Sampled
 
 
@@ -32,7 +32,7 @@ class ShieldedPolicy(Sampled):
     """`policy` inside the rule of a shield's session; the arguments are those of `Sampled`."""
 
     _policy: Policy
-    decision: Decision | None = None
+    decision: Decision | LocalDecision | None = None
 
     @torch.no_grad()
     def select_action(self, observation: Mapping[str, Any]) -> torch.Tensor:
@@ -44,7 +44,7 @@ class ShieldedPolicy(Sampled):
         self.decision = chosen.decision
         if chosen.sample is not None:
             return chunks[chosen.sample][:, 0]
-        return torch.as_tensor(np.asarray(self._instead(chosen, rows[0]))[None]).to(chunks[0])
+        return torch.as_tensor(np.asarray(self._instead(chosen, rows[chosen.like]))[None]).to(chunks[0])
 
     def _observed(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
         """What `predict_action_chunk` is to be given. A policy that looks at several observations keeps them

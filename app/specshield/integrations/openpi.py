@@ -26,8 +26,7 @@ class ShieldedPolicy(Sampled, BasePolicy):  # type: ignore[misc]
         answers = [self._policy.infer(obs) for _ in range(self._samples)]
         rows = [np.asarray(answer["actions"], dtype=np.float64)[0] for answer in answers]
         chosen = self._shield.choose(rows, obs)
-        sample = chosen.sample or 0
-        row = rows[sample]
+        row = rows[chosen.like]
         if chosen.sample is None:
             row = self._instead(chosen, row)
-        return {**answers[sample], "actions": row[None], "decision": chosen.decision}
+        return {**answers[chosen.like], "actions": row[None], "decision": chosen.decision}

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.client.models import Decision, Pose
+from specshield.client.models import Decision, LocalDecision, Pose
 from specshield.errors import InputError
 from specshield.robot import Robot
 
@@ -33,11 +33,14 @@ class Session(Protocol):
 
 
 class Chosen(NamedTuple):
-    """sample: the index of the sample to run, None where none is allowed and the robot's `action` is run."""
+    """sample: the index of the sample to run, None where none is allowed and the robot's `action` is run, in
+    all else like the sample `like`. action: None where the service is away and the robot has to stand.
+    """
 
-    action: int
+    action: int | None
     sample: int | None
-    decision: Decision
+    like: int
+    decision: Decision | LocalDecision
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,8 @@ class SampleShield:
                 self.pose_of(observation), np.log(shares), main_task_done=self.session.main_task_done
             )
         own = usable[meant == decision.execute]
-        return Chosen(decision.execute, int(own[0]) if len(own) else None, decision)
+        sample = int(own[0]) if len(own) else None
+        return Chosen(decision.execute, sample, int(usable[0]) if sample is None else sample, decision)
 
 
 class Sampled:
@@ -93,6 +97,8 @@ class Sampled:
 
     def _instead(self, chosen: Chosen, row: Floats) -> Floats:
         """The row that is run where no sample is allowed."""
+        if chosen.action is None:
+            return self._row_of(0.0, 0.0, row)
         action = self._shield.robot.actions[chosen.action]
         return self._row_of(action.translate, action.rotate, row)
 
