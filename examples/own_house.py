@@ -71,6 +71,7 @@ def occupancy(drawing: str) -> tuple[dict[str, object], list[int]]:
 def main() -> None:
     url = sys.argv[1] if len(sys.argv) > 1 else "http://127.0.0.1:8000"
     with ShieldClient(url) as client:
+        print(f"waiting for the service at {url} ...", flush=True)
         client.wait_until_ready()
         house = client.maps.occupancy_grid(*occupancy(HOUSE))
         spec = client.specs.validate(RULE, REGIONS)

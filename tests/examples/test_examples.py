@@ -40,7 +40,8 @@ def run(example: str, url: str, folder: Path) -> list[str]:
 
 
 def test_a_house_of_ones_own(url: str, tmp_path: Path) -> None:
-    decided, from_where, kept = run("own_house.py", url, tmp_path)
+    waiting, decided, from_where, kept = run("own_house.py", url, tmp_path)
+    assert waiting == f"waiting for the service at {url} ..."
     assert decided.endswith("decided after 120 steps")
     assert re.search(r"(9\d|100)%", from_where)
     assert kept == "the rule is satisfied after 120 steps"

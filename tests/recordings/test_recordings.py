@@ -15,6 +15,7 @@ from specshield.recordings import drive
 from specshield.recordings.recording import Recording
 from specshield.recordings.tables import write_csv, write_parquet
 from specshield.robot.dynamics import make_body, step
+from specshield.world.occupancy import OccupancyGrid
 from tests.serving import RunningServer
 
 START = (4.5, 5.0, 0.0)
@@ -191,6 +192,17 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
     assert run("export", "record", "--to", "csv", "--out", "b.csv") == "b.csv: 1 steps\n"
     assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
     assert run("export", "record", "--to", "mcap") == f"{session.id}.mcap: 1 steps\n"
+    LocalShield.make(OccupancyGrid(np.zeros((30, 30), bool), 0.2), "F[0,9] x > 1").save(tmp_path / "room")
+    files = [tmp_path / "room" / name for name in ("map.yaml", "map.pgm", "policy.safetensors", "card.json")]
+    with ShieldClient(
+        server.url, timeout=30.0
+    ) as client:  # a session whose map is deleted, once it is closed
+        room, made = client.maps.upload(*files[:2]), client.policies.upload(*files[2:])
+        with client.sessions.create(policy_id=made.id, initial_pose=(3.0, 3.0, 0.0)) as gone:
+            gone.step((3.0, 3.0, 0.0), np.zeros(20))
+        client.policies.delete(made.id)
+        client.maps.delete(room.id)
+    assert run("export", gone.id, "--to", "mcap", "--url", server.url) == f"{gone.id}.mcap: 1 steps\n"
     words = ["export", "record", "--to", "csv", "--out", "nowhere/a.csv"]
     refused = subprocess.run(
         [sys.executable, "-m", "specshield.cli", *words], cwd=tmp_path, capture_output=True, text=True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -44,16 +45,17 @@ def export(
     rooms: Mapping[str, Region] = {}
     if file.is_file():
         found = chain.read(file.read_bytes())
-        try:
+        with suppress(NotFound):
             known = Maps(read_settings()).get(found.configs[0].map_id)
             grid, rooms = known.grid, known.rooms
-        except NotFound:
-            typer.echo("the map is not at hand: it is left out, and so are the ways ahead", err=True)
     else:
         with ShieldClient(url, api_key, timeout=30.0) as client, tempfile.TemporaryDirectory() as folder:
             client.sessions.get(session).save_record(Path(folder) / "record")
             found = chain.read((Path(folder) / "record").read_bytes())
-            grid, rooms = map_of_service(client, found.configs[0].map_id)
+            with suppress(NotFound):  # a map may be deleted once its sessions are closed
+                grid, rooms = map_of_service(client, found.configs[0].map_id)
+    if grid is None:
+        typer.echo("the map is not at hand: it is left out, and so are the ways ahead", err=True)
     recording = of_record(found, grid, rooms, step_seconds)
     path = out or Path(f"{recording.id}.{to}")
     try:
