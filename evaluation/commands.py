@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from specshield.errors import InputError
+
 
 def evaluate(
     case: Annotated[str, typer.Option(help="A case of maps/, as 1 or case1; or house.")],
@@ -92,10 +94,10 @@ def worlds(
 
     trials = [
         Trial(each, name, senses, seed, slack < 0, max(slack, 0), robot=body)
-        for body in robot.split(",")
+        for body in _some(robot, "stretch,locobot,trailing,arcs", "--robot")
         for each in case.split(",")
-        for name in world.split(",")
-        for senses in sensing.split(",")
+        for name in _some(world, "told,obstacle,shift,collider,person", "--world")
+        for senses in _some(sensing, "scan,contact,none", "--sensing")
     ]
     compare(trials, runs, out, processes or os.cpu_count() or 1)
 
@@ -120,7 +122,7 @@ def results(
     from evaluation.houses import houses_in
     from evaluation.plan import carry_out
 
-    kinds = only.split(",") if only else []
+    kinds = _some(only, "cases,noise,bodies,houses,models,tasks", "--only") if only else []
     failed = carry_out(out, page, houses_in(houses), kinds, share, processes or os.cpu_count() or 1)
     raise typer.Exit(1 if failed else 0)
 
@@ -171,8 +173,8 @@ def curves(
     ]
     draw_all(
         asked,
-        [float(value) for value in thresholds.split(",")],
-        [float(value) for value in metres.split(",")],
+        _numbers(thresholds, "--thresholds"),
+        _numbers(metres, "--metres"),
         runs,
         out,
         page,
@@ -223,3 +225,19 @@ def report(
     from evaluation import writeup
 
     writeup.write_up(results, out)
+
+
+def _some(text: str, known: str, option: str) -> list[str]:
+    """The names in a text, all of which have to be known."""
+    found = text.split(",")
+    for name in found:
+        if name not in known.split(","):
+            raise InputError("there is no such name", path=option, got=name, expected=f"some of {known}")
+    return found
+
+
+def _numbers(text: str, option: str) -> list[float]:
+    try:
+        return [float(value) for value in text.split(",")]
+    except ValueError:
+        raise InputError("not all are numbers", path=option, got=text, expected="as 0.5,1") from None

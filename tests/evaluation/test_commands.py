@@ -87,3 +87,19 @@ def test_a_mistake_is_told_in_a_line(arguments, said):
     done = specshield("evaluate", *arguments, code=1)
     (line,) = done.stderr.splitlines()
     assert said in line
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "given"),
+    [
+        ("worlds", "--world", "obstacle,nope"),  # which would be measured, as a world like the one told
+        ("worlds", "--sensing", "nope"),
+        ("results", "--only", "nope"),
+        ("curves", "--metres", "0.1,nope"),
+    ],
+)
+def test_a_name_that_nothing_has_is_refused(command, option, given, tmp_path):
+    refused = specshield(command, option, given, "--out", str(tmp_path), code=1)
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith(f"{option}: ")
+    assert "nope" in line
