@@ -142,7 +142,7 @@ def test_a_watched_session_is_headed_with_the_rule_of_the_decisions_that_follow(
 
     monkeypatch.setattr("specshield.client.ShieldClient", client)
     shown = []
-    for after in (None, 1):
+    for after in (-1, 1):
         watched("s", "http://robot.test", after, None)
         head, _, *lines = capsys.readouterr().out.splitlines()
         shown.append([head, *(line if "from" in line else int(line.split()[0]) for line in lines)])
