@@ -87,9 +87,10 @@ class Recorded:
     def predict_action_chunk(self, batch: dict[str, Any]) -> Any:
         import torch
 
-        assert batch["observation.state"].shape == (1, 3)
+        count, state = batch["observation.state"].shape
+        assert state == 3
         self.asked += 1
-        return torch.as_tensor(np.tile(self.rows[self.asked % len(self.rows)], (1, 50, 1))).float()
+        return torch.as_tensor(np.tile(self.rows[self.asked % len(self.rows)], (count, 50, 1))).float()
 
     def reset(self) -> None:
         self.asked = 0
@@ -108,6 +109,8 @@ def test_a_lerobot_policy_is_asked_for_samples_and_answers_as_before() -> None:
     assert policy.asked == 8
     only = ShieldedPolicy(Recorded([LEFT]), chooser("F[0,4] x > 1.9"), lambda move, turn, like: [move, turn])
     assert only.select_action(batch)[0].numpy() == pytest.approx(AHEAD)
+    with pytest.raises(InputError, match="one observation at a time"):  # nobody would judge the second
+        only.select_action({"observation.state": torch.zeros(2, 3)})
     shielded.reset()
     assert policy.asked == 0
 

@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch")
 transformers = pytest.importorskip("transformers")
 
 from examples import action_tokens  # noqa: E402
+from specshield.client import LocalDecision  # noqa: E402
 from specshield.errors import InputError, LogitsError  # noqa: E402
 from specshield.integrations.transformers import ShieldLogitsProcessor, score_actions  # noqa: E402
 
@@ -31,7 +32,7 @@ def drawn(model: Any, prompt: Any, tokens: Any, distribution: np.ndarray, n: int
     counts = np.zeros(len(tokens))
     torch.manual_seed(0)
     for _ in range(n):
-        decision = SimpleNamespace(distribution=tuple(distribution))
+        decision = SimpleNamespace(distribution=tuple(distribution), execute=0)
         shaping = ShieldLogitsProcessor(lambda logits, made=decision: made, tokens, **more)
         text = model.generate(
             prompt, do_sample=True, top_k=0, max_new_tokens=shaping.longest,
@@ -73,7 +74,7 @@ def test_single_tokens_are_shaped_from_the_scores_they_have(model: Any) -> None:
 
     def ask(logits: np.ndarray) -> Any:
         asked.append(logits)
-        return SimpleNamespace(distribution=(0.0, 1.0, 0.0))
+        return SimpleNamespace(distribution=(0.0, 1.0, 0.0), execute=1)
 
     shaping = ShieldLogitsProcessor(ask, tokens, temperature=0.5)
     text = model.generate(
@@ -98,3 +99,18 @@ def test_what_cannot_work_is_refused(model: Any) -> None:
 
 def test_a_model_that_says_anything_keeps_the_rule_in_every_episode() -> None:
     assert action_tokens.run(20) == 20
+
+
+@pytest.mark.parametrize(("source", "execute"), [("witness", 2), ("stop", None)])
+def test_while_the_service_is_away_the_certified_action_is_generated_or_none(
+    model: Any, source: Any, execute: int | None
+) -> None:
+    prompt, away = torch.tensor([[0, 12, 13]]), LocalDecision(3, source, execute, "away", "pending")
+    shaping = ShieldLogitsProcessor(lambda logits: away, SEVERAL, logits=np.zeros(6), eos=EOS)
+    text = model.generate(
+        prompt, do_sample=True, top_k=0, max_new_tokens=shaping.longest,
+        logits_processor=transformers.LogitsProcessorList([shaping]), pad_token_id=EOS, eos_token_id=EOS,
+    )  # fmt: skip
+    assert shaping.action(text) == execute
+    if execute is not None:
+        assert text[0, 3:].tolist()[: len(SEVERAL[execute])] == SEVERAL[execute]

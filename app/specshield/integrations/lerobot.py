@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from specshield.client.models import Decision, LocalDecision
+from specshield.errors import InputError
 from specshield.integrations.samples import Sampled
 
 
@@ -36,9 +37,12 @@ class ShieldedPolicy(Sampled):
 
     @torch.no_grad()
     def select_action(self, observation: Mapping[str, Any]) -> torch.Tensor:
-        """One action [1, D] for a batch of one observation."""
+        """One action [1, D] for a batch of one observation. Raises InputError for another."""
         batch = self._observed(observation)
         chunks = [self._policy.predict_action_chunk(dict(batch)) for _ in range(self._samples)]
+        if any(chunk.ndim != 3 or len(chunk) != 1 for chunk in chunks):
+            what, got = "one observation at a time", [list(chunk.shape) for chunk in chunks]
+            raise InputError(what, path="batch", got=got, expected="chunks of shape [1, n, D]")
         rows = [chunk[0, 0].double().cpu().numpy() for chunk in chunks]
         chosen = self._shield.choose(rows, observation)
         self.decision = chosen.decision

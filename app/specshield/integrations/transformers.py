@@ -27,7 +27,7 @@ import torch
 from transformers import LogitsProcessor
 
 from specshield.arrays import Floats
-from specshield.client.models import Decision
+from specshield.client.models import Decision, LocalDecision
 from specshield.errors import InputError, LogitsError
 
 
@@ -44,7 +44,7 @@ class ShieldLogitsProcessor(LogitsProcessor):
 
     def __init__(
         self,
-        ask: Callable[[Floats], Decision],
+        ask: Callable[[Floats], Decision | LocalDecision],
         tokens: Sequence[Sequence[int]],
         *,
         logits: Any = None,
@@ -55,14 +55,10 @@ class ShieldLogitsProcessor(LogitsProcessor):
         self._tokens = check_tokens(tokens, eos)
         self._logits = None if logits is None else np.asarray(logits, dtype=np.float64)
         if self._logits is None and self.longest > 1:
-            raise LogitsError(
-                "actions of several tokens need the model's logits of whole actions",
-                path="logits",
-                got=None,
-                expected="what score_actions gives",
-            )
+            what = "actions of several tokens need the model's logits of whole actions"
+            raise LogitsError(what, path="logits", got=None, expected="what score_actions gives")
         self._prompt = -1  # the length of the prompt, known at the first token
-        self.decision: Decision | None = None
+        self.decision: Decision | LocalDecision | None = None
 
     @property
     def longest(self) -> int:
@@ -83,15 +79,20 @@ class ShieldLogitsProcessor(LogitsProcessor):
             self.decision = self._ask(self._logits / self._temperature)
         said = tuple(input_ids[0, self._prompt :].tolist())
         shaped = torch.full_like(scores, -torch.inf)
-        for token, mass in self._following(said, self.decision.distribution).items():
+        taken = [float(i == self.decision.execute) for i in range(len(self._tokens))]
+        shares = taken if isinstance(self.decision, LocalDecision) else self.decision.distribution
+        for token, mass in self._following(said, shares).items():
             shaped[0, token] = float(np.log(mass))
         return shaped
 
-    def action(self, sequence: torch.Tensor) -> int:
+    def action(self, sequence: torch.Tensor) -> int | None:
         """The action that was generated, an index. sequence [1, n]: prompt and answer, as generate gives.
 
-        Where it is a terminal one, run `decision.completion_action` while the rule is pending.
+        Where it is a terminal one, run `decision.completion_action` while the rule is pending. None where the
+        service is away and the robot has to stand.
         """
+        if isinstance(self.decision, LocalDecision):
+            return self.decision.execute
         said = tuple(sequence[0, self._prompt :].tolist())
         found = [i for i, tokens in enumerate(self._tokens) if said[: len(tokens)] == tokens]
         if not found:
@@ -118,12 +119,8 @@ def check_tokens(tokens: Sequence[Sequence[int]], eos: int | None = None) -> lis
                 "an action needs tokens of its own", path=f"tokens[{i}]", got=list(one), expected="a new list"
             )
         if eos is None and any(other[: len(one)] == one and other != one for other in read):
-            raise InputError(
-                "this action's tokens begin another's",
-                path=f"tokens[{i}]",
-                got=list(one),
-                expected="an `eos` that tells where an action ends",
-            )
+            what, end = "this action's tokens begin another's", "an `eos` that tells where an action ends"
+            raise InputError(what, path=f"tokens[{i}]", got=list(one), expected=end)
     return read
 
 
