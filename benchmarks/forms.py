@@ -40,6 +40,8 @@ RULES = (  # what it is, the method, the rule
     ("meeting", "planner", "G[60,80] Charger1"),
     ("meeting", DEFAULT, "G[60,80] Charger1"),
     ("stay", DEFAULT, "F[0,60] G[0,20] Charger1"),
+    ("short window far away", "planner", "F[60,62] G[0,5] Charger1"),
+    ("short window far away", DEFAULT, "F[60,62] G[0,5] Charger1"),
 )
 CONFIGS = {"none": Config(), "default": SESSIONS["default"]}
 NOISES = ("none", "slip", "gaussian")

@@ -120,8 +120,7 @@ class _Motion:
         if not len(failing):
             i = int(np.argmin(asked))
             whole = self.doubtful or asked[i] > SATISFIED_ABOVE + self.judged.aimed.margin
-            known = None, self.known(self.judged.aimed.slack)
-            late, detail = known if whole else self.lacks(parts[i], row)
+            late, detail = (None, self.known(self.judged.aimed.slack)) if whole else self.lacks(parts[i], row)
             order = (KEEPS_ALL if whole else KEPT), late or 0
             return order, Explanation(str(parts[i]), float(rho[i]), late, detail)
         i = int(np.argmin(rho))
@@ -215,7 +214,8 @@ class _Motion:
             for proposer in shield.proposers if left > 0 else ():
                 given, _ = ask(proposer, history, signals, 0.0, count, left)
                 if given is not None:
-                    yield before, np.column_stack([np.full(len(given.motions), self.motion), given.motions])
+                    first = given.motions[given.motions[:, 0] == given.preferred]  # the others are no sooner
+                    yield before, np.column_stack([np.full(len(first), self.motion), first])
             before = earlier
 
     def rejoined(self, x_next: Floats) -> dict[int, list[Ints]]:
