@@ -63,7 +63,7 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
     except SpecshieldError as error:
         sys.exit(str(error))
     except OSError as error:
-        if error.filename is None:  # else it is about a file or folder that the caller named
+        if error.filename is None:  # else it is most likely a file or folder that the caller named
             raise
         sys.exit(f"{error.filename} cannot be used: {error.strerror}")
     except ModuleNotFoundError as error:

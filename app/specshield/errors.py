@@ -27,7 +27,7 @@ SpecshieldError
 │   ├── SessionFinished         a step after the end
 │   ├── SessionExists           a session id already taken
 │   ├── NameTaken               a name that another map or policy has
-│   └── InUse                   a policy that sessions still use
+│   └── InUse                   a policy or map that is still used
 ├── Unauthorized                a missing or wrong API key
 ├── CrossSite                   a request that a page of another origin made
 ├── MisdirectedRequest          a Host that is not this server's

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from subprocess import PIPE, STDOUT
 
 import httpx
 import numpy as np
@@ -20,7 +18,7 @@ from specshield.client import ShieldClient
 from specshield.sim.cases import load_case
 from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import Pose, SimulatedRobot
-from tests.serving import HUNG, serving, wait_for
+from tests.serving import serving
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -50,17 +48,6 @@ def test_a_house_of_ones_own(url: str, tmp_path: Path) -> None:
 def test_a_loop_that_nothing_disturbs(url: str, tmp_path: Path) -> None:
     assert run("robot_loop.py", url, tmp_path)[-1] == "the rule is satisfied"
     assert not list(tmp_path.iterdir())  # the notes are gone with the session
-
-
-def test_a_loop_that_is_stopped_by_ctrl_c_says_so_and_goes_on(url: str, tmp_path: Path) -> None:
-    command = [sys.executable, str(EXAMPLES / "robot_loop.py"), url]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=PIPE, stderr=STDOUT, text=True) as loop:
-        wait_for((tmp_path / robot_loop.NOTES).exists)
-        loop.send_signal(signal.SIGINT)
-        said, _ = loop.communicate(timeout=HUNG)
-    assert said == "stopped: start it again, and it goes on\n"
-    assert loop.returncode == 130
-    assert run("robot_loop.py", url, tmp_path)[-1] == "the rule is satisfied"
 
 
 class LosesAnswers(httpx.HTTPTransport):
@@ -106,6 +93,22 @@ class EventfulRobot(SimulatedRobot):
         self.motions += 1
         self.events.pop(self.motions, lambda: None)()
         super().execute(action)
+
+
+def test_a_loop_that_is_stopped_by_ctrl_c_says_so_and_goes_on(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ctrl_c() -> None:
+        raise KeyboardInterrupt  # as Python does where the signal arrives
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["robot_loop.py", url])
+    monkeypatch.setattr(robot_loop, "SimulatedRobot", lambda _, pose: EventfulRobot(pose, {5: ctrl_c}))
+    with pytest.raises(SystemExit) as ended:
+        robot_loop.main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().out == "stopped: start it again, and it goes on\n"
+    assert run("robot_loop.py", url, tmp_path)[-1] == "the rule is satisfied"
 
 
 def test_a_loop_that_goes_on_through_outage_bump_and_restart(tmp_path: Path) -> None:

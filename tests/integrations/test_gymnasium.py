@@ -131,7 +131,7 @@ def test_an_action_that_there_is_not_does_not_reach_the_environment() -> None:
     house = House()
     env = ShieldWrapper(house, LocalShield.shipped("case1"), lambda env: START)
     env.reset()
-    for action in (-1, 20, 1.7, float("nan"), None, "m", np.array([0, 1])):
+    for action in (-1, 20, 1.7, np.array(1.7), np.array(np.nan), float("nan"), None, "m", np.array([0, 1])):
         with pytest.raises(InputError, match="0 to 19"):
             env.step(action)
     assert house.executed == []

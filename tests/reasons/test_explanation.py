@@ -213,3 +213,16 @@ def test_a_slack_that_is_longer_than_the_window_is_explained_all_the_same(rule, 
     lacking = [why for why in decision.explanations if why is not None and why.robustness > 0.0]
     assert lacking
     assert all(why.late_by is None and why.detail is not None for why in lacking)
+
+
+@pytest.mark.parametrize("slack", [0, 1])
+def test_what_lacks_the_margin_is_named_and_not_what_was_near_an_edge_before(slack):
+    """The first step is 5 cm from where G ends; what is to come keeps the margin there, and F does not."""
+    cells = Cells("G[0,3] x > 0.05 and F[0,3] x > 0.4", None, {})
+    history = [cells.pose(0, 0, 0), cells.pose(1, 0, 0)]
+    proposer = Scripted(cells, lambda t, first: [0, WAIT] if first == 0 else [0])
+    shield = make_shield([proposer], Config(margin=0.2, slack=slack))
+    decision = decide(shield, history, EVEN, explain=explanations)
+    assert (decision.j_values[0], decision.j_values[WAIT]) == (1.0, 0.0)
+    assert decision.explanations[WAIT].conjunct == "F[0,3] x > 0.4"
+    assert "leaves as much of 'F[0,3] x > 0.4'" in decision.explanations[WAIT].detail

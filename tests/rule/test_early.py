@@ -35,15 +35,21 @@ RULES = [
     "G[4,9] y > 0.3 and not F[6,8] x < 0.4 and G[9,9] G[0,1] x > 0.3 and G[1,9] x > -1",
     "F[8,9] x > 0.5 and F[7,9] G[0,2] y > 0.3 and F[5,5] G[1,3] x > 0.1",  # short windows that are far away
     "(G[4,9] y > 0.3 and F[0,5] x > 0.4) or not F[2,8] x < 0.4",
+    "F[0,8] (x > 0.4 and not (not F[0,6] y > 0.3)) and (F[0,8] x > 0.9 -> not (y < 9 U[0,7] y > 0.6))",
     "x > 0.5 and not y > 0.4",  # nothing is left open of it, and it has conjuncts all the same
 ]
 
 
-def met_early(formula, start, samples, t, early):
-    """rho at a step, where what x_{0:t} has yet to show of an F or U is asked for so many steps early."""
+def met_early(formula, start, samples, t, early, turned=0):
+    """rho at a step, where what x_{0:t} has yet to show of an F or U is asked for so many steps early, and
+    `turned` steps of those that are below a `not`.
+    """
 
     def at(part, steps):
-        return [met_early(part, start + k, samples, t, early) for k in steps]
+        return [met_early(part, start + k, samples, t, early, turned) for k in steps]
+
+    def negated(part):
+        return -met_early(part, start, samples, t, turned, early)
 
     match formula:
         case Eventually(a, b) | Until(a, b):
@@ -59,9 +65,9 @@ def met_early(formula, start, samples, t, early):
         case Or(children):
             return max(at(child, [0])[0] for child in children)
         case Implies(left, right):
-            return max(-at(left, [0])[0], at(right, [0])[0])
+            return max(negated(left), at(right, [0])[0])
         case Not(child):
-            return -at(child, [0])[0]
+            return negated(child)
     rho = float(robustness(formula, {name: samples[name][start : start + 1] for name in formula.names}))
     return rho if start > t else math.copysign(math.inf, rho if rho > SATISFIED_ABOVE else -1.0)
 

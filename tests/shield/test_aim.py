@@ -231,3 +231,17 @@ def test_on_its_way_a_robot_may_do_all_that_keeps_the_slack(slack):
             motion = int(random.choice(np.flatnonzero(found.j_values[:4])))
             history, carry = [*history, found.next_poses[motion]], found.carry
     assert min(allowed[1], sum(allowed.values()) - allowed[1]) > 5
+
+
+@pytest.mark.parametrize(
+    "formula", ["F[0,6] x < 0.25 -> F[0,3] y > 9", "not F[0,6] x < 0.25", "G[0,6] x > 0.25"]
+)
+@pytest.mark.parametrize("slack", [0, 3])
+def test_the_margin_to_what_must_not_be_reached_stays_to_the_end_of_its_window(formula, slack):
+    """Forward leads to 5 cm from it, also in the last steps of the window."""
+    cells = Cells(formula, None, {})
+    shield = make_shield([Scripted(cells, lambda t, first: [])], Config(margin=0.1, slack=slack))
+    for waited in range(6):
+        poses = [cells.pose(2, 0, 2)] * (waited + 1)
+        found = decide(shield, poses, np.zeros(5))
+        assert (found.j_values[FORWARD], found.j_values[WAIT]) == (0.0, 1.0)

@@ -191,7 +191,7 @@ class Transport(httpx.HTTPTransport):
 
 
 class AsyncTransport(threading.local, httpx.AsyncHTTPTransport):
-    """The same for asyncio. Connections are their event loop's: each loop and each thread has its own."""
+    """The same for asyncio. Each thread has its own connections, and opens new ones for another loop."""
 
     def __init__(self, url: httpx.URL) -> None:
         super().__init__(verify=_certificates())

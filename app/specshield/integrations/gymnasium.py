@@ -16,7 +16,9 @@ to lie beyond the rule's horizon.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, SupportsFloat, SupportsIndex
+from contextlib import suppress
+from operator import index
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -79,10 +81,11 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         assert self.session is not None, "reset comes before step"
         assert self.decision is not None
         decision, session, over = self.decision, self.session, self.session.main_task_done
-        n, terminal = len(decision.distribution), session.info.terminal_actions
-        if not (np.ndim(action) == 0 and isinstance(action, SupportsIndex) and 0 <= int(action) < n):
+        n, terminal, executed = len(decision.distribution), session.info.terminal_actions, -1
+        with suppress(TypeError):  # no whole number
+            executed = index(action)
+        if not 0 <= executed < n:
             raise InputError("no such action", path="action", got=action, expected=f"0 to {n - 1}")
-        executed = int(action)
         ends = executed in terminal and decision.distribution[executed] > 0.0 and not over
         if ends and decision.completion_action is not None:
             executed = decision.completion_action
@@ -93,7 +96,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         settled = session.spec_status != "pending"
         terminated = session.main_task_done and settled
         truncated = not terminated and (bool(truncated) or session.finished)
-        told |= {"executed": executed, "overruled": executed != int(action)}
+        told |= {"executed": executed, "overruled": executed != index(action)}
         if terminated or truncated:
             told["verdict"] = session.close()
         return observation, 0.0 if over else reward, terminated, truncated, {**info, **told}

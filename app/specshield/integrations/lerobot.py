@@ -37,7 +37,7 @@ class ShieldedPolicy(Sampled):
 
     @torch.no_grad()
     def select_action(self, observation: Mapping[str, Any]) -> torch.Tensor:
-        """One action [1, D] for a batch of one observation. Raises InputError for another."""
+        """One action [1, D]. Raises InputError for a batch of several observations."""
         batch = self._observed(observation)
         chunks = [self._policy.predict_action_chunk(dict(batch)) for _ in range(self._samples)]
         if any(chunk.ndim != 3 or len(chunk) != 1 for chunk in chunks):

@@ -99,12 +99,12 @@ class _Motion:
         place. poses [n, t + 1 + m, 3]: along which rho is.
         """
         part, early, t, asked = self.judged.part, self.judged.aimed.early, self.prefix.t, rho.copy()
-        if early.any():
+        if len(early):  # else J is made of the conjuncts as a whole
             whole, joint = conjunction_of(part.task, part.formula)
             seen, still = part.of(whole), np.empty(len(early), np.bool_)
             _, leaves = rho_of(seen, np.ascontiguousarray(poses[:, t + 1 :]))
             find_open(joint, seen.known, t, still)
-            for k, each in enumerate(conjuncts(part.formula)):
+            for k, each in enumerate(conjuncts(part.formula)[: len(early)]):
                 if still[k] and each in parts:
                     only = np.arange(len(still)) == k
                     rate_open(joint, only, t, early, leaves, asked[parts.index(each)])
@@ -120,7 +120,7 @@ class _Motion:
         if not len(failing):
             i = int(np.argmin(asked))
             whole = self.doubtful or asked[i] > SATISFIED_ABOVE + self.judged.aimed.margin
-            late, detail = (None, self.known(self.judged.aimed.slack)) if whole else self.lacks(parts[i], row)
+            late, detail = (None, self.known(parts[i], 0)) if whole else self.lacks(parts[i], row)
             order = (KEEPS_ALL if whole else KEPT), late or 0
             return order, Explanation(str(parts[i]), float(rho[i]), late, detail)
         i = int(np.argmin(rho))
@@ -156,23 +156,20 @@ class _Motion:
         """Of a conjunct that is kept along `row`, but not as J asks: how many steps late it is for that, None
         where steps are no measure of it; and what is lacking, in words.
         """
-        aimed, above = self.judged.aimed, SATISFIED_ABOVE + self.judged.aimed.margin
-        reserves = zip(conjuncts(self.judged.part.formula), aimed.early.tolist(), strict=False)
-        reserve = dict(reserves).get(part, 0)
+        parts, early = conjuncts(self.judged.part.formula), self.judged.aimed.early.tolist()
+        reserve = dict(zip(parts, early, strict=False)).get(part, 0)
         asked = later(part, -reserve) if reserve else None
-        if asked is not None and float(values_of(asked, row)) <= above:  # it is not a window deeper in it
-            late = late_by(asked, row, self.prefix.t, above)
+        if asked is not None and float(values_of(asked, row)) <= SATISFIED_ABOVE:
+            late = late_by(asked, row, self.prefix.t, SATISFIED_ABOVE)
             if late is not None:
                 return late, (
                     f"a way was found after it that keeps the rule, but none with the {steps(reserve)} in "
-                    f"reserve that the session asks for: on the best one {when(asked, late)} for that"
+                    f"reserve that other actions leave: on the best one {when(asked, late)} for that"
                 )
-        return None, self.known(reserve)
+        return None, self.known(part, reserve)
 
-    def known(self, reserve: int) -> str:
-        """Why a motion is forbidden of which a future is known that keeps the rule. reserve [steps]: what is
-        asked for in hand.
-        """
+    def known(self, part: Formula, reserve: int) -> str:
+        """Why a motion is forbidden though a known future keeps the rule. reserve [steps]: as in `lacks`."""
         if self.doubtful:
             return (
                 "the rule could still be kept, but only by what led nowhere before, or by an obstacle that "
@@ -188,8 +185,8 @@ class _Motion:
         if not found:
             return "a way is known that keeps the rule, but the policies did not find it"
         return (
-            "the rule could still be kept, but no way that was found leaves as much to spare as the session "
-            f"asks for ({judged.aimed.margin:.2g} m, and {steps(reserve)} at the next deadline)"
+            f"the rule could still be kept, but no way that was found leaves as much of '{part}' to spare as "
+            f"other actions do ({judged.aimed.margin:.2g} m, {steps(reserve)})"
         )
 
     def futures(self) -> Iterator[tuple[int, Ints]]:

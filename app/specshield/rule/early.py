@@ -2,8 +2,7 @@
 
 What the prefix has settled is left out. An F or U is asked for so many steps before its window ends, or where
 it is met already; a G of a predicate that has yet to begin, or what a short window far away asks for, so many
-steps before; any other G from the first step on at which its child is open. All is read off leaves' values.
-Where a `not` stands above an F, that asks for less, but nothing counts that does not keep the whole rule.
+steps before; any other G from the first step on at which its child is open. What is below a `not` stays.
 """
 
 from __future__ import annotations
@@ -31,7 +30,8 @@ class Conjuncts(NamedTuple):
     OTHER: none, all is in `below`. at [K]: where in the buffer values begin that it ranges over. a, b [K]:
     its window [steps]. horizon [K]: of what is below [steps]. half [K]: half of the longest window of an F or
     U in it [steps]; of a G whose values are in the buffer from step 0 on, half of the time until it begins.
-    plain [K]: whether what is below is a predicate, or under F a G of one. owner [n]: each node's conjunct.
+    plain [K]: whether what is below is a predicate, or under F a G of one. owner [n]: each node's conjunct;
+    -1 where it is `turned`, and a shorter window would ask for less.
     """
 
     below: Tree
@@ -61,10 +61,10 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
         rest = len(own.op)
         if isinstance(part, (Always, Eventually)):
             rest, row = rest - 1, (own.op[-1], size + part.a * early, part.a, part.b, part.child.horizon)
-        halves = (own.b - own.a)[np.isin(own.op, (EVENTUALLY, UNTIL))] // 2
+        halves = (own.b - own.a)[np.isin(own.op, (EVENTUALLY, UNTIL)) & ~own.turned] // 2
         rows.append((*row, halves.max(initial=row[2] // 2 * early)))
         kept += [True] * rest + [False] * (len(own.op) - rest + (k > 0))  # without the `and`
-        owner += [k] * rest
+        owner += np.where(own.turned, -1, k)[:rest].tolist()
         size += own.size
     below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:7]})  # of its nodes
     columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
@@ -118,14 +118,15 @@ def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Float
             for i in range(parts.below.leaf_at[n], first + min(parts.below.leaf_stop[n], t + 1)):
                 buffer[i] = np.inf if buffer[i] > SATISFIED_ABOVE else -np.inf
         for n in range(parts.owner.shape[0]):
-            _apply_early(parts.below, n, t, early[parts.owner[n]] if some else 0, buffer, scratch)
+            sooner = early[parts.owner[n]] if some and parts.owner[n] >= 0 else 0
+            _apply_early(parts.below, n, t, sooner, buffer, scratch)
         least = np.inf
         for k in range(still.shape[0]):
             a, b = parts.a[k], parts.b[k]
             if some and parts.kind[k] == EVENTUALLY:
-                sooner = min(early[k], (b - a) // 2)
-                b = max(b - sooner, min(b, t))
-                lead = min(early[k], parts.half[k]) - sooner if parts.plain[k] and a > t else 0
+                end = min(early[k], (b - a) // 2)
+                b = max(b - end, min(b, t))
+                lead = min(early[k], parts.half[k]) - end if parts.plain[k] and a > t else 0
                 for i in range(parts.at[k] + b - a, parts.at[k] - 1, -1):
                     buffer[i] = buffer[i - lead : i + 1].min()
             elif some and parts.kind[k] == ALWAYS:

@@ -82,19 +82,11 @@ def check_place(shield: Shield, pose: Floats, path: str) -> None:
     """Raises PoseError, at `path`, for a pose (3,) that is outside the map or in collision."""
     grid, got = shield.task.grid, pose.tolist()
     if not grid.holds(pose[:2]):
-        raise PoseError(
-            "the pose is outside the map",
-            path=path,
-            got=got,
-            expected=f"within {list(grid.bounds)} (xmin, ymin, xmax, ymax)",
-        )
+        within = f"within {list(grid.bounds)} (xmin, ymin, xmax, ymax)"
+        raise PoseError("the pose is outside the map", path=path, got=got, expected=within)
     if in_collision(shield.body, *pose):
-        raise PoseError(
-            "the footprint touches an obstacle",
-            path=path,
-            got=got,
-            expected=f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle",
-        )
+        apart = f"the footprint's centre at least {shield.task.robot.radius:g} m from every obstacle"
+        raise PoseError("the footprint touches an obstacle", path=path, got=got, expected=apart)
 
 
 def close(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Floats, Ints
+from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import inlined, leaf
 from specshield.stl.conjunction import is_predicate
 from specshield.stl.formula import Always, And, Eventually, Formula, Implies, Not, Or, Until
@@ -47,6 +47,13 @@ class Tree(NamedTuple):
     high: Floats
     programs: Programs
     size: int
+
+    @property
+    def turned(self) -> Bools:
+        """Whether an odd number of `not` stands above a node, [n]."""
+        # What is below a node comes before it, and begins where it begins or later.
+        above = [(self.op[n:] == NOT) & (self.at[n:] <= self.at[n]) for n in range(len(self.op))]
+        return np.array([each.sum() % 2 for each in above], np.bool_)
 
 
 def compile_tree(formula: Formula, slots: Mapping[str, int]) -> Tree:
