@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -90,14 +91,16 @@ def worlds(
 ) -> None:
     """Measure what a session keeps in worlds that are not as it was told, beside an oracle that was."""
     from evaluation.worlds.campaign import compare
-    from evaluation.worlds.runs import Trial
+    from evaluation.worlds.robots import ROBOTS
+    from evaluation.worlds.runs import SENSING, Trial
+    from evaluation.worlds.world import WORLDS
 
     trials = [
         Trial(each, name, senses, seed, slack < 0, max(slack, 0), robot=body)
-        for body in _some(robot, "stretch,locobot,trailing,arcs", "--robot")
+        for body in _some(robot, ROBOTS, "--robot")
         for each in case.split(",")
-        for name in _some(world, "told,obstacle,shift,collider,person", "--world")
-        for senses in _some(sensing, "scan,contact,none", "--sensing")
+        for name in _some(world, WORLDS, "--world")
+        for senses in _some(sensing, SENSING, "--sensing")
     ]
     compare(trials, runs, out, processes or os.cpu_count() or 1)
 
@@ -122,7 +125,7 @@ def results(
     from evaluation.houses import houses_in
     from evaluation.plan import carry_out
 
-    kinds = _some(only, "cases,noise,bodies,houses,models,tasks", "--only") if only else []
+    kinds = _some(only, ("cases", "noise", "bodies", "houses", "models", "tasks"), "--only") if only else []
     failed = carry_out(out, page, houses_in(houses), kinds, share, processes or os.cpu_count() or 1)
     raise typer.Exit(1 if failed else 0)
 
@@ -227,12 +230,13 @@ def report(
     writeup.write_up(results, out)
 
 
-def _some(text: str, known: str, option: str) -> list[str]:
+def _some(text: str, known: Iterable[str], option: str) -> list[str]:
     """The names in a text, all of which have to be known."""
-    found = text.split(",")
+    found, names = text.split(","), list(known)
     for name in found:
-        if name not in known.split(","):
-            raise InputError("there is no such name", path=option, got=name, expected=f"some of {known}")
+        if name not in names:
+            expected = f"some of {','.join(names)}"
+            raise InputError("there is no such name", path=option, got=name, expected=expected)
     return found
 
 
