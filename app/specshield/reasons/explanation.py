@@ -67,7 +67,7 @@ class _Motion:
     doubtful: bool
 
     def explained(self) -> Explanation:
-        """By its most telling future: one that keeps all conjuncts, at best with less to spare than J asks for;
+        """By its most telling future: one that keeps all conjuncts, best with less to spare than J asks for;
         else all but one, the least late or else the most robust; else the one that comes nearest to keeping
         all, and the conjunct that it keeps least.
         """
@@ -95,8 +95,8 @@ class _Motion:
         return [*kept, *again(broken, prefix.t + 1)] or [prefix.formula]
 
     def asked(self, parts: Sequence[Formula], rho: Floats, poses: Floats) -> Floats:
-        """What J is the least of: rho [parts, n] of the conjuncts, or for those that are open, where margin or
-        slack is asked for, of what is asked in their place. poses [n, t + 1 + m, 3]: of the futures.
+        """What J is the least of: rho [parts, n] of the conjuncts, or of what is asked in place of those that
+        are open, where margin or slack is asked for. poses [n, t + 1 + m, 3]: of the futures.
         """
         part, early, t, asked = self.judged.part, self.judged.aimed.early, self.prefix.t, rho.copy()
         if len(early):  # else J is made of the conjuncts as a whole
