@@ -1,6 +1,9 @@
 """The kinds of arrays that pass between modules, named after what they hold; docstrings give their shapes."""
 
+from typing import Any, TypeVar
+
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from specshield.compiled import inlined
@@ -13,6 +16,17 @@ Bytes = NDArray[np.uint8]
 Singles = NDArray[np.float32]
 Int32s = NDArray[np.int32]
 Codes = NDArray[np.uint16]
+Kind = TypeVar("Kind", bound=np.generic)
+
+
+def pooled(array: NDArray[Kind], join: np.ufunc, reach: int, axis: int, mode: Any = "edge") -> NDArray[Kind]:
+    """What `join` makes of the values at most `reach` places away along an axis. mode: what lies beyond its
+    ends, as numpy.pad has it. scipy.ndimage has the like, and takes 0.2 s to import.
+    """
+    sides = [(reach, reach) if a == axis else (0, 0) for a in range(array.ndim)]
+    windows = sliding_window_view(np.pad(array, sides, mode), 2 * reach + 1, axis)
+    result: NDArray[Kind] = join.reduce(list(np.moveaxis(windows, -1, 0)))
+    return result
 
 
 @inlined

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import sys
 from collections.abc import Callable
 from itertools import islice
 from typing import Any, NamedTuple
 
 import numba
 from llvmlite.binding import parse_assembly
-from numba.core import compiler
+from numba.core import compiler, environment
+from numba.core.environment import Environment
+from numba.core.runtime.nrt import rtsys
 
 njit: Any = numba.njit  # its types leave out the options
 Base: Any = compiler.Compiler
@@ -28,6 +31,22 @@ LONG = 700
 POSSIBLE = "reload_init" in getattr(compiler.CompileResult, "_fields", ())
 _callees: dict[tuple[str, str], Any] = {}  # by module and name
 _symbols: dict[str, tuple[Any, ...]] = {}  # the types of arguments that each stands for
+
+
+def _environment(module: str, constants: list[Any], name: str) -> Any:
+    """What compiled code needs of Python. numba imports the module for it; of its own, which take 0.3 s to
+    import, no kernel reads anything.
+    """
+    if not module.startswith("numba.") or module in sys.modules or name in Environment._memo:
+        return _rebuild_env(module, constants, name)
+    made: Any = Environment({"__name__": module})
+    made.consts[:], made.env_name = constants, name
+    Environment._memo[name] = made
+    return made
+
+
+_rebuild_env: Any = environment._rebuild_env
+environment._rebuild_env = _environment
 
 
 class Entry(Base):  # type: ignore[misc]
@@ -104,9 +123,10 @@ def callee(function: Function, options: dict[str, Any], kept: Callable[[Any], An
 
 def load_whole(compiled: Any) -> None:
     """From now on, what this takes from the disk loads all that it calls, or is compiled anew."""
-    load = compiled._cache.load_overload
+    load = compiled._cache._load_overload
 
     def load_with_callees(types: Any, context: Any) -> Any:
+        rtsys.initialize(context)  # of the compiler, whose parts take 0.3 s to import, it needs no more
         try:
             kernel = load(types, context)
         except _GoneError:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+import scipy
 
 from specshield.arrays import Bools
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, Rules, goals_of
@@ -69,5 +69,5 @@ def places_that_matter(task: Task, body: Body, rules: Rules, pitch: float) -> Bo
         if there.any():
             first = rules.a[k] + (rules.b[k] if rules.kind[k] == EVENTUALLY_ALWAYS else 0)
             steps = max(int(rules.last[k]), over - int(first))
-            kept &= distance_transform_edt(~there) * pitch <= steps * move + pitch
+            kept &= scipy.ndimage.distance_transform_edt(~there) * pitch <= steps * move + pitch
     return kept

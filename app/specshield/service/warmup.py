@@ -13,13 +13,13 @@ import gc
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from llvmlite.binding import ffi
 from numba.core.compiler import Flags
 
-from specshield.policy.dqn.network import make_network
+from specshield.policy.dqn.network import Network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.progress import make_rules
@@ -38,7 +38,7 @@ from specshield.shield.uncertainty import Uncertainty
 from specshield.task import Task, make_task
 from specshield.world.occupancy import OccupancyGrid
 
-FORMULA = "F[0,3] A and F[0,2] G[0,1] B and G[0,4] not C"
+FORMULA = "F[0,3] A and F[0,2] G[0,1] B and G[1,4] not C"
 REGIONS = {
     "A": {"type": "circle", "center": [1.0, 1.0], "radius": 1.0},
     "B": {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 2.0]},
@@ -66,7 +66,7 @@ def _decide(task: Task) -> None:
     """What the shield takes to begin a session, to decide and to refuse, with a DQN that proposes: in a world
     that is as told, and by a session's defaults.
     """
-    policy = Policy(task, {"id": "warm-up"}, make_network(_weights(task), *_sizes(task)))
+    policy = Policy(task, {"id": "warm-up"}, _network(task))
     logits = np.zeros(len(STRETCH.actions))
     for config in (Config(), Config(uncertainty=Uncertainty(), learn_map=True)):
         shield = make_shield([policy], config)
@@ -98,24 +98,16 @@ PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield an
 
 
 def _task() -> Task:
-    occupied = np.zeros((20, 20), bool)
-    occupied[0] = True
-    return make_task(OccupancyGrid(occupied, 0.1), STRETCH, FORMULA, REGIONS)
+    """One in which every cell can be reached: for others scipy is imported, for a fifth of the whole time."""
+    small = replace(STRETCH, radius=0.01)
+    return make_task(OccupancyGrid(np.zeros((20, 20), bool), 0.1), small, FORMULA, REGIONS)
 
 
-def _sizes(task: Task) -> tuple[int, int]:
+def _network(task: Task) -> Network:
     body = make_body(task.robot, task.grid)
-    return observation_size(make_rules(task), body), motion_count(body)
-
-
-def _weights(task: Task) -> dict[str, np.ndarray]:
-    inputs, outputs = _sizes(task)
-    sizes = [inputs, 4, 4, outputs]
-    weights: dict[str, np.ndarray] = {}
-    for i in range(3):
-        weights[f"w{i + 1}"] = np.zeros((sizes[i], sizes[i + 1]), np.float32)
-        weights[f"b{i + 1}"] = np.zeros(sizes[i + 1], np.float32)
-    return weights
+    inputs, outputs = observation_size(make_rules(task), body), motion_count(body)
+    shapes = ((inputs, 4), 4, (4, 4), 4, (4, outputs), outputs)
+    return Network(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
 def _hasten() -> None:
@@ -123,7 +115,6 @@ def _hasten() -> None:
     gc.set_threshold(100_000, 50, 50)  # compiling makes millions of small objects
     flags: Any = Flags
     with contextlib.suppress(AttributeError):  # a numba that does it otherwise
-        ffi.lib._lock._cblist.clear()  # each call of LLVM is told to clocks that nobody reads
         defaults = {name: option.default for name, option in flags.options.items()}
         if flags()._values == {}:  # otherwise a hundred thousand comparisons ask for each option by itself
             flags.values = lambda flags: {**defaults, **flags._values}

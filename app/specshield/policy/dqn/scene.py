@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
@@ -88,9 +88,9 @@ def make_scene(task: Task) -> Scene:
 def _filled(distance: Floats, resolution: float) -> Floats:
     """The field made finite: a cell that no way reaches counts as a detour by the nearest one reached."""
     reached = np.isfinite(distance)
-    if not reached.any():
-        return np.full_like(distance, UNREACHABLE)
-    gap, nearest = ndimage.distance_transform_edt(~reached, sampling=resolution, return_indices=True)
+    if reached.all() or not reached.any():
+        return np.where(reached, distance, UNREACHABLE)
+    gap, nearest = scipy.ndimage.distance_transform_edt(~reached, sampling=resolution, return_indices=True)
     filled: Floats = distance[tuple(nearest)] + OFF_THE_WAY * gap
     return filled
 

@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
-from specshield.arrays import Bools, Bytes, Floats
+from specshield.arrays import Bools, Bytes, Floats, pooled
 from specshield.compiled import kernel
 from specshield.policy.lattice import Lattice, pose_of
 from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, value_count
@@ -111,14 +110,9 @@ def look(
 
 def about(inner: Bools) -> Bools:
     """Where some pose of `inner` is at most CELLS_ABOUT cells and HEADINGS_ABOUT headings away."""
-    near = cells_about(inner, CELLS_ABOUT)
-    found: Bools = maximum_filter1d(near, 2 * HEADINGS_ABOUT + 1, axis=2, mode="wrap")
-    return found
+    return pooled(cells_about(inner, CELLS_ABOUT), np.logical_or, HEADINGS_ABOUT, 2, mode="wrap")
 
 
 def cells_about(inner: Bools, reach: int) -> Bools:
     """The cells [ny, nx, ...] that have one of `inner` at most `reach` cells away along both axes."""
-    found = inner
-    for axis in (0, 1):
-        found = maximum_filter1d(found, 2 * reach + 1, axis=axis, mode="constant")
-    return found
+    return pooled(pooled(inner, np.logical_or, reach, 0), np.logical_or, reach, 1)

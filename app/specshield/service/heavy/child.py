@@ -27,12 +27,10 @@ from specshield.errors import SpecshieldError
 
 LIMITS = struct.Struct("<QB")  # most memory [bytes], niceness
 LENGTH = struct.Struct("<Q")
-PRELOADED = ("specshield.service.heavy.uploads",)
 
 
 def template(control: socket.socket) -> None:
-    for module in PRELOADED:
-        importlib.import_module(module)
+    importlib.import_module("specshield.service.heavy.uploads")
     gc.collect()
     gc.freeze()  # the forks leave these pages as they are, and share them
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server

@@ -37,7 +37,6 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.training.jobs import Jobs
 from specshield.task import names_for, parse_regions, parse_signals
 from specshield.world.formats import read_map
-from specshield.world.regions import Polygon
 
 T = TypeVar("T")
 Content = bytes | Path  # a body, or the file that it is in
@@ -48,8 +47,6 @@ MOST_WINDOWS = 100  # shown of a formula
 REQUEST = TypeAdapter(PolicyRequest)
 CARD = TypeAdapter(Card)
 SPEC = TypeAdapter(SpecRequest)
-
-Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))  # loads numba's compiler, once for all forks
 
 
 @cache

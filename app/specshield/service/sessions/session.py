@@ -131,27 +131,24 @@ def needed(rules: Sequence[Mapping[str, Any]], state: State) -> set[str]:
 
 def check_step(session: Session, request: StepBody) -> None:
     """Raises what is wrong with asking for a step that was not decided before."""
-    state, t = session.state, request.t
-    if state.finished:
+    check_ahead(session, request.t, f"step {request.t} was passed over and can no longer be decided")
+    check_last(request.t, session.config["max_steps"])
+    check_main_task(session.state.main_task_done, request.main_task_done)
+
+
+def check_ahead(session: Session, t: int, otherwise: str) -> None:
+    """Raises SessionFinished, or StepConflict saying `otherwise`, unless step t can follow those decided."""
+    if session.state.finished:
         raise over(session, t)
-    check_last(t, session.config["max_steps"])
-    if t < state.next_t:
-        raise StepConflict(
-            f"step {t} was passed over and can no longer be decided",
-            path="t",
-            got=t,
-            expected=f"{state.next_t} or later",
-            expected_t=state.next_t,
-        )
-    check_main_task(state.main_task_done, request.main_task_done)
+    ahead = session.state.next_t
+    if t < ahead:
+        raise StepConflict(otherwise, path="t", got=t, expected=f"{ahead} or later", expected_t=ahead)
 
 
 def check_last(t: int, last: int) -> None:
-    """last: the session's max_steps. Raises InputError for a step that comes after it."""
+    """last: the session's. Raises InputError for a step that comes after it."""
     if t > last:
-        raise InputError(
-            f"step {t} is past the session's max_steps", path="t", got=t, expected=f"at most {last}"
-        )
+        raise InputError(f"step {t} is past the session's last", path="t", got=t, expected=f"at most {last}")
 
 
 def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:

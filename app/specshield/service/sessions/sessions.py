@@ -32,6 +32,7 @@ from specshield.service.sessions.config import asked_by, asked_for, stored
 from specshield.service.sessions.session import (
     RACES,
     Session,
+    check_last,
     columns,
     contended,
     describe,
@@ -145,14 +146,7 @@ class Sessions:
             session = Session.of(there(await self._store.load(id), id))
             state = session.state
             if request.t is not None and request.poses is not None:
-                last = session.config["max_steps"] + 1  # where the last step led
-                if request.t > last:
-                    raise InputError(
-                        f"step {request.t} is past the session's last",
-                        path="t",
-                        got=request.t,
-                        expected=f"at most {last}",
-                    )
+                check_last(request.t, session.config["max_steps"] + 1)  # where the last step led
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
                     raise over(session, request.t)

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import HistoryGap, InputError, LimitReached, SpecshieldError, StepConflict
+from specshield.errors import HistoryGap, InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION
 from specshield.reasons import refusal
 from specshield.service.heavy.heavy import Heavy
@@ -21,11 +21,11 @@ from specshield.service.sessions.config import asked_by, settings_of
 from specshield.service.sessions.session import (
     RACES,
     Session,
+    check_ahead,
     check_last,
     columns,
     contended,
     describe,
-    over,
     pack,
     there,
 )
@@ -120,17 +120,8 @@ def _wanted(
     session: Session, request: SwitchRequest, policy_ids: Sequence[str], step: bytes | None
 ) -> Wanted:
     """step: what the decision before x_t left. Raises what is wrong with asking for it."""
-    state, t = session.state, request.t
-    if state.finished:
-        raise over(session, t)
-    if t < state.next_t:
-        raise StepConflict(
-            f"step {t} is decided, or was passed over: no other rule can hold there",
-            path="t",
-            got=t,
-            expected=f"{state.next_t} or later",
-            expected_t=state.next_t,
-        )
+    t = request.t
+    check_ahead(session, t, f"step {t} is decided, or was passed over: no other rule can hold there")
     if len(session.rules) >= rules.MOST_RULES:
         raise LimitReached(
             f"a session has at most {rules.MOST_RULES} rules", expected="a new session for what follows"

@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.ndimage import minimum_filter
 
-from specshield.arrays import Bools, Floats, Int8s
+from specshield.arrays import Bools, Floats, Int8s, pooled
 from specshield.compiled import inlined, kernel
 from specshield.policy.geodesic import geodesic_distance
 from specshield.policy.progress import ALWAYS, PENDING, Rules
@@ -63,8 +62,8 @@ def distances(body: Body, goals: Bools) -> Floats:
     for goal, far in zip(goals, found, strict=True):
         if goal.any():
             far[:] = geodesic_distance(free, goal, coarse * h)
-            beside = minimum_filter(far, 3) + coarse * h  # a pose may be in a cell whose centre is not free
-            far[:] = np.where(np.isinf(far), beside, far)
+            beside = pooled(pooled(far, np.minimum, 1, 0), np.minimum, 1, 1)
+            far[:] = np.where(np.isinf(far), beside + coarse * h, far)  # of a cell whose centre is not free
     return found
 
 
