@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 import numba
 from llvmlite.binding import parse_assembly
 from numba.core import compiler, environment
-from numba.core.environment import Environment
 from numba.core.runtime.nrt import rtsys
 
 njit: Any = numba.njit  # its types leave out the options
 Base: Any = compiler.Compiler
+Environment: Any = environment.Environment
 Function = Callable[..., Any]
 # [instructions of LLVM, optimised] A kernel of no more is still written into those that call it. With 250 the
 # first start took as long, and decisions 1.013 times (`python -m benchmarks.episodes --against`).
@@ -39,7 +39,7 @@ def _environment(module: str, constants: list[Any], name: str) -> Any:
     """
     if not module.startswith("numba.") or module in sys.modules or name in Environment._memo:
         return _rebuild_env(module, constants, name)
-    made: Any = Environment({"__name__": module})
+    made = Environment({"__name__": module})
     made.consts[:], made.env_name = constants, name
     Environment._memo[name] = made
     return made

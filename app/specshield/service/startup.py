@@ -70,7 +70,7 @@ class Startup:
 
     def compiled(self) -> int:
         """The kernels that were compiled since the start."""
-        return min(compiled.on_disk() - (self.before or 0), KERNELS)
+        return min(max(compiled.on_disk() - (self.before or 0), 0), KERNELS)
 
 
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
