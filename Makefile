@@ -8,7 +8,7 @@ export NUMBA_CACHE_DIR ?= $(CURDIR)/.venv/numba-cache
 # Its tests start some 200 processes; without bytecode on the disk each compiles all that it imports.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: install demo run test wheels lint lines docs bench reliability results openapi clean
+.PHONY: install demo run test wheels lowest lint lines docs bench reliability results openapi clean
 
 install: .venv/.dev
 
@@ -38,6 +38,10 @@ test: .venv/.dev
 # processor. Both are installed in a new environment and run in an empty folder, as a newcomer would.
 wheels: .venv/bin/python
 	$(BIN)/python .ci/wheel.py
+
+# The oldest packages that pyproject.toml allows, in a new environment.
+lowest: .venv/bin/python
+	$(BIN)/python .ci/lowest.py
 
 lint: .venv/.dev
 	$(BIN)/ruff check app evaluation tests benchmarks examples ros2

@@ -114,10 +114,10 @@ def count(kernels: Path) -> int:
     return sum(1 for _ in kernels.rglob("*.nbi"))
 
 
-def demo(python: Path, empty: Path, environment: dict[str, str]) -> float:
+def demo(python: Path, empty: Path, environment: dict[str, str], *more: str) -> float:
     """Seconds that the demo took."""
     began = time.monotonic()
-    run([str(python.with_name("specshield")), "demo"], cwd=empty, env=environment)
+    run([str(python.with_name("specshield")), "demo", *more], cwd=empty, env=environment)
     assert sorted(path.name for path in (empty / "out").iterdir()) == ["case1.png", "case2.png"]
     shutil.rmtree(empty / "out")
     return time.monotonic() - began

@@ -120,7 +120,7 @@ def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     once more for each such number, which took a sixth of all the time that compiling takes.
     """
     compiled = called = _kept(njit(cache=True, pipeline_class=linking.Entry, **options)(function))
-    if linking.POSSIBLE and function.__closure__ is None:
+    if function.__closure__ is None:
         linking.load_whole(compiled)
         called = linking.callee(function, options, _kept)
     template = called.get_call_template

@@ -26,9 +26,6 @@ Function = Callable[..., Any]
 # [instructions of LLVM, optimised] A kernel of no more is still written into those that call it. With 250 the
 # first start took as long, and decisions 1.013 times (`python -m benchmarks.episodes --against`).
 LONG = 700
-# Whether this numba has what it takes, of which its manual says nothing. Otherwise the kernels are compiled
-# as numba does it, in twice the time.
-POSSIBLE = "reload_init" in getattr(compiler.CompileResult, "_fields", ())
 _callees: dict[tuple[str, str], Any] = {}  # by module and name
 _symbols: dict[str, tuple[Any, ...]] = {}  # the types of arguments that each stands for
 

@@ -1,0 +1,48 @@
+"""Installs the wheel with the oldest version that it allows of each package it names, and uses it.
+
+    make lowest     # an environment in which older packages are pinned has to work, or to be refused by pip
+
+Raises CalledProcessError or AssertionError where something does not work.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from wheel import build, demo, install, run
+
+EXTRAS = "server,stream,minigrid,recordings"
+MODULES = "client local integrations.gymnasium recordings.foxglove recordings.rerun recordings.tables"
+COMMANDS = "check-drive demo doctor export keys openapi policy run serve train verify watch worker"
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory(prefix="specshield-lowest-") as name:
+        folder = Path(name)
+        tool, environment, empty = folder / "uv" / "bin" / "python", folder / "venv", folder / "empty"
+        empty.mkdir()
+        run([sys.executable, "-m", "venv", str(folder / "uv")])
+        install(tool, "uv")
+        uv = str(tool.with_name("uv"))
+        run([uv, "venv", "--quiet", "--python", sys.executable, str(environment)])
+        python = environment / "bin" / "python"
+        wheel = build(folder / "wheel", {})
+        packages = ["--resolution", "lowest-direct", f"specshield[{EXTRAS}] @ {wheel.as_uri()}"]
+        run([uv, "pip", "install", "--quiet", "--python", str(python), *packages])
+        clean = {n: v for n, v in os.environ.items() if not n.startswith(("SPECSHIELD_", "REDIS_", "PYTHON"))}
+        imports = "; ".join(f"import specshield.{module}" for module in MODULES.split())
+        run([str(python), "-c", imports], cwd=empty, env=clean)
+        for command in COMMANDS.split():
+            shown = [str(python.with_name("specshield")), command, "--help"]
+            run(shown, cwd=empty, env=clean, stdout=subprocess.DEVNULL)
+        kernels = {**clean, "NUMBA_CACHE_DIR": str(folder / "kernels")}
+        seconds = demo(python, empty, kernels, "--runs", "1")
+        print(f"demo with the oldest packages: {seconds:.1f} s")
+
+
+if __name__ == "__main__":
+    main()
