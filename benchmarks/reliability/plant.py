@@ -46,11 +46,12 @@ class Program:
         self.command, self.log, self.environment = command, log, environment
         self.process: subprocess.Popen[bytes] | None = None
 
-    def start(self) -> None:
+    def start(self, *more: str) -> None:
+        """more: arguments of this start only."""
         self.log.parent.mkdir(parents=True, exist_ok=True)
         with open(self.log, "ab") as output:
             self.process = subprocess.Popen(
-                self.command,
+                [*self.command, *more],
                 env=self.environment,
                 stdin=subprocess.DEVNULL,
                 stdout=output,

@@ -36,7 +36,7 @@ def run(out: Path, page: Path) -> int:
         fresh = [name for name in rows if "away_all_s" in (read(out, f"fault-{name}") or {})]
         if fresh and _part(known, "faults"):
             faults["faults"] = _merged(_part(known, "faults"), _faults(out, fresh)[2:])
-            faults["summary"] = _summed(faults["faults"], _part(known, "summary"))
+            faults["summary"] = _summed(faults["faults"])
             measured += [f"fault-{name}" for name in fresh]
     makers = {"load": _load, "isolation": _isolation, "fuzz": _fuzz, "contract": _contract}
     parts = faults | {name: make(out) for name, make in makers.items() if name in measured}
@@ -61,17 +61,16 @@ def _merged(before: Sequence[str], fresh: Sequence[str]) -> list[str]:
     return [new.get(line.split(" | ")[0], line) for line in before]
 
 
-def _summed(table: Sequence[str], before: Sequence[str]) -> list[str]:
-    """The summary `before`, with the sums of this table of faults."""
+def _summed(table: Sequence[str]) -> list[str]:
+    """The sums of this table of faults."""
     rows = [line.strip("| ").split(" | ") for line in table[2:]]
     rows = [row for row in rows if len(row) > 4]
     faults, steps = (sum(int(row[i].replace(",", "")) for row in rows) for i in (1, 2))
     bad = [sum(int(row[4].split(" / ")[i]) for row in rows) for i in range(len(COUNTS))]
     told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in zip(COUNTS, bad, strict=True))
-    first = (
+    return [
         f"Over all rows that were run to their end: {faults:,} faults, {steps:,} acknowledged steps: {told}."
-    )
-    return [first + " ".join(before).partition("stuck.")[2]]
+    ]
 
 
 def _part(page: str, name: str) -> list[str]:

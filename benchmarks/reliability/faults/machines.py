@@ -21,6 +21,9 @@ MOVED = 400  # slots that move to another node, each time
 DOWN = 0.5  # [s] that a killed node stays away
 IDLE = 2  # [s] after which a session moves to the archive
 QUORUM = 2
+# [ms] without an answer after which a sentinel takes a store for dead. It first pings a new master after so
+# long, or after a second if that is less: with less than a second here, it may take it for dead and go back.
+UNHEARD = 2000
 
 
 def cluster_node(scene: Scene) -> dict[str, Any]:
@@ -68,14 +71,14 @@ def sentinel(scene: Scene) -> dict[str, Any]:
 
         def mend(master: RedisServer, other: RedisServer) -> None:
             wait_for(lambda: _master(watcher) == other.port, 60.0, "a new master")
-            master.start()
+            master.start("--replicaof", "127.0.0.1", str(other.port))
 
         with Crowd([service.url], scene.starts, 4) as crowd:
             for _ in range(scene.n):
                 master = next(node for node in pair if node.port == _master(watcher))
                 other = next(node for node in pair if node is not master)
                 crowd.fault(master.kill, lambda master=master, other=other: mend(master, other))
-                wait_for(lambda master=master: _follows(master), 60.0, "a replica again")
+                wait_for(lambda: any(map(_follows, pair)), 60.0, "a replica again")
                 wait_for(lambda: _known_replica(watcher), 60.0, "a replica that the sentinels know")
         return {"kills": scene.n, **crowd.result(service.url, scene.reference)}
 
@@ -143,9 +146,8 @@ def _watched(folder: Path) -> Iterator[tuple[list[RedisServer], list[RedisServer
     """A master with its replica, the sentinels, and the URL of it all."""
     with ExitStack() as stack:
         quick = ["--repl-diskless-sync-delay", "0"]
-        pair = [stack.enter_context(RedisServer(folder / "first", *quick))]
-        follows = ["--replicaof", "127.0.0.1", str(pair[0].port), *quick]
-        pair.append(stack.enter_context(RedisServer(folder / "second", *follows)))
+        pair = [stack.enter_context(RedisServer(folder / name, *quick)) for name in ("first", "second")]
+        _ask(pair[1], "REPLICAOF", "127.0.0.1", pair[0].port)
         wait_for(lambda: _follows(pair[1]), 60.0, "a replica")
         watchers = []
         for i in range(3):
@@ -154,7 +156,7 @@ def _watched(folder: Path) -> Iterator[tuple[list[RedisServer], list[RedisServer
             told.write_text(
                 f"port {watcher.port}\nbind 127.0.0.1\ndir {watcher.folder}\n"
                 f"sentinel monitor shield 127.0.0.1 {pair[0].port} {QUORUM}\n"
-                "sentinel down-after-milliseconds shield 500\nsentinel failover-timeout shield 3000\n"
+                f"sentinel down-after-milliseconds shield {UNHEARD}\nsentinel failover-timeout shield 3000\n"
             )
             Program.__init__(watcher, ["redis-server", str(told), "--sentinel"], watcher.log)
             watchers.append(stack.enter_context(watcher))
