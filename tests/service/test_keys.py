@@ -64,6 +64,15 @@ def own_world(client):
     return send_policy(client)["id"]
 
 
+def test_a_newline_at_the_end_of_a_path_opens_nothing(keyed):
+    with httpx.Client(base_url=keyed.url, timeout=None) as client:
+        for path in ("/metrics%0a", "/livez%0a"):
+            problem(client.get(path), 404, "not-found")
+        key = {"Authorization": "Bearer operator"}
+        for path in ("/v1/maps%0a", "/v1/policies%0a", "/v1/sessions/a/steps%0a"):
+            problem(client.post(path, json=grid_json(), headers=key), 404, "not-found")
+
+
 def test_a_command_acts_as_the_owner_of_the_key_that_it_starts_a_server_with(keyed):
     async def act(keys):
         secret = await keys.create("dora")

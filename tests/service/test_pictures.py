@@ -57,6 +57,13 @@ def test_the_grids_become_finer_to_the_finest():
     assert np.isnan(share[0]).all()  # the wall
 
 
+def test_where_the_formula_has_no_value_nothing_can_be_kept():
+    xmin, _, xmax, _ = TASK.grid.bounds
+    task = make_task(TASK.grid, TASK.robot, f"G[0,1] 1 / (x - {(xmin + xmax) / 2}) < 9")
+    share, _, _ = next(kept_from(make_shield([Waits(task)]), math.inf))  # of the middle alone
+    assert share == 0.0
+
+
 def test_none_is_begun_that_would_come_too_late():
     assert [pitch for _, pitch, _ in kept_from(make_shield([Waits(TASK)]), time.monotonic())] == [4.0]
 

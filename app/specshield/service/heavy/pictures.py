@@ -15,7 +15,7 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.drawing.outline import way_ahead
 from specshield.drawing.svg import Plan
-from specshield.errors import InfeasibleStart, PoseError
+from specshield.errors import InfeasibleStart, PoseError, SampleError
 from specshield.service.heavy.latest import latest
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.library.policies import Description
@@ -116,6 +116,6 @@ def _kept(shield: Shield, x: float, y: float, theta: float) -> float:
         start(shield, (x, y, theta))
     except PoseError:
         return math.nan
-    except InfeasibleStart:
+    except (InfeasibleStart, SampleError):  # or the formula has no value there
         return 0.0
     return 1.0

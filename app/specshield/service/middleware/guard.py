@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from specshield.errors import SpecshieldError, Stopping
+from specshield.errors import NotFound, SpecshieldError, Stopping
 from specshield.service import problems
 from specshield.service.access.rates import Rates
 from specshield.service.access.site import check_site
 
 
 class Guard:
-    """Refuses before anything of a body is read. WebSocket handshakes obey the same rules, and are refused
-    with the same answers. `scope["state"]` says who asks: `key`, its name as
-    `owner`, and `rates`, which count what it asks.
+    """Refuses before anything of a body is read, and handshakes of WebSockets by the same rules and answers.
+    `scope["state"]` says who asks: `key`, its name as `owner`, and `rates`, which count what it asks.
     """
 
     def __init__(self, app: ASGIApp, allowed_hosts: frozenset[str]) -> None:
@@ -32,6 +31,8 @@ class Guard:
     async def _check(self, scope: Scope, headers: dict[bytes, bytes]) -> None:
         check_site(scope, headers, self._allowed)
         path, server = scope["path"], scope["app"].state.server
+        if path.endswith("\n"):  # a route's pattern would take it: `$` stands before a last newline too
+            raise NotFound(f"there is no {path!r} here", got=path, expected="a path listed at /docs")
         if guarded(path):
             key = await server.keys.check(headers.get(b"authorization", b""))
             self._rates.take(key, path.endswith(("/steps", "/stream")))

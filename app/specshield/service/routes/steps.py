@@ -42,7 +42,7 @@ class StepRoute:
         if message["type"] != "http.request":  # the caller has gone
             return
         try:
-            packed = headers.get(b"content-type", b"").startswith(PACKED)
+            packed = headers.get(b"content-type", b"").lower().startswith(PACKED)
             request = read_step(message["body"], packed)
             server: Server = scope["app"].state.server
             state = scope["state"]

@@ -187,8 +187,7 @@ class Sessions:
     async def record(self, id: str) -> tuple[bytes, str]:
         """The session's record as a file, and its seal."""
         found = there(await self._store.dump(id), id)
-        rows = Session.of(found).rows
-        return await self._run(chain.pack, found.config, pack(rows), found.steps)
+        return await self._run(chain.pack, found.config, pack(Session.of(found).rows), found.steps)
 
     async def last(self, id: str) -> tuple[dict[str, Any], Floats, bytes]:
         """The session's config, its rows, and the record of the last one, empty where that has none, or was
