@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import socket
@@ -11,6 +12,15 @@ from typing import Any
 
 import httpx
 
+from specshield.service.access.owners import scoped
+from specshield.service.sessions import record
+from specshield.service.sessions.session import Session
+from specshield.service.sessions.state import State
+from specshield.service.storage.archive import Archive
+from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.objects import open_objects
+from specshield.service.watch.events import Watchers
 from tests.service.world import ahead
 from tests.serving import HUNG, serving, wait_for
 
@@ -164,6 +174,85 @@ def test_what_another_server_decides_is_told_here_and_a_server_that_stops_lets_i
         reader.join(HUNG)
         assert not reader.is_alive()
         assert [t for t, _ in reader.found] == [0, 1, 2]
+
+
+@contextlib.asynccontextmanager
+async def another_server(server):
+    """What another server has of the store and the archive, and its watchers, who look from now on."""
+    held = Archive(open_objects(f"{server.data_dir}/archive"))
+    store = ArchivingStore(EmbeddedStore(server.data_dir).url, 30.0, 60, held)
+    watchers = Watchers(store, 10, lambda: False, lambda: 0)
+    looking = asyncio.create_task(watchers.run())
+    yield store, watchers
+    looking.cancel()
+    await store.aclose()
+
+
+async def put_away(store, id):
+    return await store.put_away(id, time.time() + 60, await store.dump(id))
+
+
+async def ids_told(stream, last):
+    told = b""
+    while b"id: %d\n" % last not in told and b"event: end" not in told:
+        told += await anext(stream)
+    await stream.aclose()
+    return [int(line[4:]) for line in told.splitlines() if line.startswith(b"id: ")]
+
+
+def test_a_stream_goes_on_though_its_session_leaves_the_store_while_it_is_looked_at(server, begin, step):
+    session = begin()
+    id, moved = scoped("", session["id"]), []
+
+    async def watch():
+        async with another_server(server) as (store, watchers):
+            ask = store.news
+
+            async def news(asked):  # after the look at its version
+                if not moved:
+                    moved.append(await put_away(store, id))
+                return await ask(asked)
+
+            store.news = news
+            stream = await watchers.open(id, None)
+            assert step(session, 0, ahead(0)).status_code == 200
+            assert await ids_told(stream, 0) == [0]
+        assert moved == [True]
+
+    asyncio.run(watch())
+
+
+def test_a_step_is_told_once_though_it_is_decided_while_the_archive_is_read(server, begin, step):
+    session = begin()
+    assert step(session, 0, ahead(0)).status_code == 200
+    id, read = scoped("", session["id"]), []
+
+    async def watch():
+        async with another_server(server) as (store, watchers):
+            assert await put_away(store, id)
+            before, dump = await store.load(id), store.dump
+
+            async def slow(id):
+                found = await dump(id)
+                if not read:  # as if the step were decided by the server that reads
+                    read.append(step(session, 1, ahead(1)[1:]))
+                    now = await store.load(id, 1)
+                    made, row = record.decode(now.step), Session.of(now).rows[-1]
+                    told = record.answer(made, row, session["actions"])
+                    watchers.decided(id, before.version, now.version, State.of(now.state), row, made, told)
+                return found
+
+            store.dump = slow
+            first = await watchers.open(id, -1)
+            assert await anext(first)
+            await asyncio.sleep(1.0)  # time for several looks
+            assert step(session, 2, ahead(2)[2:]).status_code == 200
+            await asyncio.sleep(1.0)
+            assert await ids_told(await watchers.open(id, 0), 2) == [1, 2]
+            await first.aclose()
+        assert [answer.status_code for answer in read] == [200]
+
+    asyncio.run(watch())
 
 
 def test_an_erased_session_ends_its_streams_and_an_unknown_one_has_none(server, client, begin, step):

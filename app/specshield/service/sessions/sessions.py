@@ -164,8 +164,7 @@ class Sessions:
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
                     continue
             self.steps.recent.drop(id)
-            told = list(map(handover.finite, bounds))
-            return {**describe(session.rules, state), "robustness_bounds": told}
+            return {**describe(session.rules, state), "robustness_bounds": list(map(handover.finite, bounds))}
         raise contended(id)
 
     def _closed(self, session: Session) -> tuple[Session, str, tuple[float, float]]:
@@ -181,8 +180,7 @@ class Sessions:
         """One JSON object a step, as `lines` has it; and the rules, as one JSON list."""
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
-        shown = describe(session.rules, session.state)["rules"]
-        return lines(session, found.steps), files.to_json(shown)
+        return lines(session, found.steps), files.to_json(describe(session.rules, session.state)["rules"])
 
     async def record(self, id: str) -> tuple[bytes, str]:
         """The session's record as a file, and its seal."""

@@ -220,23 +220,23 @@ class Watchers:
             ends = [feed.end for feed, _ in here]
             news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed, _ in here])
             for (feed, version), end, new in zip(here, ends, news, strict=True):
-                if feed.end != end:
+                if feed.end != end or new is None:  # one that has left the store meanwhile is read next time
                     continue
                 if feed.version is None:  # it is back from the archive, or another one has its id
                     if await self._switched(feed):
                         feed.version = b""
                     else:
                         feed.close()
-                elif new is None or not outdated(feed, new) or not await self._switched(feed):
+                elif not outdated(feed, new) or not await self._switched(feed):
                     self._gone_on(feed, version, new)
         since = time.monotonic() - AWAY
         for feed, known, now in seen:
             if now is None and feed.version == known and (known is not None or feed.looked < since):
                 await self._left(feed)
 
-    def _gone_on(self, feed: Feed, version: bytes, new: News | None) -> None:
-        if new is None or begun(version) != begun(feed.version or version):
-            feed.close()  # erased, and perhaps another session of this id was begun
+    def _gone_on(self, feed: Feed, version: bytes, new: News) -> None:
+        if begun(version) != begun(feed.version or version):
+            feed.close()  # it was erased, and another session of this id was begun
             return
         state, (found, end) = State.of(new.state), events(feed, feed.end, new)
         upto = reached(feed, end, new)
@@ -251,7 +251,9 @@ class Watchers:
 
     async def _left(self, feed: Feed) -> None:
         """The session is no longer in the store: it was erased, or lies in the archive."""
-        dump, feed.looked = await self._store.dump(feed.id), time.monotonic()
+        known, dump, feed.looked = feed.version, await self._store.dump(feed.id), time.monotonic()
+        if feed.version != known:  # a step that was decided here meanwhile has brought it back
+            return
         if dump is None or not feed.rule(Session.of(dump)):
             feed.close()
         else:
