@@ -4,6 +4,7 @@ import asyncio
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 
 import httpx
@@ -205,6 +206,15 @@ def test_a_key_keeps_no_more_sessions_than_it_may(keyed):
         problem(begin(small, id="two"), 429, "limit-reached")
         assert small.delete("/v1/sessions/one").status_code == 204
         assert begin(small, id="two").status_code == 201
+
+
+def test_a_key_keeps_no_more_sessions_than_it_may_though_they_begin_at_once(keyed):
+    with caller(keyed, "hasty", sessions=2) as hasty, ThreadPoolExecutor(12) as threads:
+        answers = list(threads.map(lambda i: begin(hasty, id=f"s{i}"), range(12)))
+        assert {answer.status_code for answer in answers} <= {201, 429}
+        kept = [session["id"] for session in hasty.get("/v1/sessions").json()["items"]]
+        assert kept == sorted(answer.json()["id"] for answer in answers if answer.status_code == 201)
+        assert len(kept) <= 2
 
 
 def test_the_rate_of_a_key_leaves_its_robots_room(keyed):

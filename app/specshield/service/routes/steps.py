@@ -45,9 +45,8 @@ class StepRoute:
             packed = headers.get(b"content-type", b"").lower().startswith(PACKED)
             request = read_step(message["body"], packed)
             server: Server = scope["app"].state.server
-            state = scope["state"]
-            key = scoped(state["owner"], found[1])
-            answer = await server.sessions.steps.decide(key, request, state["timing"])
+            key = scoped(scope["state"]["owner"], found[1])
+            answer = await server.sessions.steps.decide(key, request, scope["state"]["timing"])
         except SpecshieldError as error:
             problems.tell(scope, error)
             await problems.response(error)(scope, receive, send)

@@ -76,8 +76,7 @@ class Sessions:
 
     async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
-        await self._check_room(None, self._settings.max_sessions)
-        await self._check_room(key.name, key.sessions)
+        await self._check_room(key, 0)
         if self._settings.redis_url is None:  # the store writes to this disk
             files.check_free(self._settings.data_dir, self._settings.disk_reserve_bytes)
         settings = self._checked(request)
@@ -103,6 +102,7 @@ class Sessions:
         await self._store.create(stored_as, files.to_json(config), Change(state.packed(), pack(rows)))
         try:  # whoever deletes a policy sees this session now, or has marked the policy before
             await self._run(self._policies.still_there, config["policy_ids"], key.name)
+            await self._check_room(key, 1)  # others may have begun at the same time
         except SpecshieldError:
             await self._store.delete(stored_as)
             raise
@@ -209,21 +209,22 @@ class Sessions:
             if after is None:
                 return None
 
-    async def _check_room(self, owner: str | None, limit: int | None) -> None:
-        """Raises LimitReached where this owner, or with None all of them, keep `limit` sessions."""
+    async def _check_room(self, key: Key, begun: int) -> None:
+        """Raises LimitReached where a caller, or all of them, keep all that they may, `begun` here aside."""
         if self._store.full:
             raise LimitReached(
                 f"the archive holds {self._settings.archive_bytes} bytes, and takes no more sessions",
                 expected="room: delete sessions; the server's operator can raise SPECSHIELD_ARCHIVE_BYTES",
             )
-        if limit is None or await self._store.count(owner) < limit:
-            return
-        await self._store.sweep(owner)
-        if await self._store.count(owner) >= limit:
-            raise LimitReached(
-                f"no more than {limit} sessions are kept",
-                expected="room for one more: delete a session, or wait until one expires",
-            )
+        for owner, limit in ((None, self._settings.max_sessions), (key.name, key.sessions)):
+            if limit is None or await self._store.count(owner) < limit + begun:
+                continue
+            await self._store.sweep(owner)
+            if await self._store.count(owner) >= limit + begun:
+                raise LimitReached(
+                    f"no more than {limit} sessions are kept",
+                    expected="room for one more: delete a session, or wait until one expires",
+                )
 
     async def _run(self, function: Callable[..., R], *args: Any) -> R:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
