@@ -50,6 +50,8 @@ def decision(formula, *motions, **config):
         ("G[0,4] F[0,4] A", [], 2, [1, 0, 0, 1], False),  # a patrol
         ("G[0,4] F[0,4] A", [WAIT], 2, [1, 0, 0, 0], False),
         ("G[0,4] F[0,4] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
+        ("G[0,4] not G[0,4] not A", [], 2, [1, 0, 0, 1], False),  # the same in other words
+        ("G[0,4] not A -> x > 9", [WAIT], 2, [1, 0, 0, 0], False),  # what has to end is to end early
         ("G[4,6] A", [WAIT], 2, [1, 0, 0, 0], False),  # what is yet to begin
         ("G[4,6] A", [WAIT], 0, [1, 1, 1, 1], False),
         ("G[4,6] A", [WAIT, WAIT], 2, [1, 0, 0, 0], True),
@@ -63,6 +65,14 @@ def decision(formula, *motions, **config):
         ("G[1,2] G[3,4] A", [WAIT], 2, [1, 0, 0, 0], False),
         ("G[4,6] abs(2 * x - 1) < 0.6", [WAIT], 2, [1, 0, 0, 0], False),
         ("G[4,6] 1 / (1 + x) < 0.8", [WAIT], 2, [1, 1, 1, 1], False),  # it may have no value before
+        ("F[4,5] A or F[4,5] x > 9", [WAIT], 2, [1, 0, 0, 1], False),  # what is far away and not alone
+        ("F[4,5] A or F[4,5] x > 9", [WAIT, WAIT], 2, [1, 0, 0, 0], False),
+        ("F[4,5] A or F[4,5] x > 9", [WAIT] * 3, 2, [1, 0, 0, 1], True),
+        ("F[4,5] (A and G[0,1] x > 0)", [WAIT, WAIT], 2, [1, 0, 0, 0], False),
+        ("G[4,6] A or not F[4,6] x < 9", [WAIT], 2, [1, 0, 0, 0], False),
+        ("G[0,1] (x < 0.2 -> F[4,4] A)", [WAIT], 2, [1, 0, 0, 0], False),
+        ("x > 9 or not F[4,6] not A", [WAIT], 2, [1, 0, 0, 0], False),
+        ("F[4,5] 1 / (1 + x) < 0.8 or F[4,5] x > 9", [WAIT, WAIT], 2, [1, 1, 1, 1], False),
         ("G[0,4] (x < 0.2 -> F[0,4] A)", [WAIT], 2, [1, 0, 0, 0], False),  # what is to follow something
         ("F[0,4] (x < 0.2 and F[0,4] A)", [WAIT] * 3, 2, [1, 0, 0, 1], False),  # one after the other
     ],

@@ -17,9 +17,11 @@ SLOTS = {name: i for i, name in enumerate(NAMES)}
 LENGTH = 24
 
 
-def run(formula: Formula, samples: dict[str, list[float]], known: int) -> tuple[float, float, float | None]:
+def run(
+    formula: Formula, samples: dict[str, list[float]], known: int, ahead: bool = False
+) -> tuple[float, float, float | None]:
     """The bounds on the first `known` samples, and the value where they are all there."""
-    tree, stack = compile_tree(formula, SLOTS), np.empty(STACK_SIZE)
+    tree, stack = compile_tree(formula, SLOTS, ahead), np.empty(STACK_SIZE)
     low, high = np.full(tree.size, np.nan), np.full(tree.size, np.nan)
     for n in range(len(tree.leaf_at)):
         for t in range(tree.leaf_start[n], tree.leaf_stop[n]):
@@ -33,11 +35,11 @@ def run(formula: Formula, samples: dict[str, list[float]], known: int) -> tuple[
 
 
 @settings(max_examples=400, deadline=None)
-@given(formulas(max_leaves=8), traces(LENGTH), st.integers(1, LENGTH))
+@given(formulas(max_leaves=8), traces(LENGTH), st.integers(1, LENGTH), st.booleans())
 def test_equal_to_the_evaluator_bit_for_bit(
-    formula: Formula, samples: dict[str, list[float]], known: int
+    formula: Formula, samples: dict[str, list[float]], known: int, ahead: bool
 ) -> None:
-    low, high, whole = run(formula, samples, known)
+    low, high, whole = run(formula, samples, known, ahead)
     prefix = {name: values[:known] for name, values in samples.items()}
     expected = robustness_bounds(formula, prefix)
     assert (np.float64(low).tobytes(), np.float64(high).tobytes()) == tuple(e.tobytes() for e in expected)

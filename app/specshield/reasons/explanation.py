@@ -100,8 +100,8 @@ class _Motion:
         """
         part, early, t, asked = self.judged.part, self.judged.aimed.early, self.prefix.t, rho.copy()
         if len(early):  # else J is made of the conjuncts as a whole
-            whole, joint = conjunction_of(part.task, part.formula)
-            seen, still = part.of(whole), np.empty(len(early), np.bool_)
+            view, joint = conjunction_of(part.task, part.formula)
+            seen, still = part.of(part.formula, view), np.empty(len(early), np.bool_)
             _, leaves = rho_of(seen, np.ascontiguousarray(poses[:, t + 1 :]))
             find_open(joint, seen.known, t, still)
             for k, each in enumerate(conjuncts(part.formula)[: len(early)]):

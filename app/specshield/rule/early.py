@@ -1,8 +1,9 @@
 """What a prefix leaves open of a formula, with each F and U met some steps early.
 
 What the prefix has settled is left out. An F or U is asked for so many steps before its window ends, or where
-it is met already; a G of a predicate that has yet to begin, or what a short window far away asks for, so many
-steps before; any other G from the first step on at which its child is open. What is below a `not` stays.
+it is met already. What a G that has yet to begin asks for is asked for so many steps before it, and so is
+what a short window far away asks for; another G at the top counts from the first step on at which its child
+is open. Below a `not`, a G is taken for the F that it is, and an F for a G.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from specshield.arrays import Bools, Floats, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.rule.residual import joined
 from specshield.rule.values import places
-from specshield.stl import SATISFIED_ABOVE, Always, Arithmetic, Eventually, Formula, Node, Number, conjuncts
+from specshield.rule.view import View, view_of
+from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, conjuncts
 from specshield.stl.conjunction import flat, is_predicate
 from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, apply, bounds_at, compile_tree, slide, until
 from specshield.task import Task, kept_with_task
@@ -27,11 +29,11 @@ class Conjuncts(NamedTuple):
     """A conjunction of K formulas, over the leaves of its tree.
 
     below: the tree without the F or G at the top of each conjunct, and the `and`. kind [K]: what that is;
-    OTHER: none, all is in `below`. at [K]: where in the buffer values begin that it ranges over. a, b [K]:
-    its window [steps]. horizon [K]: of what is below [steps]. half [K]: half of the longest window of an F or
-    U in it [steps]; of a G whose values are in the buffer from step 0 on, half of the time until it begins.
-    plain [K]: whether what is below is a predicate, or under F a G of one. owner [n]: each node's conjunct;
-    -1 where it is `turned`, and a shorter window would ask for less.
+    OTHER: none, all is in `below`. at [K]: where in the buffer the values in its window begin. a, b [K]: its
+    window [steps]. horizon [K]: of what is below [steps]. lead [K]: half of the time until its window if that
+    `is_far`, else 0 [steps]. half [K]: half of the longest window of an F or U in it, or of the time until a
+    window in `below` that is far [steps]. plain [K]: whether what is below is a predicate, or under F a G of
+    one. owner [n]: each node's conjunct; -1 where nothing can be asked for early.
     """
 
     below: Tree
@@ -40,53 +42,39 @@ class Conjuncts(NamedTuple):
     a: Ints
     b: Ints
     horizon: Ints
+    lead: Ints
     half: Ints
     plain: Bools
     owner: Ints
 
 
 @kept_with_task
-def conjunction_of(task: Task, formula: Formula) -> tuple[Formula, Conjuncts]:
-    """The formula's conjuncts, and the one that has their leaves: itself, or an equal one but for its G that
-    begin later, which it has from step 0 on.
-    """
-    above, slots = (formula,) if is_predicate(formula) else conjuncts(formula), places(task)  # as in the tree
+def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts]:
+    """The formula's conjuncts, and the view that has their leaves; None where that is the formula's own."""
+    above = (formula,) if is_predicate(formula) else conjuncts(formula)  # as in the tree
     above = tuple(flat(part) if isinstance(part, Always) else part for part in above)
-    wide = [_from_now_on(part) for part in above]
-    whole = formula if joined(wide) == formula else joined(wide)
-    tree = compile_tree(whole, slots)
+    whole, slots = joined(above), places(task)
+    tree = compile_tree(whole, slots, True)
     rows, kept, owner, size = list[tuple[int, ...]](), list[bool](), list[int](), 0
     for k, part in enumerate(above):
-        own, row, early = compile_tree(wide[k], slots), (OTHER, size, 0, 0, part.horizon), wide[k] is not part
-        rest = len(own.op)
+        each, row = compile_tree(part, slots, True), (OTHER, size, 0, 0, part.horizon, 0)
+        seeks = np.where(each.op == ALWAYS, each.turned, (each.op > ALWAYS) & ~each.turned)
+        lead = np.where((each.op == UNTIL) | (each.right <= each.at), 0, each.a // 2)
+        half, rest = np.where(seeks, each.b - each.a, 0) // 2, len(each.op)
         if isinstance(part, (Always, Eventually)):
-            rest, row = rest - 1, (own.op[-1], size + part.a * early, part.a, part.b, part.child.horizon)
-        halves = (own.b - own.a)[np.isin(own.op, (EVENTUALLY, UNTIL)) & ~own.turned] // 2
-        rows.append((*row, halves.max(initial=row[2] // 2 * early)))
-        kept += [True] * rest + [False] * (len(own.op) - rest + (k > 0))  # without the `and`
-        owner += np.where(own.turned, -1, k)[:rest].tolist()
-        size += own.size
-    below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:7]})  # of its nodes
+            rest -= 1
+            at_once = lead[rest] > 0 and part.a == part.b and is_predicate(part.child)
+            kind = ALWAYS if at_once else each.op[rest]
+            row = (kind, size + each.right[rest], part.a, part.b, part.child.horizon, lead[rest])
+        rows.append((*row, max(half.max(initial=0), lead[:rest].max(initial=0))))
+        kept += [True] * rest + [False] * (len(each.op) - rest + (k > 0))  # without the `and`
+        owner += np.where(np.maximum(half, lead) > 0, k, -1)[:rest].tolist()
+        size += each.size
+    below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:8]})  # of its nodes
     columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
-    return whole, Conjuncts._make((below, *columns, plain, np.array(owner, np.int64)))
-
-
-def _from_now_on(part: Formula) -> Formula:
-    """A conjunct; from step 0 on if it is a G of a predicate, or an F of one or of such a G whose window is
-    short and far away, unless the predicate may be no number before.
-    """
-    if not isinstance(part, (Always, Eventually)) or part.a <= 1 or not _is_plain(part) or _may_fail(part):
-        return part
-    if isinstance(part, Always) or (part.a == part.b and is_predicate(part.child)):
-        return Always(0, part.b, part.child)
-    return Eventually(0, part.b, part.child) if part.b - part.a < part.a // 2 else part
-
-
-def _may_fail(node: Node) -> bool:
-    match node:
-        case Arithmetic("+" | "-") | Arithmetic("*", Number()) | Arithmetic("*" | "/", _, Number()):
-            return any(map(_may_fail, node.parts))
-    return isinstance(node, Arithmetic) or any(map(_may_fail, node.parts))
+    parts = Conjuncts._make((below, *columns, plain, np.array(owner, np.int64)))
+    same = whole == formula and tree.size == view_of(task, formula).tree.size  # no window is far
+    return None if same else view_of(task, whole, True), parts
 
 
 def _is_plain(part: Formula) -> bool:
@@ -105,8 +93,8 @@ def find_open(parts: Conjuncts, known: Floats, t: int, still: Bools) -> None:
 
 @kernel
 def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Floats, rho: Floats) -> None:
-    """rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before its end
-    and each G that is to begin kept so many steps before, though a window keeps at least half its length.
+    """rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before its end,
+    though a window keeps at least half its length, and what a window that is far asks for kept before it.
 
     leaves (N, size): the leaves along N trajectories. Where nothing is open, rho is that of the whole.
     """
@@ -123,37 +111,42 @@ def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Float
         least = np.inf
         for k in range(still.shape[0]):
             a, b = parts.a[k], parts.b[k]
+            lead = min(early[k], parts.lead[k]) if some and a > t else 0
             if some and parts.kind[k] == EVENTUALLY:
-                end = min(early[k], (b - a) // 2)
-                b = max(b - end, min(b, t))
-                lead = min(early[k], parts.half[k]) - end if parts.plain[k] and a > t else 0
-                for i in range(parts.at[k] + b - a, parts.at[k] - 1, -1):
-                    buffer[i] = buffer[i - lead : i + 1].min()
+                lead -= b - a
+                b = max(b - min(early[k], (b - a) // 2), min(b, t))
             elif some and parts.kind[k] == ALWAYS:
-                later = a > t and parts.plain[k]
-                a = a - min(early[k], parts.half[k]) if later else max(a, min(t + 1 - parts.horizon[k], b))
+                a = max(a, min(t + 1 - parts.horizon[k], b))
             if still[k] or not some:
                 least = min(least, _value(parts, k, a, b, buffer))
+                for i in range(parts.at[k] - lead, parts.at[k]):
+                    least = min(least, buffer[i])
         rho[f] = least
 
 
 @leaf
 def _apply_early(tree: Tree, n: int, t: int, early: int, buffer: Floats, scratch: Floats) -> None:
     """Applies node n below the conjuncts as `rate_open` says. buffer, scratch (size,): both overwritten."""
-    op, at, count, a, b = tree.op[n], tree.at[n], tree.length[n], tree.a[n], tree.b[n]
-    sooner, past = min(early, (b - a) // 2), t - tree.start[n]
-    if op == UNTIL:
-        for i in range(count):
-            buffer[at + i] = until(buffer, at + i, tree.right[n] + i, a, max(b - sooner, min(b, past - i)))
-    elif op != EVENTUALLY or sooner == 0:
+    op, at, right, count, a, b = tree.op[n], tree.at[n], tree.right[n], tree.length[n], tree.a[n], tree.b[n]
+    turned, past = tree.turned[n], t - tree.start[n]
+    seeks = (op == ALWAYS) == turned
+    sooner = min(early, (b - a) // 2) if seeks else 0
+    if early == 0:
         apply(tree, n, buffer)
+    elif op == UNTIL:
+        for i in range(count):
+            buffer[at + i] = until(buffer, at + i, right + i, a, max(b - sooner, min(b, past - i)))
     else:
-        length = b - a + 1 - sooner
+        length, lead = b - a + 1 - sooner, min(early, a // 2) - (b - a if seeks else 0) if right > at else 0
         copy_row(buffer, scratch)
-        slide(buffer, at, count, length, False)
-        for i in range(min(count, past - a - length + 1)):
-            for j in range(i + length, min(i + length + sooner, past - a + 1)):
-                buffer[at + i] = max(buffer[at + i], scratch[at + j])
+        slide(buffer, at, right, count, length, op == ALWAYS)
+        for i in range(count):
+            value = buffer[at + i]
+            for j in range(i + length, min(i + length + sooner, past - a + 1)):  # late, but done
+                value = min(value, scratch[right + j]) if turned else max(value, scratch[right + j])
+            for j in range(i + a - (lead if i + a > past else 0), i + a):  # before its window
+                value = max(value, scratch[at + j]) if turned else min(value, scratch[at + j])
+            buffer[at + i] = value
 
 
 @leaf

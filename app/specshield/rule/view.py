@@ -34,10 +34,10 @@ class View(NamedTuple):
 
 
 @kept_with_task
-def view_of(task: Task, formula: Formula) -> View:
-    """The formula, or a part of it, prepared once."""
+def view_of(task: Task, formula: Formula, ahead: bool = False) -> View:
+    """The formula, or a part of it, prepared once. ahead: as `compile_tree` has it; then no leaf binds."""
     names = list(task.areas)
-    tree = compile_tree(formula, places(task))
+    tree = compile_tree(formula, places(task), ahead)
     first, last = np.full(len(names), np.iinfo(np.int64).max), np.full(len(names), -1)
     programs = tree.programs
     for n in range(len(tree.leaf_at)):
@@ -46,7 +46,7 @@ def view_of(task: Task, formula: Formula) -> View:
             r = int(place) - REGIONS
             if 0 <= r < len(names):
                 first[r], last[r] = min(first[r], tree.leaf_start[n]), max(last[r], tree.leaf_stop[n] - 1)
-    return View(tree, regions_of(task), first, last, np.array(list(_binding(formula, True)), np.bool_))
+    return View(tree, regions_of(task), first, last, np.array(list(_binding(formula, not ahead)), np.bool_))
 
 
 def _binding(formula: Node, binds: bool) -> Iterator[bool]:
@@ -54,12 +54,8 @@ def _binding(formula: Node, binds: bool) -> Iterator[bool]:
     if is_predicate(formula):
         yield binds
         return
-    if isinstance(formula, Until):
-        sides = formula.parts if formula.b > 0 else formula.parts[1:]  # as in stl/tree.py
-        for side in sides:
-            yield from _binding(side, False)
-        return
-    for part in formula.parts:
+    right_alone = isinstance(formula, Until) and formula.b == 0  # as in stl/tree.py
+    for part in formula.parts[right_alone:]:
         yield from _binding(part, binds and isinstance(formula, (And, Always)))
 
 

@@ -56,9 +56,10 @@ class Prefix(NamedTuple):
         """How many motions a future has: T - t."""
         return self.task.horizon - self.t
 
-    def of(self, formula: Formula) -> Prefix:
-        """The same prefix as another formula sees it, a part of the task's own."""
-        seen = prefix_of(self.task, formula, view_of(self.task, formula), self.poses, self.signals)
+    def of(self, formula: Formula, view: View | None = None) -> Prefix:
+        """The same prefix as another formula sees it, a part of the task's own. view: of the formula."""
+        view = view or view_of(self.task, formula)
+        seen = prefix_of(self.task, formula, view, self.poses, self.signals)
         return seen._replace(held=self.held)
 
     def allows(self, pose: Floats) -> bool:
@@ -163,14 +164,9 @@ def simulated(
 
 def together(tried: Futures, more: Futures) -> Futures:
     """Both, as `more` prefers."""
-    return Futures(
-        np.concatenate([tried.motions, more.motions]),
-        np.concatenate([tried.poses, more.poses]),
-        np.concatenate([tried.rho, more.rho]),
-        np.concatenate([tried.leaves, more.leaves]),
-        more.preferred,
-        tuple(dict.fromkeys([*tried.warnings, *more.warnings])),
-    )
+    arrays = (np.concatenate(both) for both in zip(tried[:4], more[:4], strict=True))
+    said = tuple(dict.fromkeys([*tried.warnings, *more.warnings]))
+    return Futures._make((*arrays, more.preferred, said))
 
 
 def rho_of(prefix: Prefix, poses: Floats) -> tuple[Floats, Floats]:
@@ -266,12 +262,13 @@ class Best(NamedTuple):
 def best_of(tried: Futures, values: Floats, motions: int) -> Best:
     """The future of each motion with the highest of `values` (N,), the lowest row on ties."""
     rows, robustness = np.empty(motions, np.int64), np.empty(motions)
-    _best_rows(tried.motions, values, rows, robustness)
+    best_rows(tried.motions, values, rows, robustness)
     return Best(robustness, rows)
 
 
 @kernel
-def _best_rows(motions: Ints, values: Floats, rows: Ints, robustness: Floats) -> None:
+def best_rows(motions: Ints, values: Floats, rows: Ints, robustness: Floats) -> None:
+    """`best_of`, into rows and robustness (M,)."""
     rows[:] = -1
     robustness[:] = -np.inf
     for f in range(motions.shape[0]):

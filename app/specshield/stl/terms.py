@@ -10,7 +10,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import SampleError
-from specshield.stl.formula import Abs, Arithmetic, Name, Neg, Number, Term
+from specshield.stl.formula import Abs, Arithmetic, Name, Neg, Node, Number, Term
 
 _ARITHMETIC = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}
 
@@ -42,6 +42,14 @@ def value(term: Term, samples: Mapping[str, Floats], start: int, stop: int) -> A
                 )
             return result
     raise TypeError(f"not a term: {term!r}")
+
+
+def may_fail(node: Node) -> bool:
+    """Whether some term in it may have no value at some states: it divides or multiplies names."""
+    match node:
+        case Arithmetic("+" | "-") | Arithmetic("*", Number()) | Arithmetic("*" | "/", _, Number()):
+            return any(map(may_fail, node.parts))
+    return isinstance(node, Arithmetic) or any(map(may_fail, node.parts))
 
 
 def interval(term: Term) -> tuple[float, float]:

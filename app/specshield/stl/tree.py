@@ -18,6 +18,7 @@ from specshield.stl.conjunction import is_predicate
 from specshield.stl.formula import Always, And, Eventually, Formula, Implies, Not, Or, Until
 from specshield.stl.program import Programs, compile_predicates
 from specshield.stl.robustness import unseen_bounds
+from specshield.stl.terms import may_fail
 
 NOT, AND, OR, ALWAYS, EVENTUALLY, UNTIL = range(6)
 
@@ -25,9 +26,10 @@ NOT, AND, OR, ALWAYS, EVENTUALLY, UNTIL = range(6)
 class Tree(NamedTuple):
     """A formula at step 0, of n nodes in postfix order and l leaves. rho ends up at buffer[0].
 
-    op [n]: the operator. at, right [n]: where in the buffer its first and second operand's values begin.
-    length [n]: how many values it has, written from `at` on. a, b [n]: its window, in steps.
-    start [n]: the step of its first value.
+    op [n]: the operator. at, right [n]: where in the buffer its first and second operand's values begin; of
+    an F or G, where its operand's values begin, and where those in the window of its first step do. length
+    [n]: how many values it has, written from `at` on. a, b [n]: its window, in steps. start [n]: the step of
+    its first value. turned [n]: whether an odd number of `not` stands above it.
     leaf_at, leaf_start, leaf_stop [l]: where a leaf's values begin in the buffer, and from which step up to
     which (excluded) they are. low, high [l]: bounds on a leaf's value at a step whose samples are to come.
     size: of the buffer.
@@ -40,6 +42,7 @@ class Tree(NamedTuple):
     b: Ints
     right: Ints
     start: Ints
+    turned: Bools
     leaf_at: Ints
     leaf_start: Ints
     leaf_stop: Ints
@@ -48,70 +51,76 @@ class Tree(NamedTuple):
     programs: Programs
     size: int
 
-    @property
-    def turned(self) -> Bools:
-        """Whether an odd number of `not` stands above a node, [n]."""
-        # What is below a node comes before it, and begins where it begins or later.
-        above = [(self.op[n:] == NOT) & (self.at[n:] <= self.at[n]) for n in range(len(self.op))]
-        return np.array([each.sum() % 2 for each in above], np.bool_)
 
-
-def compile_tree(formula: Formula, slots: Mapping[str, int]) -> Tree:
+def compile_tree(formula: Formula, slots: Mapping[str, int], ahead: bool = False) -> Tree:
     """The tree of `formula`, whose leaves find a name's value at values[slots[name]].
 
-    Raises FormulaError for a name without a slot.
+    ahead: whether the operand of an F or G that `is_far` has values before the window too, from the step of
+    the F or G on. Raises FormulaError for a name without a slot.
     """
-    builder = _Builder()
-    builder.add(formula, 0, 1)
-    nodes = np.array(builder.nodes, np.int64).reshape(-1, 7).T.copy()
-    leaf_at, leaf_start, leaf_stop = np.array(builder.leaves, np.int64).T.copy()
-    low, high = np.array([unseen_bounds(each) for each in builder.predicates]).T.copy()
+    builder = _Builder(ahead)
+    builder.add(formula, 0, 1, False)
+    *nodes, turned = np.array(builder.nodes, np.int64).reshape(-1, 8).T.copy()
+    leaves = np.array(builder.leaves, np.int64).T.copy()
+    bounds = np.array([unseen_bounds(each) for each in builder.predicates]).T.copy()
     programs = compile_predicates(builder.predicates, slots)
-    return Tree._make((*nodes, leaf_at, leaf_start, leaf_stop, low, high, programs, builder.size))
+    return Tree._make((*nodes, turned.astype(np.bool_), *leaves, *bounds, programs, builder.size))
+
+
+def is_far(formula: Always | Eventually, turned: bool) -> bool:
+    """Whether an F or G has to be asked for before its window to be met some steps early, and can be.
+
+    So it is where half of the time until the window is longer than that of an F, or than what is below a G
+    looks ahead. turned: whether an odd number of `not` stands above: then a G is an F, and an F a G.
+    """
+    seeks = isinstance(formula, Eventually) is not turned
+    span = formula.b - formula.a if seeks else formula.child.horizon
+    return span < formula.a // 2 and not may_fail(formula.child)
 
 
 class _Builder:
-    def __init__(self) -> None:
+    def __init__(self, ahead: bool) -> None:
+        self.ahead = ahead
         self.nodes: list[tuple[int, ...]] = []
         self.leaves: list[tuple[int, int, int]] = []
         self.predicates: list[Formula] = []
         self.size = 0
 
-    def add(self, formula: Formula, start: int, stop: int) -> int:
+    def add(self, formula: Formula, start: int, stop: int, turned: bool) -> int:
         """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin."""
+
+        def node(op: int, at: int, right: int = -1, a: int = 0, b: int = 0) -> int:
+            self.nodes.append((op, at, stop - start, a, b, right, start, turned))
+            return at
+
         match formula:
             case _ if is_predicate(formula):
-                return self._leaf(formula, start, stop)
+                at, self.size = self.size, self.size + stop - start
+                self.leaves.append((at, start, stop))
+                self.predicates.append(formula)
+                return at
             case Not(child):
-                return self._node(NOT, self.add(child, start, stop), start, stop)
+                return node(NOT, self.add(child, start, stop, not turned))
             case And(children) | Or(children):
                 op = AND if isinstance(formula, And) else OR
-                at = self.add(children[0], start, stop)
+                at = self.add(children[0], start, stop, turned)
                 for child in children[1:]:
-                    self._node(op, at, start, stop, right=self.add(child, start, stop))
+                    node(op, at, self.add(child, start, stop, turned))
                 return at
             case Implies(left, right):
-                at = self._node(NOT, self.add(left, start, stop), start, stop)
-                return self._node(OR, at, start, stop, right=self.add(right, start, stop))
+                at = node(NOT, self.add(left, start, stop, not turned))
+                return node(OR, at, self.add(right, start, stop, turned))
             case Always(a, b, child) | Eventually(a, b, child):
                 op = ALWAYS if isinstance(formula, Always) else EVENTUALLY
-                return self._node(op, self.add(child, start + a, stop + b), start, stop, a, b)
+                before = a if self.ahead and is_far(formula, turned) else 0
+                at = self.add(child, start + a - before, stop + b, turned)
+                return node(op, at, at + before, a, b)
             case Until(_, 0, _, right):
-                return self.add(right, start, stop)
+                return self.add(right, start, stop, turned)
             case Until(a, b, left, right):
-                at = self.add(left, start, stop - 1 + b)
-                return self._node(UNTIL, at, start, stop, a, b, self.add(right, start + a, stop + b))
+                at = self.add(left, start, stop - 1 + b, turned)
+                return node(UNTIL, at, self.add(right, start + a, stop + b, turned), a, b)
         raise TypeError(f"not a formula: {formula!r}")
-
-    def _leaf(self, formula: Formula, start: int, stop: int) -> int:
-        at, self.size = self.size, self.size + stop - start
-        self.leaves.append((at, start, stop))
-        self.predicates.append(formula)
-        return at
-
-    def _node(self, op: int, at: int, start: int, stop: int, a: int = 0, b: int = 0, right: int = -1) -> int:
-        self.nodes.append((op, at, stop - start, a, b, right, start))
-        return at
 
 
 @inlined
@@ -162,12 +171,16 @@ def apply(tree: Tree, n: int, buffer: Floats) -> None:
         for i in range(count):
             buffer[at + i] = until(buffer, at + i, right + i, tree.a[n], tree.b[n])
     else:
-        slide(buffer, at, count, tree.b[n] - tree.a[n] + 1, op == ALWAYS)
+        slide(buffer, at, right, count, tree.b[n] - tree.a[n] + 1, op == ALWAYS)
 
 
 @inlined
-def slide(buffer: Floats, at: int, count: int, width: int, least: bool) -> None:
-    """The extremum of every `width` neighbours, in log2(width) passes, as `robustness._sliding`."""
+def slide(buffer: Floats, at: int, right: int, count: int, width: int, least: bool) -> None:
+    """The extremum of every `width` neighbours from `right` on, in log2(width) passes, as
+    `robustness._sliding`.
+    """
+    for i in range(count + width - 1 if right > at else 0):
+        buffer[at + i] = buffer[right + i]
     if count == 1:
         best = buffer[at]
         for i in range(at + 1, at + width):

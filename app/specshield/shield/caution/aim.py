@@ -16,7 +16,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.rule.early import Conjuncts, conjunction_of, find_open, rate_open
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Best, Futures, Prefix, rho_of
+from specshield.shield.feasibility import Best, Futures, Prefix, best_rows, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
 from specshield.stl.tree import EVENTUALLY
@@ -58,9 +58,9 @@ def aim(
     which no more is asked.
     """
     task, margin = shield.task, SATISFIED_ABOVE + care.margin
-    formula, parts = conjunction_of(task, prefix.formula)
-    if formula is not prefix.formula:  # the conjuncts read the leaves of another
-        prefix = prefix.of(formula)
+    view, parts = conjunction_of(task, prefix.formula)
+    if view is not None:
+        prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
     count, motions = len(parts.kind), len(task.robot.motions)
     now = Open._make((parts, np.empty(count, np.bool_), *np.zeros((2, count), np.int64), prefix.t))
@@ -114,9 +114,7 @@ def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chan
     parts, still, asked, due, t = now
     find_open(parts, known, t, still)
     for k in range(still.shape[0]):
-        half, due[k] = parts.half[k], NEVER
-        if parts.plain[k] and parts.a[k] <= t:  # its window has begun
-            half = (parts.b[k] - parts.a[k]) // 2 if parts.kind[k] == EVENTUALLY else 0
+        half, due[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER
         if still[k] and half > 0:
             left = parts.b[k] + parts.horizon[k] - t
             if parts.kind[k] != EVENTUALLY:  # the first that its child is asked for
@@ -142,16 +140,10 @@ def _best_open(
     The way that the robot is on stays its motion's future (`rows`) where it keeps enough, though another may
     be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
     """
-    rho, stays = np.empty(whole.shape[0]), -1
+    rho = np.empty(whole.shape[0])
     rate_open(now.parts, now.still, now.t, early, leaves, rho)
-    rows[:] = -1
-    robustness[:] = -np.inf
-    for f in range(whole.shape[0]):
-        m = motions[f, 0]
-        value = rho[f] if whole[f] > SATISFIED_ABOVE else -np.inf
-        if follows and f == 0 and value > margin:
-            stays = m
-        if rows[m] < 0 or value > robustness[m]:
-            robustness[m] = value
-            rows[m] = 0 if m == stays else f
+    rho[~(whole > SATISFIED_ABOVE)] = -np.inf
+    best_rows(motions, rho, rows, robustness)
+    if follows and rho[0] > margin:
+        rows[motions[0, 0]] = 0
     return float(robustness.max())

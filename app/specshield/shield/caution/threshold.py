@@ -41,10 +41,10 @@ def chances(shield: Shield, care: Care, prefix: Prefix, judged: Judged, doubts: 
     future by them may keep the rule, where others are feasible.
     """
     tried, task = judged.tried, shield.task
-    formula, parts = conjunction_of(task, prefix.formula)
+    view, parts = conjunction_of(task, prefix.formula)
     leaves = tried.leaves
-    if formula is not prefix.formula:
-        prefix = prefix.of(formula)
+    if view is not None:
+        prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
     rho = np.where(judged.kept > SATISFIED_ABOVE, tried.rho, -np.inf)  # what is set aside does not count
     still, values = np.empty(len(parts.kind), np.bool_), np.zeros(len(task.robot.motions))
@@ -121,7 +121,7 @@ def _deadline(parts: Conjuncts, k: int, t: int, margin: float, buffer: Floats) -
     if a <= t:
         return 0, 0, 0
     met = a
-    while met > (t if parts.half[k] > 0 else a) and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
+    while met > (t if parts.lead[k] > 0 else a) and buffer[first + met - 1] > SATISFIED_ABOVE + margin:
         met -= 1
     return met - t, a - met, a - t
 
