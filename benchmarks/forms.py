@@ -42,6 +42,12 @@ RULES = (  # what it is, the method, the rule
     ("stay", DEFAULT, "F[0,60] G[0,20] Charger1"),
     ("short window far away", "planner", "F[60,62] G[0,5] Charger1"),
     ("short window far away", DEFAULT, "F[60,62] G[0,5] Charger1"),
+    ("patrol, in other words", "planner", "G[0,90] not G[0,60] not (Charger1 or Charger2)"),
+    ("condition that a visit ends", "planner", "G[0,70] not Charger1 -> F[0,40] Charger2"),
+    ("choice far away", "planner", "F[60,61] Charger1 or F[60,61] Charger2"),
+    ("choice of meetings", "planner", "G[60,80] Charger1 or G[60,80] Charger2"),
+    ("two things far away", "planner", "F[60,61] (Charger1 and G[0,5] not Kitchen)"),
+    ("response far away", "planner", "F[0,60] Charger1 and G[0,60] (Charger1 -> F[50,52] Charger2)"),
 )
 CONFIGS = {"none": Config(), "default": SESSIONS["default"]}
 NOISES = ("none", "slip", "gaussian")
