@@ -148,7 +148,7 @@ def check_ahead(session: Session, t: int, otherwise: str) -> None:
 def check_last(t: int, last: int) -> None:
     """last: the session's. Raises InputError for a step that comes after it."""
     if t > last:
-        raise InputError(f"step {t} is past the session's last", path="t", got=t, expected=f"at most {last}")
+        raise InputError(f"step {t} is past max_steps", path="t", got=t, expected=f"at most {last}")
 
 
 def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:
