@@ -13,11 +13,20 @@ import sys
 import tempfile
 from pathlib import Path
 
-from wheel import build, demo, install, run
+from wheel import asked, build, demo, install, run
 
 EXTRAS = "server,stream,minigrid,recordings"
 MODULES = "client local integrations.gymnasium recordings.foxglove recordings.rerun recordings.tables"
 COMMANDS = "check-drive demo doctor export keys openapi policy run serve train verify watch worker"
+STREAMED = """
+import sys
+from specshield.client import ShieldClient
+with ShieldClient(sys.argv[1], stream=True) as client:
+    client.wait_until_ready(600.0)
+    with client.sessions.create(policy_id="case1", initial_pose=(4.5, 5.0, 0.0)) as session:
+        decision = session.step((4.5, 5.0, 0.0), [0.0] * len(session.info.actions))
+        print(decision.spec_status)
+"""
 
 
 def main() -> None:
@@ -40,6 +49,7 @@ def main() -> None:
             shown = [str(python.with_name("specshield")), command, "--help"]
             run(shown, cwd=empty, env=clean, stdout=subprocess.DEVNULL)
         kernels = {**clean, "NUMBA_CACHE_DIR": str(folder / "kernels")}
+        assert asked(python, empty, kernels, STREAMED)[0] == "pending"
         seconds = demo(python, empty, kernels, "--runs", "1")
         print(f"demo with the oldest packages: {seconds:.1f} s")
 
