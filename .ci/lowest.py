@@ -8,14 +8,15 @@ Raises CalledProcessError or AssertionError where something does not work.
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from wheel import asked, build, demo, install, run
+from wheel import REPOSITORY, asked, build, demo, install, run
 
-EXTRAS = "server,stream,minigrid,recordings"
+EXTRAS = "server stream minigrid recordings"
 MODULES = "client local integrations.gymnasium recordings.foxglove recordings.rerun recordings.tables"
 COMMANDS = "check-drive demo doctor export keys openapi policy run serve train verify watch worker"
 STREAMED = """
@@ -40,8 +41,15 @@ def main() -> None:
         run([uv, "venv", "--quiet", "--python", sys.executable, str(environment)])
         python = environment / "bin" / "python"
         wheel = build(folder / "wheel", {})
-        packages = ["--resolution", "lowest-direct", f"specshield[{EXTRAS}] @ {wheel.as_uri()}"]
-        run([uv, "pip", "install", "--quiet", "--python", str(python), *packages])
+        extras = [part for extra in EXTRAS.split() for part in ("--extra", extra)]
+        named = ["--resolution", "lowest-direct", "-r", str(REPOSITORY / "pyproject.toml"), *extras]
+        for packages in (named, ["--no-deps", str(wheel)]):
+            run([uv, "pip", "install", "--quiet", "--python", str(python), *packages])
+        bound = re.search(r'"numba>=([0-9.]+)', (REPOSITORY / "pyproject.toml").read_text())
+        assert bound is not None
+        version = "import numba; print(numba.__version__)"
+        told = subprocess.run([str(python), "-c", version], check=True, stdout=subprocess.PIPE, text=True)
+        assert told.stdout.startswith(bound[1]), f"numba {told.stdout} is not the oldest that is allowed"
         clean = {n: v for n, v in os.environ.items() if not n.startswith(("SPECSHIELD_", "REDIS_", "PYTHON"))}
         imports = "; ".join(f"import specshield.{module}" for module in MODULES.split())
         run([str(python), "-c", imports], cwd=empty, env=clean)

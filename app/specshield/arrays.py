@@ -25,7 +25,9 @@ def pooled(array: NDArray[Kind], join: np.ufunc, reach: int, axis: int, mode: An
     """
     sides = [(reach, reach) if a == axis else (0, 0) for a in range(array.ndim)]
     windows = sliding_window_view(np.pad(array, sides, mode), 2 * reach + 1, axis)
-    result: NDArray[Kind] = join.reduce(list(np.moveaxis(windows, -1, 0)))
+    result = windows[..., 0].copy()
+    for n in range(1, 2 * reach + 1):
+        join(result, windows[..., n], out=result)
     return result
 
 

@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numba
-from llvmlite.binding import ffi, get_host_cpu_features, get_host_cpu_name
+from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 from numba.core.caching import CacheImpl, _CacheLocator
 
 from specshield import linking
@@ -51,8 +51,6 @@ def _base() -> Path:
 
 
 BASE = _base()
-with contextlib.suppress(AttributeError):  # a numba that does it otherwise
-    ffi.lib._lock._cblist.clear()  # each call of LLVM is told to clocks that nobody reads
 _found = get_host_cpu_features()
 if config.CPU_NAME is None and all(_found.get(feature) for feature in HAS):
     config.CPU_NAME, config.CPU_FEATURES = COMMON, ""

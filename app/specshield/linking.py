@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import sys
 from collections.abc import Callable
+from functools import update_wrapper
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -21,7 +22,6 @@ from numba.core.runtime.nrt import rtsys
 
 njit: Any = numba.njit  # its types leave out the options
 Base: Any = compiler.Compiler
-Environment: Any = environment.Environment
 Function = Callable[..., Any]
 # [instructions of LLVM, optimised] A kernel of no more is still written into those that call it. With 250 the
 # first start took as long, and decisions 1.013 times (`python -m benchmarks.episodes --against`).
@@ -31,19 +31,14 @@ _symbols: dict[str, tuple[Any, ...]] = {}  # the types of arguments that each st
 
 
 def _environment(module: str, constants: list[Any], name: str) -> Any:
-    """What compiled code needs of Python. numba imports the module for it; of its own, which take 0.3 s to
-    import, no kernel reads anything.
-    """
-    if not module.startswith("numba.") or module in sys.modules or name in Environment._memo:
-        return _rebuild_env(module, constants, name)
-    made = Environment({"__name__": module})
-    made.consts[:], made.env_name = constants, name
-    Environment._memo[name] = made
-    return made
+    """As numba has it, without 0.3 s of importing its own modules, of which no kernel on the disk reads."""
+    spared = module.startswith("numba.") and module not in sys.modules
+    return _rebuild_env("numba" if spared else module, constants, name)
 
 
 _rebuild_env: Any = environment._rebuild_env
-environment._rebuild_env = _environment
+# By its own name it would stand in the caches of others, which could not be read without this package then.
+environment._rebuild_env = update_wrapper(_environment, _rebuild_env)
 
 
 class Entry(Base):  # type: ignore[misc]
@@ -60,7 +55,7 @@ class _Callee(Entry):
     def compile_extra(self, function: Function) -> Any:
         self.state.flags.no_cpython_wrapper = True
         place = function.__module__, function.__qualname__
-        source = _source(_callees[place])
+        source = str(_callees[place]._cache._impl.locator.get_source_stamp())
         mangle = self.state.targetctx.mangler
 
         def name(whole: str, types: Any, *, abi_tags: Any = (), uid: Any = None) -> Any:
@@ -103,7 +98,7 @@ def callee(function: Function, options: dict[str, Any], kept: Callable[[Any], An
     cache = compiled._cache
     files, save = cache._cache_file, cache.save_overload
     name = cache._impl.filename_base + ".callee"  # besides what Python calls
-    cache._cache_file = type(files)(cache.cache_path, name, _source(compiled))
+    cache._cache_file = type(files)(cache.cache_path, name, str(cache._impl.locator.get_source_stamp()))
 
     def link_and_save(types: Any, kernel: Any) -> None:
         code = kernel.library._final_module.get_function(kernel.fndesc.mangled_name)
@@ -144,7 +139,3 @@ def _needed(kernel: Any) -> _Needed | None:
         return None
     made = kernel.fndesc
     return _Needed(made.modname, made.qualname, kernel.signature.args, made.mangled_name)
-
-
-def _source(compiled: Any) -> str:
-    return str(compiled._cache._impl.locator.get_source_stamp())

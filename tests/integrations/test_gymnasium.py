@@ -130,11 +130,11 @@ def test_an_agent_that_ends_its_task_leaves_the_rule_to_the_shield() -> None:
 def test_each_episode_draws_anew_and_a_seed_gives_one_back() -> None:
     env = ShieldWrapper(House(), LocalShield.shipped("case1"), lambda env: START, seed=3)
     told = []
-    for seed in (None, None, 1, None):
+    for seed in (7, None, 8, 7, None):
         env.reset(seed=seed)
         assert env.decision is not None
         told.append(env.decision.execute)
-    assert told[1] == told[2]  # drawn with 4, the others with 3 and 5
+    assert told[:2] == told[3:]
     assert len(set(told)) == 3
 
 

@@ -26,6 +26,9 @@ for part in warmup.PARTS:
     warmup.warm_up(part)
 before = ready()
 start = (4.5, 5.0, 0.0)
+ending = np.where(case.task.robot.terminal, 0.0, -np.inf)
+for threshold, wanted in ((0.5, logits), (0.5, ending), (1.0, ending)):
+    episode.decide(make_shield([policy], Config(threshold)), [start], wanted)
 ring = [[4.5 + 0.4 * np.cos(a), 5.0 + 0.4 * np.sin(a)] for a in np.arange(0.0, 6.3, 0.1)]
 for config in (Config(), Config(uncertainty=Uncertainty(), learn_map=True)):
     shield = make_shield([policy], config)

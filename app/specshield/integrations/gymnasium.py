@@ -41,7 +41,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     the action that was executed before it (None at first), which many models are fed; by default every action
     is alike. possible: which actions may be taken at all, [A] booleans, where the dynamics that the shield
     knows do not tell all. settings: of the session, as of `LocalShield.session`; by default the environment
-    is taken to move exactly as the shield's robot. Its `seed` grows by that of `reset`, or by 1 an episode.
+    is taken to move exactly as the shield's robot. Each episode's seed is made of theirs and of `reset`'s.
 
     Raises RobotError at `reset` unless actions are numbered as the robot's, InfeasibleStart there where
     the rule cannot be kept, and InputError at `step` for an action that there is not.
@@ -62,7 +62,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
         self._settings = {"uncertainty": "none", "learn_map": False, "seed": 0, **settings}
-        self._episode = -1
+        self._since = [0, -1]
         self.session: LocalSession | None = None
         self.decision: Decision | None = None
 
@@ -75,8 +75,9 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         if (getattr(space, "n", None), getattr(space, "start", None)) != (n, 0):
             what = "the environment's actions are not the robot's"
             raise RobotError(what, path="action_space", got=str(space), expected=f"Discrete({n})")
-        self._episode = self._episode + 1 if seed is None else seed
-        settings = self._settings | {"seed": (self._settings["seed"] + self._episode) % 2**63}
+        self._since = [self._since[0], self._since[1] + 1] if seed is None else [seed, 0]
+        own = np.random.SeedSequence([self._settings["seed"], *self._since])
+        settings = self._settings | {"seed": int(own.generate_state(1)[0])}
         self.session = shield.session(initial_pose=self._pose_of(self.env), **settings)
         return observation, {**info, **self._decide(self.session, observation, None, False)}
 

@@ -3,7 +3,7 @@
 What the prefix has settled is left out. An F or U is asked for so many steps before its window ends, or where
 it is met already. What a G that has yet to begin asks for is asked for so many steps before it, and so is
 what a short window far away asks for; another G at the top counts from the first step on at which its child
-is open. Below a `not`, a G is taken for the F that it is, and an F for a G.
+is open. Below a `not`, a G is an F in other words, and an F a G.
 """
 
 from __future__ import annotations

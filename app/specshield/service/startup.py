@@ -25,7 +25,7 @@ from specshield.errors import InputError, ServerError, SpecshieldError, Starting
 from specshield.service import warmup
 
 READY = "ready"  # the file of this name (`compiled.mark`) says that every kernel of a start is on the disk
-KERNELS = 243  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
+KERNELS = 254  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 34  # [s] that a first start took on two quiet cores: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them

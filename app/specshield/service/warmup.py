@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from llvmlite.binding import ffi
 from numba.core.compiler import Flags
 
 from specshield.policy.dqn.network import Network
@@ -49,6 +50,7 @@ START = (1.0, 1.0, 0.0)
 
 def warm_up(part: str) -> None:
     """Runs this part's kernels once: compiles them, or takes them from the disk."""
+    _hasten()
     PARTS[part](_task())
 
 
@@ -82,7 +84,7 @@ def _decide(task: Task) -> None:
 
 def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
     """What only a robot in trouble needs, so that no decision waits for a compiler then: walled in, where it
-    must not be, or stopped by something unknown. And what a probability for the whole episode needs.
+    must not be, or stopped by something unknown. And what a threshold below 1 needs.
     """
     shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
     first = episode.decide(shield, [START], logits)
@@ -90,8 +92,8 @@ def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
     episode.decide(shield, [START, START], logits, carry=first.carry, occupied=around)
     episode.decide(shield, [START, (1.766, 1.434, 0.0)], logits, carry=first.carry)  # in C
     cells_met(shield.body, np.array(START), 0, np.array([START]))
-    shield = make_shield([policy], Config(0.5, uncertainty=Uncertainty(), threshold_over="episode"))
-    episode.decide(shield, [START], logits)
+    for config in (Config(0.5), Config(0.5, uncertainty=Uncertainty(), threshold_over="episode")):
+        episode.decide(make_shield([policy], config), [START], logits)
 
 
 PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
@@ -111,10 +113,11 @@ def _network(task: Task) -> Network:
 
 
 def _hasten() -> None:
-    """Takes a tenth off the time that compiling takes in this process."""
+    """Takes a tenth off the time that compiling and loading kernels take in this process."""
     gc.set_threshold(100_000, 50, 50)  # compiling makes millions of small objects
     flags: Any = Flags
     with contextlib.suppress(AttributeError):  # a numba that does it otherwise
+        ffi.lib._lock._cblist.clear()  # each call of LLVM is told to clocks that nobody here reads
         defaults = {name: option.default for name, option in flags.options.items()}
         if flags()._values == {}:  # otherwise a hundred thousand comparisons ask for each option by itself
             flags.values = lambda flags: {**defaults, **flags._values}
@@ -122,5 +125,4 @@ def _hasten() -> None:
 
 if __name__ == "__main__":
     at_end_of_input(lambda: os._exit(1))  # the server is gone
-    _hasten()
     warm_up(sys.argv[1])

@@ -49,7 +49,7 @@ from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
 from specshield.service.storage.archiving import ArchivingStore
-from specshield.service.storage.store import Change
+from specshield.service.storage.store import Change, Limit, no_more
 from specshield.shield import episode
 from specshield.shield.decision import Config, check_preferring
 from specshield.shield.preference import Preference
@@ -76,7 +76,7 @@ class Sessions:
 
     async def create(self, request: SessionRequest, key: Key = OPEN) -> dict[str, Any]:
         """Raises NotFound, PolicyError, PoseError, InfeasibleStart, SessionExists, LimitReached."""
-        await self._check_room(key, 0)
+        limits = await self._check_room(key)
         if self._settings.redis_url is None:  # the store writes to this disk
             files.check_free(self._settings.data_dir, self._settings.disk_reserve_bytes)
         settings = self._checked(request)
@@ -99,10 +99,10 @@ class Sessions:
         config, state, rows = begun
         state = msgspec.structs.replace(state, expires_at=self._expiry())
         stored_as = scoped(key.name, config["id"])
-        await self._store.create(stored_as, files.to_json(config), Change(state.packed(), pack(rows)))
+        change = Change(state.packed(), pack(rows))
+        await self._store.create(stored_as, files.to_json(config), change, *limits)
         try:  # whoever deletes a policy sees this session now, or has marked the policy before
             await self._run(self._policies.still_there, config["policy_ids"], key.name)
-            await self._check_room(key, 1)  # others may have begun at the same time
         except SpecshieldError:
             await self._store.delete(stored_as)
             raise
@@ -209,22 +209,21 @@ class Sessions:
             if after is None:
                 return None
 
-    async def _check_room(self, key: Key, begun: int) -> None:
-        """Raises LimitReached where a caller, or all of them, keep all that they may, `begun` here aside."""
+    async def _check_room(self, key: Key) -> list[Limit]:
+        """A caller's limits. Raises LimitReached where one is reached."""
         if self._store.full:
             raise LimitReached(
                 f"the archive holds {self._settings.archive_bytes} bytes, and takes no more sessions",
                 expected="room: delete sessions; the server's operator can raise SPECSHIELD_ARCHIVE_BYTES",
             )
-        for owner, limit in ((None, self._settings.max_sessions), (key.name, key.sessions)):
-            if limit is None or await self._store.count(owner) < limit + begun:
-                continue
-            await self._store.sweep(owner)
-            if await self._store.count(owner) >= limit + begun:
-                raise LimitReached(
-                    f"no more than {limit} sessions are kept",
-                    expected="room for one more: delete a session, or wait until one expires",
-                )
+        both = ((None, self._settings.max_sessions), (key.name, key.sessions))
+        limits: list[Limit] = [(owner, most) for owner, most in both if most is not None]
+        for owner, most in limits:
+            if await self._store.count(owner) >= most:
+                await self._store.sweep(owner)
+                if await self._store.count(owner) >= most:
+                    raise no_more(most)
+        return limits
 
     async def _run(self, function: Callable[..., R], *args: Any) -> R:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)

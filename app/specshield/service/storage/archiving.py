@@ -65,10 +65,10 @@ class ArchivingStore(Store):
         self.full = False
         self._files = anyio.CapacityLimiter(AT_ONCE)
 
-    async def create(self, id: str, config: bytes, change: Change) -> bytes:
+    async def create(self, id: str, config: bytes, change: Change, *limits: tuple[str | None, int]) -> bytes:
         if await self.in_thread(self.archive.find, id) is not None:
             raise exists(id)
-        return await super().create(id, config, change)
+        return await super().create(id, config, change, *limits)
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """Two round trips and a file where the session is not in the store."""

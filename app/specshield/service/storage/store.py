@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import anyio
 
-from specshield.errors import SessionExists
+from specshield.errors import LimitReached, SessionExists
 from specshield.service.access.owners import between, shown
 from specshield.service.storage.connect import FAILURES, away, connect, is_cluster
 from specshield.service.storage.wire import PART, Script, Wire, too_few
@@ -23,6 +23,7 @@ from specshield.service.storage.wire import PART, Script, Wire, too_few
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
 AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
 INDEX = "specshield:sessions"
+Limit = tuple[str | None, int]  # how many sessions an owner may have, or with None all of them
 NO_VERSION = b"-"  # that no session ever has
 APPEND = Script(Path(__file__).with_name("append.lua").read_text())
 
@@ -77,6 +78,7 @@ class Store:
     def __init__(self, url: str, timeout: float, ttl: int, replicas: int = 0) -> None:
         self.redis: Any = connect(url, socket_timeout=timeout)
         self._append = self.redis.register_script(APPEND.text)
+        self._claim = self.redis.register_script(Path(__file__).with_name("claim.lua").read_text())
         # A cluster has no one connection: redis-py finds the server that has a session's keys.
         self._wire = None if is_cluster(url) else Wire(self.redis.connection_pool, timeout, replicas)
         self._timeout, self._ttl, self._replicas = timeout, ttl, replicas
@@ -104,11 +106,11 @@ class Store:
         if self._replicas:
             await self.load("ready")
 
-    async def create(self, id: str, config: bytes, change: Change) -> bytes:
-        """The first version. Raises SessionExists. `config` has to be unlike any other, so that a retry knows
-        its own.
+    async def create(self, id: str, config: bytes, change: Change, *limits: Limit) -> bytes:
+        """The first version. Raises SessionExists, and LimitReached where a limit is reached. `config` has
+        to be unlike any other, so that a retry knows its own.
         """
-        await self.list_name(id)
+        await self.list_name(id, *limits)
         begun = await self._write(id, b"", change, config)
         if isinstance(begun, Record) and begun.config == config:  # a try whose answer was lost
             begun = begun.version
@@ -117,13 +119,16 @@ class Store:
         await self.list_name(id)
         return begun
 
-    async def list_name(self, id: str) -> None:
-        """Lists a session that is being made, before it is there: else a server that is killed in between
-        leaves one that nobody ever finds or moves. It is listed again afterwards, since names without a
-        session are taken off the list.
+    async def list_name(self, id: str, *limits: Limit) -> None:
+        """Lists a session before it is there: else a server that is killed in between leaves one that nobody
+        ever finds or moves. It is listed again afterwards, since names without a session are taken off the
+        list. Raises LimitReached for a new one where a limit is reached.
         """
+        bounds = [part for limit in limits for part in (*_range(limit[0]), limit[1])]
         async with self._reaching():
-            await self.redis.zadd(INDEX, {id: 0})
+            passed = await self._claim(keys=[INDEX], args=[id, *bounds])
+        if passed:
+            raise no_more(limits[passed - 1][1])
 
     async def take_off(self, ids: Sequence[bytes]) -> None:
         """Takes names off the list that have no session. One that was made meanwhile is listed again."""
@@ -265,6 +270,11 @@ def _record(
     config: bytes | None, state: bytes, version: bytes, rows: bytes | None, step: bytes | None
 ) -> Record | None:
     return None if config is None or rows is None else Record(config, state, version, rows, step or None)
+
+
+def no_more(most: int) -> LimitReached:
+    expected = "room for one more: delete a session, or wait until one expires"
+    return LimitReached(f"no more than {most} sessions are kept", expected=expected)
 
 
 def exists(id: str) -> SessionExists:
