@@ -27,9 +27,9 @@ class Config:
     """A session's settings. Raises InputError or Unsupported with the field's path.
 
     threshold: delta; with `feasibility` in (0, 1], with `robustness` any number (metres). margin: J asks rho
-    > margin [m]. slack: J asks for each F of the conjunction this many steps early. Where the margin or the
-    slack cannot be had, J asks for as much of it as can be. max_steps: None is max(600, T + 1). seed: of the
-    drawn actions.
+    > margin [m]. slack: J asks for what has a deadline this many steps early. Where the margin or the slack
+    cannot be had, J asks for as much of it as can be. max_steps: None is max(600, T + 1). seed: of the drawn
+    actions.
 
     uncertainty: None takes f for exact, as the paper does; else margin and slack follow from what is known
     and learned of the robot, and those given are the least that is kept. threshold_over: whether delta holds
