@@ -44,8 +44,8 @@ lowest: .venv/bin/python
 	$(BIN)/python .ci/lowest.py
 
 lint: .venv/.dev
-	$(BIN)/ruff check app evaluation tests benchmarks examples ros2
-	$(BIN)/ruff format --check app evaluation tests benchmarks examples ros2
+	$(BIN)/ruff check app evaluation tests benchmarks examples ros2 .ci
+	$(BIN)/ruff format --check app evaluation tests benchmarks examples ros2 .ci
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m benchmarks.lines

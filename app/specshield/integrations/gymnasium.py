@@ -40,8 +40,8 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     own. pose_of: (x, y, theta) in the map's frame. logits: the model's, one an action, for an observation and
     the action that was executed before it (None at first), which many models are fed; by default every action
     is alike. possible: which actions may be taken at all, [A] booleans, where the dynamics that the shield
-    knows do not tell all. settings: of the session, as of `LocalShield.session`; by default the environment
-    is taken to move exactly as the shield's robot. Each episode's seed is made of theirs and of `reset`'s.
+    knows do not tell all. settings: as of `LocalShield.session`; by default the environment moves exactly as
+    the shield's robot. Each episode has its own seed, made of the one in `settings` and the one of `reset`.
 
     Raises RobotError at `reset` unless actions are numbered as the robot's, InfeasibleStart there where
     the rule cannot be kept, and InputError at `step` for an action that there is not.
@@ -62,7 +62,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
         self._settings = {"uncertainty": "none", "learn_map": False, "seed": 0, **settings}
-        self._since = [0, -1]
+        self._since = [0, -1]  # the last seed that `reset` was given, and the episodes since
         self.session: LocalSession | None = None
         self.decision: Decision | None = None
 

@@ -100,7 +100,7 @@ PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield an
 
 
 def _task() -> Task:
-    """One in which every cell can be reached: for others scipy is imported, for a fifth of the whole time."""
+    """A task in which every cell can be reached: for others scipy is imported, which takes 0.2 s."""
     small = replace(STRETCH, radius=0.01)
     return make_task(OccupancyGrid(np.zeros((20, 20), bool), 0.1), small, FORMULA, REGIONS)
 
