@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from specshield.cores import cores
 from specshield.errors import InputError
 
 
@@ -56,7 +56,7 @@ def evaluate(
         runs,
         methods.split(",") if methods else available(case),
         out,
-        processes or os.cpu_count() or 1,
+        processes or cores(),
         redis,
         json,
     )
@@ -102,7 +102,7 @@ def worlds(
         for name in _some(world, WORLDS, "--world")
         for senses in _some(sensing, SENSING, "--sensing")
     ]
-    compare(trials, runs, out, processes or os.cpu_count() or 1)
+    compare(trials, runs, out, processes or cores())
 
 
 def results(
@@ -126,7 +126,7 @@ def results(
     from evaluation.plan import carry_out
 
     kinds = _some(only, ("cases", "noise", "bodies", "houses", "models", "tasks"), "--only") if only else []
-    failed = carry_out(out, page, houses_in(houses), kinds, share, processes or os.cpu_count() or 1)
+    failed = carry_out(out, page, houses_in(houses), kinds, share, processes or cores())
     raise typer.Exit(1 if failed else 0)
 
 
@@ -181,7 +181,7 @@ def curves(
         runs,
         out,
         page,
-        processes or os.cpu_count() or 1,
+        processes or cores(),
     )
 
 
@@ -197,7 +197,7 @@ def habits(
     """Measure what shields break of a model's habit and of its memory."""
     from evaluation.habits import measure
 
-    measure(runs, seed, out, page, processes or os.cpu_count() or 1)
+    measure(runs, seed, out, page, processes or cores())
 
 
 def rivals(
@@ -215,7 +215,7 @@ def rivals(
     from evaluation.rivals import FAMILIES, measure
 
     models = model.split(",") if model else FAMILIES
-    measure(runs, seed, models, case.split(","), out, page, processes or os.cpu_count() or 1)
+    measure(runs, seed, models, case.split(","), out, page, processes or cores())
 
 
 def report(

@@ -1,12 +1,12 @@
 """Steps over HTTP: answers, replay, races, history, the end, reading back."""
 
 import json
-import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from specshield.cores import cores
 from tests.service import world
 from tests.service.world import LOGITS, SPEC, START, ahead, send_policy
 
@@ -70,7 +70,7 @@ def test_a_rule_that_is_over_at_once_leaves_nothing_to_look_ahead_to(client, beg
 
 def test_sessions_that_are_prepared_keep_no_step_waiting(client, policy, begin, step):
     """As many at once as there are threads for decisions, each for a task of its own: they take seconds."""
-    session, count = begin(), (os.cpu_count() or 1) + 1
+    session, count = begin(), cores() + 1
     formulas = [f"F[0,{250 + k}] Goal and F[{300 + k},{590 + k}] x < 1.2" for k in range(count)]
     made = [send_policy(client, spec={**SPEC, "formula": formula})["id"] for formula in formulas]
 

@@ -13,6 +13,7 @@ import pytest
 
 from specshield import compiled
 from specshield.client import ShieldClient
+from specshield.cores import cores
 from specshield.errors import Starting, TransportError
 from specshield.service.startup import READY
 from tests.serving import serving, wait_for
@@ -94,7 +95,7 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
         assert told["parts"] == {"reachability": "compiling", "shield and dqn": "compiling"}
         wait_for(lambda: starting(server.url))
         fcntl.flock(lock, fcntl.LOCK_UN)
-        wait_for(lambda: len(compiling(kernels)) == min(2, os.cpu_count()))
+        wait_for(lambda: len(compiling(kernels)) == min(2, cores()))
         server.kill()
         wait_for(lambda: not compiling(kernels))
     assert re.search(r"INFO: +compiling the kernels: .* takes about \d+ s", server.log.read_text())

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from specshield import compiled
+from specshield.cores import cores
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
@@ -108,7 +109,7 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
 async def _compile(startup: Startup, mark: Path) -> None:
     startup.before = compiled.on_disk()
     telling = asyncio.create_task(_tell(startup))
-    free = asyncio.Semaphore(os.cpu_count() or 1)
+    free = asyncio.Semaphore(cores())
     try:
         async with _one_at_a_time(mark.with_suffix(".lock")):
             if mark.exists():  # another process has done it meanwhile

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from specshield.client import Session, ShieldClient
+from specshield.cores import cores
 from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.sim.cases import Case, load_case
@@ -52,9 +53,8 @@ def robots(url: str) -> Iterator[Executor]:
     """A process for each core that drives robots, through clients of the service at `url`: the models of
     several robots would wait for each other in one. What has not begun by the end of the block is called off.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     others = active_children()
-    pool = ProcessPoolExecutor(min(cores, MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
+    pool = ProcessPoolExecutor(min(cores(), MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
     try:
         yield pool
     finally:

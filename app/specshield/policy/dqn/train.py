@@ -24,6 +24,7 @@ from scipy.stats import binomtest
 from torch import nn
 
 from specshield.arrays import Bools, Ints, Singles
+from specshield.cores import cores
 from specshield.policy.card import make_card
 from specshield.policy.dqn.environment import Environment, free_poses
 from specshield.policy.dqn.method import Settings
@@ -69,7 +70,7 @@ def train(
     the fragment, Stopped when `should_stop` says so.
     """
     # One core is for the robots. A thread that waits for a core spins, which was forty times slower at worst.
-    torch.set_num_threads(max((os.cpu_count() or 1) - 1, 1))
+    torch.set_num_threads(max(cores() - 1, 1))
     run = Run(task, settings, seed)
     if checkpoint is not None:
         run.resume(checkpoint)

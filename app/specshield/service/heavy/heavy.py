@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import time
 from collections.abc import Hashable
 from functools import partial
@@ -11,6 +10,7 @@ from typing import Any
 
 from fastapi import Request
 
+from specshield.cores import cores
 from specshield.service.heavy.pool import Pool, Template
 from specshield.service.problems import ClientGone, until_gone
 from specshield.service.settings import Settings
@@ -28,7 +28,7 @@ class Heavy:
 
     def __init__(self, settings: Settings) -> None:
         self._settings, self._template = settings, Template()
-        pool, size = partial(Pool, self._template, unused=self._unused), max(os.cpu_count() or 1, 2)
+        pool, size = partial(Pool, self._template, unused=self._unused), max(cores(), 2)
         self.tasks = pool(size=2, memory=settings.heavy_memory, nice=TASKS_NICE, waiting=WAITING, idle=IDLE)
         self.decisions = pool(
             size=size, memory=DECISION_MEMORY, nice=DECISIONS_NICE, waiting=1000, idle=10 * IDLE

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
 import secrets
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ import numpy as np
 
 from specshield import handover
 from specshield.arrays import Floats
+from specshield.cores import cores
 from specshield.errors import InputError, LimitReached, NotFound, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION, check_shaping
 from specshield.reasons import refusal
@@ -69,7 +69,7 @@ class Sessions:
     ) -> None:
         self._settings, self._store, self._policies = settings, store, policies
         self._shields = Shields(policies, settings.shield_cache)
-        self._threads = ThreadPoolExecutor(os.cpu_count() or 1, "decide")
+        self._threads = ThreadPoolExecutor(cores(), "decide")
         self.steps = Steps(store, self._shields, self._threads, heavy, settings.session_ttl, tell)
         self.switches = Switches(store, self._shields, self._run, heavy, settings)
         self._heavy = heavy
