@@ -144,7 +144,8 @@ def rewards(
     """Train the learned policy with the paper's reward and with ours, and compare what comes of them."""
     from evaluation.rewards import all_of, compare
 
-    compare(all_of(case, reward, seeds, updates), runs, out, page)
+    whole = [int(seed) for seed in _numbers(seeds, "--seeds")]
+    compare(all_of(case, reward, whole, updates), runs, out, page)
 
 
 def curves(

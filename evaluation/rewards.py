@@ -220,11 +220,11 @@ def _commands(trainings: Sequence[Training], runs: int, out: Path) -> Iterator[s
         )
 
 
-def all_of(cases: str, rewards: str, seeds: str, updates: int) -> list[Training]:
-    """One training for each, names separated by commas; the first seed of everything comes first."""
+def all_of(cases: str, rewards: str, seeds: Sequence[int], updates: int) -> list[Training]:
+    """One training for each case, reward (both separated by commas) and seed; the first seed comes first."""
     return [
-        Training(case_name(case), reward, int(seed), updates)
-        for seed in seeds.split(",")
+        Training(case_name(case), reward, seed, updates)
+        for seed in seeds
         for case in cases.split(",")
         for reward in rewards.split(",")
     ]

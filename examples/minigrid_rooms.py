@@ -9,7 +9,7 @@ later, and out of the first while the second is open. The same is done with a mo
 
 from __future__ import annotations
 
-import sys
+import argparse
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -74,7 +74,9 @@ def drive(env: ShieldWrapper, seed: int) -> tuple[str, bool]:
 
 
 def main() -> None:
-    episodes = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    parser = argparse.ArgumentParser(description="A bot and a random model in a maze, kept inside a rule.")
+    parser.add_argument("episodes", type=int, nargs="?", default=20, help="episodes of each (20)")
+    episodes = parser.parse_args().episodes
     for name, model in (("the bot", bot), ("a model that draws at random", chance)):
         env = maze(model)
         ends, refused = [], 0  # in one maze of a hundred, a thing lies in front of the only door of a room

@@ -65,6 +65,16 @@ def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
     assert "flat.json is no map of a known form" in line
 
 
+def test_sizes_of_furniture_for_what_is_no_house_are_refused(tmp_path):
+    refused = command(
+        "policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--assets", tmp_path / "sizes.json",
+        "--url", "http://127.0.0.1:9", "--out", tmp_path,
+    )  # fmt: skip
+    assert refused.returncode == 1
+    (line,) = refused.stderr.strip().splitlines()
+    assert line.startswith("--assets: only a ProcTHOR house has furniture")
+
+
 def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_path):
     (tmp_path / "file").touch()
     refused = command("policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--out", tmp_path / "file" / "in")

@@ -8,7 +8,7 @@ from evaluation.rewards import all_of, compare
 
 
 def test_every_case_and_reward_begins_with_the_first_seed():
-    found = all_of("1,2", "paper,progress", "3,4", 100)
+    found = all_of("1,2", "paper,progress", [3, 4], 100)
     assert [each.seed for each in found] == [3] * 4 + [4] * 4
     assert {(each.case, each.reward) for each in found[:4]} == {
         (case, reward) for case in ("case1", "case2") for reward in ("paper", "progress")
@@ -17,7 +17,7 @@ def test_every_case_and_reward_begins_with_the_first_seed():
 
 def test_what_was_trained_is_not_trained_again(tmp_path):
     page, out = tmp_path / "rewards.md", tmp_path / "out"
-    compare(all_of("1", "paper", "0", 2), 1, out, page)
+    compare(all_of("1", "paper", [0], 2), 1, out, page)
     weights = out / "case1-paper-0-2" / "policy.safetensors"
     written, made = page.read_text(), weights.stat().st_mtime_ns
     compare(all_of("1", "paper", "0", 2), 1, out, page)

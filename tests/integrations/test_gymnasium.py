@@ -148,6 +148,15 @@ def test_an_action_that_there_is_not_does_not_reach_the_environment() -> None:
     assert house.executed == []
 
 
+@pytest.mark.parametrize(
+    ("path", "wrong"), [("seed", -1), ("seed", None), ("possible", lambda env: np.ones(6, bool))]
+)
+def test_a_seed_and_a_mask_that_cannot_be_used_are_refused(path: str, wrong: Any) -> None:
+    env = ShieldWrapper(House(), LocalShield.shipped("case1"), lambda env: START, **{path: wrong})
+    with pytest.raises(InputError, match=path):
+        env.reset()
+
+
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(7), gymnasium.spaces.Discrete(20, start=1)])
 def test_other_actions_than_the_robots_are_refused(space: Any) -> None:
     """Also those that are counted from another number: each would be taken for the next."""

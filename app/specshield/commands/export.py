@@ -32,7 +32,9 @@ def export(
     api_key: Annotated[
         str | None, typer.Option(envvar="SPECSHIELD_API_KEY", help="Its key, where it asks for one.")
     ] = None,
-    step_seconds: Annotated[float, typer.Option(help="How long a step took, in seconds.", min=1e-3)] = 1.0,
+    step_seconds: Annotated[
+        float, typer.Option(help="How long a step took, in seconds.", min=1e-3, max=86_400.0)
+    ] = 1.0,
 ) -> None:
     """Write a session as MCAP (Foxglove), CSV, Parquet or for Rerun; needs the extra `recordings`."""
     from specshield.client import ShieldClient

@@ -76,20 +76,23 @@ def _show(status: StatusLine, found: Policy) -> None:
 def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
     """A file is sent; anything else is the id or the name of a map that the server has."""
     path = Path(map)
+    content = _read(path, "--map") if path.suffix else {}
+    if assets is not None and "rooms" not in content:
+        raise InputError(
+            "only a ProcTHOR house has furniture", path="--assets", got=str(assets), expected="no --assets"
+        )
     if not path.suffix:
         return client.maps.get(map)
     if path.suffix in (".yaml", ".yml"):
-        metadata = _read(path, "--map")
-        image = path.parent / Path(str(metadata.get("image", ""))).name
+        image = path.parent / Path(str(content.get("image", ""))).name
         if not image.is_file():
             raise InputError(
-                f"{path} names the image {metadata.get('image')!r}, which is not beside it",
+                f"{path} names the image {content.get('image')!r}, which is not beside it",
                 path="--map",
                 got=str(image),
                 expected="the map's PGM or PNG beside its YAML",
             )
         return client.maps.upload(path, image)
-    content = _read(path, "--map")
     if "rooms" in content:
         sizes = {} if assets is None else _read(assets, "--assets")
         return client.maps.procthor(content, sizes)

@@ -44,7 +44,8 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     the shield's robot. Each episode has its own seed, made of the one in `settings` and the one of `reset`.
 
     Raises RobotError at `reset` unless actions are numbered as the robot's, InfeasibleStart there where
-    the rule cannot be kept, and InputError at `step` for an action that there is not.
+    the rule cannot be kept, and InputError at `step` for an action that there is not; also for a seed, or for
+    what `possible` says, that cannot be used.
     """
 
     def __init__(
@@ -76,7 +77,10 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
             what = "the environment's actions are not the robot's"
             raise RobotError(what, path="action_space", got=str(space), expected=f"Discrete({n})")
         self._since = [self._since[0], self._since[1] + 1] if seed is None else [seed, 0]
-        own = np.random.SeedSequence([self._settings["seed"], *self._since])
+        given = self._settings["seed"]
+        if not isinstance(given, int) or given < 0:
+            raise InputError("this is no seed", path="seed", got=given, expected="a whole number, 0 or more")
+        own = np.random.SeedSequence([given, *self._since])
         settings = self._settings | {"seed": int(own.generate_state(1)[0])}
         self.session = shield.session(initial_pose=self._pose_of(self.env), **settings)
         return observation, {**info, **self._decide(self.session, observation, None, False)}
@@ -114,7 +118,11 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
             told = logit_values(self._logits(observation, executed))
             logits = np.array([-np.inf if value is None else value for value in told])
         if self._possible is not None:
-            logits[~np.asarray(self._possible(self.env), bool)] = -np.inf
+            may = np.asarray(self._possible(self.env), bool)
+            if may.shape != logits.shape:
+                expected = f"a boolean for each of the {len(logits)} actions"
+                raise InputError("the shape is wrong", path="possible", got=may.shape, expected=expected)
+            logits[~may] = -np.inf
         decision = session.step(self._pose_of(self.env), None if over else logits, main_task_done=over)
         self.decision = decision
         distribution = np.array(decision.distribution)
