@@ -1,5 +1,6 @@
 """Steps over HTTP: answers, replay, races, history, the end, reading back."""
 
+import asyncio
 import json
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -7,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from specshield.cores import cores
+from specshield.service.routes.sessions import _each, _listed
 from tests.service import world
 from tests.service.world import LOGITS, SPEC, START, ahead, send_policy
 
@@ -284,6 +286,30 @@ def test_the_trajectory_by_lines_is_the_one_by_object(client, begin, step):
         lines = client.get(path, **asked)
         assert lines.headers["content-type"] == "application/x-ndjson"
         assert [json.loads(line) for line in lines.text.splitlines()] == items
+
+
+@pytest.mark.parametrize("asked", ["json", "ndjson"])
+def test_others_have_their_turn_while_a_long_trajectory_is_written(asked):
+    turns = 0
+
+    async def other():
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    async def scenario():
+        task = asyncio.create_task(other())
+        lines = (b'{"t":%d}' % t for t in range(1000))
+        parts = _each(lines) if asked == "ndjson" else _listed(lines, b"[]")
+        content = b"".join([part async for part in parts])
+        task.cancel()
+        return content
+
+    content = asyncio.run(scenario())
+    items = list(map(json.loads, content.splitlines())) if asked == "ndjson" else json.loads(content)["items"]
+    assert items == [{"t": t} for t in range(1000)]
+    assert turns > 50
 
 
 def test_erased_is_gone(client, begin, step):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any, Literal
 
@@ -194,10 +195,12 @@ async def trajectory(
 async def _each(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
     for line in lines:
         yield line + b"\n"
+        await asyncio.sleep(0)  # others come between: 10,000 lines take more than a second
 
 
 async def _listed(lines: Iterator[bytes], rules: bytes) -> AsyncIterator[bytes]:
-    yield b'{"items":['
-    for i, line in enumerate(lines):
-        yield b"," + line if i else line
+    before = b'{"items":['
+    async for line in _each(lines):
+        yield before + line
+        before = b","
     yield b'],"next":null,"rules":' + rules + b"}"
