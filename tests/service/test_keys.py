@@ -96,7 +96,7 @@ def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
             timeout=HUNG,
         )  # fmt: skip
 
-    made = keys("create", "carol", "--requests", "7.5", "--sessions", "3")
+    made = keys("create", "carol", "--requests", "7.5", "--sessions", "3", "--bytes", f"1{400 * '0'}")
     secret = made.stdout.strip()
     assert len(secret) > 40, made.stderr
     with httpx.Client(
@@ -105,7 +105,7 @@ def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
         assert client.get("/v1/sessions").status_code == 200  # at once
         listed = keys("list").stdout
         assert "carol" in listed
-        assert "7.5 requests a second, 3 sessions" in listed
+        assert "7.5 requests a second, 3 sessions, 10,000,000" in listed
         assert secret not in listed
         assert keys("revoke", "carol").returncode == 0
         wait_for(lambda: client.get("/v1/sessions").status_code == 401)

@@ -38,7 +38,7 @@ def show() -> None:
     """The names of the keys, with their limits."""
     for key in on_keys(lambda keys: keys.listed()):
         limits = {"requests a second": key.requests, "sessions": key.sessions, "bytes": key.bytes}
-        told = ", ".join(f"{limit:g} {what}" for what, limit in limits.items() if limit is not None)
+        told = ", ".join(f"{limit:,} {what}" for what, limit in limits.items() if limit is not None)
         print(f"{key.name}  made {key.created_at}  {told or 'no limits'}")
 
 
