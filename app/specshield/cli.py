@@ -139,6 +139,7 @@ def serve(
         "timeout_graceful_shutdown": GRACE,
         "log_config": logs.config(settings.log_format, settings.log_level),
         "http": "specshield.service.bounds.protocol:BoundedProtocol",
+        "ws": "specshield.service.bounds.protocol:BoundedStream",
         "timeout_keep_alive": settings.keep_alive_timeout,
         "timeout_worker_healthcheck": STARTS_WITHIN,
     }

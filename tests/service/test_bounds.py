@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
+import psutil
 import pytest
 
 from tests.service.world import grid_json
@@ -28,6 +29,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
         "SPECSHIELD_MAX_CONNECTIONS": str(MOST),
         "SPECSHIELD_REQUEST_TIMEOUT": "2",
         "SPECSHIELD_MAX_HEADER_BYTES": "4096",
+        "SPECSHIELD_MIN_BODY_RATE": str(10 << 20),
     }
     with serving(folder, ready=False, **settings) as server:
         wait_for(lambda: _alive(server))
@@ -90,6 +92,18 @@ def test_what_cannot_open_a_websocket_is_refused(small: RunningServer, line: str
 def test_a_connection_that_says_nothing_is_closed(small: RunningServer) -> None:
     with _connect(small) as connection:
         assert connection.recv(1) == b""
+
+
+def test_a_client_that_does_not_read_its_answers_is_cut_off(small: RunningServer) -> None:
+    def held_by_server(client: socket.socket) -> bool:
+        held = psutil.Process(small.process.pid).net_connections("tcp")
+        return client.getsockname() in [each.raddr for each in held if each.raddr]
+
+    with _connect(small) as connection:
+        request = b"GET /static-offline-docs/swagger-ui-bundle.js HTTP/1.1\r\nHost: %s\r\n\r\n"
+        connection.sendall(20 * (request % urlsplit(small.url).netloc.encode()))  # 30 MB
+        wait_for(lambda: held_by_server(connection))
+        wait_for(lambda: not held_by_server(connection))
 
 
 def test_silent_connections_make_room_for_those_who_ask(small: RunningServer) -> None:

@@ -3,6 +3,9 @@
 import asyncio
 import json
 import signal
+import socket
+import threading
+import time
 from contextlib import suppress
 
 import httpx
@@ -161,6 +164,33 @@ def test_a_caller_who_does_not_read_holds_up_nobody(server, begin):
             deaf.transport.abort()
 
     asyncio.run(scene())
+
+
+PING, EMPTY, STEP = b"\x89\x80" + bytes(4), b"\x00\x80" + bytes(4), b"\x81\x82" + bytes(4) + b"{}"
+
+
+@pytest.mark.parametrize("frame", [PING, EMPTY, STEP], ids=["pings", "empty fragments", "steps"])
+def test_a_flood_of_small_frames_holds_up_nobody(server, client, begin, frame):
+    with connect(stream_of(server, begin()), ping_interval=None) as stream:
+        flood, over = stream.socket, threading.Event()
+
+        def send():
+            with suppress(OSError):
+                flood.sendall(b"\x01\x80" + bytes(4) if frame == EMPTY else b"")  # begins a message
+                while not over.is_set():
+                    flood.sendall(frame * 20_000)
+
+        sending = threading.Thread(target=send)
+        sending.start()
+        began = time.monotonic()
+        for _ in range(20):
+            assert client.get("/livez").status_code == 200
+            time.sleep(0.05)
+        took = time.monotonic() - began
+        over.set()
+        flood.shutdown(socket.SHUT_RDWR)
+        sending.join()
+    assert took < 5, "20 requests, each of a few ms"
 
 
 def test_a_server_that_stops_says_so_to_its_streams(tmp_path):

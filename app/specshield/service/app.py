@@ -67,7 +67,7 @@ class Application:
 
     def __init__(self, routes: FastAPI, settings: Settings) -> None:
         self.routes = routes
-        steps = StepRoute(StreamRoute(routes, settings.max_body_bytes))
+        steps = StepRoute(StreamRoute(routes))
         # Nothing is read for who may not ask.
         self._around = Observe(Guard(Bodies(steps, settings), settings.hosts))
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 import asyncio
 import signal
 import threading
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # the parent of several servers decides nothing
     from specshield.service.startup import Startup
@@ -15,20 +16,15 @@ if TYPE_CHECKING:  # the parent of several servers decides nothing
 GRACE = 10  # [s] that running requests and streams have once the server takes no more; chosen by hand
 
 
-class Stream(Protocol):
-    def stop(self) -> None:
-        """Says goodbye, after the message that is being answered."""
-
-
 class Streams:
-    """The streams of this process that are open."""
+    """What ends each stream of this process that is open, after the message that is being answered."""
 
     def __init__(self) -> None:
-        self.open = set[Stream]()
+        self.open = set[Callable[[], None]]()
 
     def close(self) -> None:
-        for stream in list(self.open):
-            stream.stop()
+        for stop in list(self.open):
+            stop()
 
     def close_at_stop(self) -> None:
         """Closes them as soon as the server is told to stop. To be called in the server's event loop."""

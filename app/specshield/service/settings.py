@@ -80,7 +80,7 @@ class Settings(BaseSettings):
         15.0,
         gt=0,
         le=LONGEST,
-        description="Longest that a request's head, or its body, may take to arrive [s].",
+        description="Longest that a request's head or body may take to arrive, or an answer stay unread [s].",
     )
     min_body_rate: int = Field(
         64 << 10, ge=1, description="A body may take 1 s more for each so many of its bytes [bytes]."

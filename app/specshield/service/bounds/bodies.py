@@ -7,7 +7,6 @@ bodies are on the disk, for the process that parses them.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 from pathlib import Path
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -83,18 +82,22 @@ class Bodies:
         announced = _header(scope, b"content-length") or "0"
         if announced.isdigit() and int(announced) > limit:
             raise _too_large(limit)
-        if ARRIVED in scope["state"]:
-            return await _receive(receive, body, limit, lambda: None)
         loop = asyncio.get_running_loop()
         begun = loop.time()
         try:
             async with asyncio.timeout_at(begun + self._patience) as deadline:
-                return await _receive(
-                    receive,
-                    body,
-                    limit,
-                    lambda: deadline.reschedule(begun + self._patience + body.size / self._slowest),
-                )
+                while True:
+                    message = await receive()
+                    if message["type"] == "http.disconnect":
+                        return False
+                    chunk = message.get("body", b"")
+                    if body.size + len(chunk) > limit:
+                        raise _too_large(limit)
+                    await body.add(chunk)
+                    if not message.get("more_body", False):
+                        await body.end()
+                        return True
+                    deadline.reschedule(begun + self._patience + body.size / self._slowest)
         except TimeoutError:
             raise RequestTimeout(
                 f"the body took too long: {body.size} bytes came in {loop.time() - begun:.0f} s",
@@ -110,22 +113,6 @@ class Bodies:
                 got=content.count(b":"),
                 expected=f"at most {self._members}, and no more colons than that in texts",
             )
-
-
-async def _receive(receive: Receive, body: Body, limit: int, came: Callable[[], None]) -> bool:
-    """Whether all of the body came; else the client has gone. came: called after each part but the last."""
-    while True:
-        message = await receive()
-        if message["type"] == "http.disconnect":
-            return False
-        chunk = message.get("body", b"")
-        if body.size + len(chunk) > limit:
-            raise _too_large(limit)
-        await body.add(chunk)
-        if not message.get("more_body", False):
-            await body.end()
-            return True
-        came()
 
 
 def _too_large(limit: int) -> BodyTooLarge:

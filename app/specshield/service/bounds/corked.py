@@ -26,16 +26,9 @@ class Corked:
         if len(data) > AT_ONCE:
             self._flush()
 
-    def writelines(self, parts: Any) -> None:
-        self.write(b"".join(parts))
-
     def close(self) -> None:
         self._flush()
         self._transport.close()
-
-    def abort(self) -> None:
-        self._held.clear()
-        self._transport.abort()
 
     def _flush(self) -> None:
         if self._held:

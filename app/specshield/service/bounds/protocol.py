@@ -1,17 +1,19 @@
-"""uvicorn's HTTP protocol with bounds that it lacks: connections, bytes of a head, time for a head to come.
+"""uvicorn's protocols, with bounds of connections, heads, what is left unread and what a WebSocket may send.
 
-What uvicorn does without these was measured: a head of 100 MB is taken in whole, and a connection that
-sends nothing, or a byte now and then, stays for good.
+What uvicorn does without these was measured: a head of 100 MB is taken in whole, a connection that sends or
+reads nothing, or a byte now and then, stays for good, and a flood of pings held up all others for 7 s.
 """
 
 from __future__ import annotations
 
 import asyncio
 import resource
+import socket
 from functools import cache
-from typing import cast
+from typing import Any, cast
 
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from specshield.errors import Busy, HeadersTooLarge, InputError, RequestTimeout, SpecshieldError
 from specshield.service import metrics, problems
@@ -19,6 +21,7 @@ from specshield.service.bounds.corked import Corked
 from specshield.service.settings import Settings
 
 ARRIVED = "arrived"  # in `scope["state"]` once all of a request is here: no wait for it needs a limit
+PIECE = 2048  # [bytes]; chosen by hand: a step fits, and as many pings as fit take some 5 ms
 KEPT_FILES = 256  # descriptors for the store, files and child processes
 
 
@@ -55,6 +58,9 @@ class BoundedProtocol(HttpToolsProtocol):
         self._late: asyncio.TimerHandle | None = None
         super().connection_made(transport)
         self.transport = cast(asyncio.Transport, Corked(transport, self.loop))
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: so long may a client read nothing of what waits
+            patience = int(1000 * _settings().request_timeout)
+            transport.get_extra_info("socket").setsockopt(socket.SOL_TCP, socket.TCP_USER_TIMEOUT, patience)
         if len(self.connections) > most_connections():
             oldest = next(iter(self.waiting), None)
             if oldest is None:
@@ -142,3 +148,29 @@ class BoundedProtocol(HttpToolsProtocol):
         status = STATUS_LINE[problems.status_of(error)]
         self.transport.write(status + head + b"\r\n" + bytes(answer.body))
         self.transport.close()
+
+
+class BoundedStream(WebSocketsSansIOProtocol):
+    """Takes what came piece by piece, and others come between: uvicorn takes 40,000 messages in one go."""
+
+    _rest = b""
+
+    def data_received(self, data: bytes = b"") -> None:
+        data = self._rest + data
+        self._rest = data[PIECE:]
+        if self.transport.is_closing():
+            return
+        if not data:
+            self.transport.resume_reading()
+            return
+        self.transport.pause_reading()
+        super().data_received(data[:PIECE])
+        if self.queue.empty():
+            self.loop.call_soon(self.data_received)
+
+    async def receive(self) -> Any:
+        message = await self.queue.get()
+        await asyncio.sleep(0)
+        if self.queue.empty():
+            self.data_received()
+        return message

@@ -4,8 +4,8 @@ server-sent events; and `/v1/sessions/{id}/record`, all of it, to be verified.
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from typing import Annotated
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Annotated, Any
 
 import anyio
 from fastapi import APIRouter, Header, Query, Response
@@ -20,14 +20,13 @@ from specshield.service.schemas.base import ID
 from specshield.service.sessions import chain
 from specshield.service.state import ServerState, problems
 
-SLOWEST = 10.0  # [s] that a reader may take for what was sent; chosen by hand
 EVENTS = "text/event-stream"
 router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
 overview = APIRouter(tags=["sessions"])
 
 
 class EventStream(Response):
-    """Sends what the stream gives until it ends or its key is refused, or the reader is gone or too slow."""
+    """Sends what the stream gives until it ends, its key is refused, or the reader is gone."""
 
     media_type = EVENTS
 
@@ -37,26 +36,18 @@ class EventStream(Response):
         self._stream = stream
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        async def end_when_gone() -> None:
-            await until_gone(receive)
-            group.cancel_scope.cancel()
-
-        async def until_refused(reading: anyio.CancelScope) -> None:
-            shown = dict(scope["headers"]).get(b"authorization", b"")
-            await scope["app"].state.server.keys.until_refused(shown)
+        async def end_after(event: Callable[[Any], Awaitable[None]], about: Any) -> None:
+            await event(about)
             reading.cancel()
 
-        start = {"type": "http.response.start", "status": 200, "headers": self.raw_headers}
+        shown = dict(scope["headers"]).get(b"authorization", b"")
+        await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
         async with anyio.create_task_group() as group:
-            group.start_soon(end_when_gone)
-            await send(start)
             with anyio.CancelScope() as reading:
-                group.start_soon(until_refused, reading)
+                group.start_soon(end_after, until_gone, receive)
+                group.start_soon(end_after, scope["app"].state.server.keys.until_refused, shown)
                 async for content in self._stream:
-                    with anyio.move_on_after(SLOWEST) as sending:
-                        await send({"type": "http.response.body", "body": content, "more_body": True})
-                    if sending.cancelled_caught:
-                        group.cancel_scope.cancel()  # unfinished: the server closes the connection
+                    await send({"type": "http.response.body", "body": content, "more_body": True})
             await send({"type": "http.response.body", "body": b""})
             group.cancel_scope.cancel()
         await self._stream.aclose()  # type: ignore[attr-defined]

@@ -17,7 +17,7 @@ from typing import Any
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from specshield.errors import BodyTooLarge, ServerError, SpecshieldError
+from specshield.errors import ServerError, SpecshieldError
 from specshield.service import metrics, problems
 from specshield.service.access.owners import scoped
 from specshield.service.routes.messages import read_step, write_problem
@@ -35,8 +35,8 @@ log = logging.getLogger("specshield")
 class StreamRoute:
     """Answers the streams; the rest goes on to `app`."""
 
-    def __init__(self, app: ASGIApp, max_message: int) -> None:
-        self.app, self._max_message = app, max_message
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         found = PATH.fullmatch(scope["path"]) if scope["type"] == "websocket" else None
@@ -55,20 +55,19 @@ class StreamRoute:
             problems.tell(scope, error)
             await problems.response(error)(scope, receive, send)
             return
-        stream = _Stream(server, key, scope, send, self._max_message)
-        server.streams.open.add(stream)
+        stream = _Stream(server, key, scope, send)
+        server.streams.open.add(stream.stop)
         try:
             await send({"type": "websocket.accept"})
             await stream.serve(receive)
         finally:
-            server.streams.open.discard(stream)
+            server.streams.open.discard(stream.stop)
 
 
 class _Stream:
-    def __init__(self, server: Server, key: str, scope: Scope, send: Send, max_message: int) -> None:
+    def __init__(self, server: Server, key: str, scope: Scope, send: Send) -> None:
         self._server, self._key, self._scope, self._send = server, key, scope, send
         self._authorization = dict(scope["headers"]).get(b"authorization", b"")
-        self._max_message = max_message
         self._busy = self._stopping = False
         self._closing: asyncio.Task[None] | None = None
 
@@ -101,8 +100,6 @@ class _Stream:
         """The status that it has over HTTP, and the message."""
         error: SpecshieldError
         try:
-            if len(content) > self._max_message:
-                raise BodyTooLarge("the message is too large", expected=f"at most {self._max_message} bytes")
             api_key = await self._server.keys.check(self._authorization)  # it may have been revoked
             self._scope["state"]["rates"].take(api_key, True)
             request = read_step(content, packed)
