@@ -32,6 +32,7 @@ run: .venv/.server
 	$(BIN)/specshield serve
 
 test: .venv/.dev
+	$(BIN)/python -m specshield.service.startup  # or each of three processes would compile what a server needs
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder  # each module's tests stay in one process; three keep two cores busy
 
 # The wheels, into dist/: one that compiles at its first start, one that brings its kernels for this Python and
