@@ -156,11 +156,12 @@ def test_being_in_time_is_as_likely_as_in_simulation(blocks, moves, waits, free,
 
 
 @pytest.mark.parametrize(
-    ("spare", "expected"), [(0, 0.5 * math.exp(-0.2)), (5, math.exp(-0.2 * math.exp(-1)))]
+    ("spare", "expected"), [(0, 0.691462 * math.exp(-0.2)), (1, 0.933193 * math.exp(-0.2 * math.exp(-0.2)))]
 )
 def test_noise_makes_late_by_a_normal_deviate_and_now_and_then_by_more(spare, expected):
     """25 motions at 0.2 steps each: sigma is 1, and 0.04 x 0.2 x 25 times the robot is held up, for 5 steps
-    in the mean.
+    in the mean. It is late by whole steps: by none where the deviate is below 0.5, by one where it is below
+    1.5.
     """
     late, due = np.empty((MOST_SLIPS + 1, MOST_SLIPS + 2)), np.array([[25, spare, 25]])
     found = _in_time(Noise(0.01, 0.01, 0.0, 0.0, 1.0), 0.2, False, due, np.zeros(25, np.int64), -1, 0, late)

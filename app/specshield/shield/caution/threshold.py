@@ -135,7 +135,7 @@ def _in_time(
 
     due (K, 3): of `_deadline`. late (MOST_SLIPS + 1, MOST_SLIPS + 2): scratch; how likely it is that so many
     motions slipped, and the robot is so many steps late and was in time for all that was due before. More
-    slips, and what is less likely than UNLIKELY, count as being too late.
+    slips, and what is less likely than UNLIKELY, count as being too late. What noise costs is rounded.
     """
     last, made, top = 0, 0, 0  # top: the most slips that are likely
     for c in range(due.shape[0]):
@@ -171,7 +171,7 @@ def _in_time(
                     for k in range(s + 1):
                         spare, left = due[c, 1] - k, due[c, 2]
                         longer = HELD_UP * spread * left * math.exp(-spare / FOR)
-                        late[s, k] *= (1.0 - above(spare, spread * math.sqrt(left))) * math.exp(-longer)
+                        late[s, k] *= (1.0 - above(spare + 0.5, spread * math.sqrt(left))) * math.exp(-longer)
     sure = 0.0
     for s in range(top + 1):
         for k in range(s + 1):
