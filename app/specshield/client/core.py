@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
 
 from specshield.client.models import Page, build
 from specshield.client.wire import Failure, Reply, Request, check, error_of, get, json_object
@@ -33,19 +33,10 @@ else:
     D = TypeVar("D")
 
 P = ParamSpec("P")
-R = TypeVar("R")
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 BACKOFF = 0.05  # s before the second try, doubled for each that follows
 PATIENCE = 4  # timeouts after which no further try starts
-
-
-class Resource(Generic[R]):
-    """Some of the calls, bound to a client."""
-
-    def __init__(self, run: R) -> None:
-        """run: performs a call, as the shell does."""
-        self._run = run
 
 
 class Wait(NamedTuple):

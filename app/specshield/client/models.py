@@ -7,7 +7,7 @@ know are ignored, so a newer server may add some.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Generic, Literal, TypedDict, TypeVar
 
 from specshield.errors import InputError, ServerError, SpecshieldError
@@ -297,3 +297,29 @@ def execute_of(body: Mapping[str, Any], terminal: Sequence[int], over: bool) -> 
     if pending:
         return body.get("completion_action") if action in terminal else action
     return terminal[0] if over and terminal else action
+
+
+def decision_of(
+    body: Mapping[str, Any], info: SessionInfo, over: bool, timings: Mapping[str, float]
+) -> Decision:
+    """Of an answer by the contract's names. over: whether the main task is."""
+    residual, told = body.get("residual"), body.get("explanations")
+    explained = [None if why is None else build(Explanation, why) for why in told or ()]
+    return build(
+        Decision,
+        body,
+        residual=None if residual is None else build(Residual, residual),
+        explanations=None if told is None else tuple(explained),
+        timings=timings,
+        execute=execute_of(body, info.terminal_actions, over),
+        action_names=info.actions,
+        source="service",
+    )
+
+
+def under(info: SessionInfo, rules: Sequence[Mapping[str, Any]], t: int) -> SessionInfo:
+    """The session with the actions of the robot that step t was decided for."""
+    rule = next((rule for rule in reversed(rules) if rule["from"] <= t), None)
+    if rule is None:
+        return info
+    return replace(info, actions=tuple(rule["actions"]), terminal_actions=tuple(rule["terminal_actions"]))

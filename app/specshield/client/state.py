@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,20 +15,27 @@ from specshield.client.core import Flow, Within, call, deliver, fetch
 from specshield.client.events import Events
 from specshield.client.models import (
     Decision,
-    Explanation,
     LocalDecision,
     Page,
     Pose,
-    Residual,
     SessionInfo,
     SpecStatus,
     TrajectoryItem,
     Verdict,
     build,
-    execute_of,
+    decision_of,
+    under,
 )
+from specshield.client.resources import deciding, stepping
 from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
-from specshield.errors import HistoryConflict, HistoryGap, SessionFinished, SpecshieldError, StepConflict
+from specshield.errors import (
+    HistoryConflict,
+    HistoryGap,
+    NotFound,
+    SessionFinished,
+    SpecshieldError,
+    StepConflict,
+)
 
 
 class SessionState:
@@ -185,7 +192,7 @@ class SessionState:
     def _decided(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
         t, over, poses = self.t, body["main_task_done"], {**self._poses, self.t: x_t}
         reply = yield from self._send("steps", poses, t, body, tries)
-        decision = _decision(wire.json_object(reply), self.info, over, wire.timings(reply))
+        decision = decision_of(wire.json_object(reply), self.info, over, wire.timings(reply))
         self._poses, self._stored, self.t, self._unanswered = poses, t + 1, t + 1, -1
         self.spec_status = decision.spec_status
         ends = own and decision.action in self.info.terminal_actions
@@ -203,7 +210,7 @@ class SessionState:
             self._continuation.branches = ()
             if item.decision is not None and item.rule == max(0, len(self.info.rules) - 1):
                 over = self.info.main_task_done
-                decision = _decision(item.decision, self.info, over, {})
+                decision = decision_of(item.decision, self.info, over, {})
                 self._continuation.learn(decision, item.pose)
 
     def _switch(
@@ -253,13 +260,21 @@ class SessionState:
         self.spec_status = verdict.spec_status
         return verdict
 
+    def _leave(self, error: BaseException | None) -> Flow[None]:
+        """At the end of a block. An error of the block's own is what the caller must see: then one try,
+        whatever comes of it.
+        """
+        if not self.closed:
+            with contextlib.suppress(NotFound if error is None else SpecshieldError):
+                yield from self._close(None, TRIES if error is None else 1)
+
     def _events(self, after: int | None) -> Events:
         rules = self._heard = list(self.info.rules)
 
         def decided(answer: Mapping[str, Any]) -> Decision:
             # Once the rule is settled, a session that is finished is one whose main task is over.
-            then = _under(self.info, rules, answer.get("t", 0))
-            return _decision(answer, then, bool(answer.get("finished")), {})
+            then = under(self.info, rules, answer.get("t", 0))
+            return decision_of(answer, then, bool(answer.get("finished")), {})
 
         return Events(self.id, self.t - 1 if after is None else after, decided, rules.append)
 
@@ -277,6 +292,12 @@ class SessionState:
         reply = yield from fetch(wire.get("sessions", self.id, "record", slow=True))
         Path(path).write_bytes(reply.content)
         return reply.headers.get("x-record-seal", "")
+
+    step = deciding(_step)
+    switch = stepping(_switch)
+    trajectory = stepping(_trajectory)
+    save_record = stepping(_save_record)
+    close = stepping(_end)
 
     def _send(
         self,
@@ -316,28 +337,3 @@ class SessionState:
                 self._stored = max(self._stored, start + 1)
             else:
                 return reply
-
-
-def _decision(
-    body: Mapping[str, Any], info: SessionInfo, over: bool, timings: Mapping[str, float]
-) -> Decision:
-    residual, told = body.get("residual"), body.get("explanations")
-    explained = [None if why is None else build(Explanation, why) for why in told or ()]
-    return build(
-        Decision,
-        body,
-        residual=None if residual is None else build(Residual, residual),
-        explanations=None if told is None else tuple(explained),
-        timings=timings,
-        execute=execute_of(body, info.terminal_actions, over),
-        action_names=info.actions,
-        source="service",
-    )
-
-
-def _under(info: SessionInfo, rules: Sequence[Mapping[str, Any]], t: int) -> SessionInfo:
-    """The session with the actions of the robot that step t was decided for."""
-    rule = next((rule for rule in reversed(rules) if rule["from"] <= t), None)
-    if rule is None:
-        return info
-    return replace(info, actions=tuple(rule["actions"]), terminal_actions=tuple(rule["terminal_actions"]))

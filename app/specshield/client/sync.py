@@ -5,41 +5,20 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Concatenate, Generic, Literal, Protocol, cast, overload
+from typing import Any, Generic, cast
 
 import httpx
 
 from specshield.client import bounded, calls
-from specshield.client.core import D, Feed, Flow, More, P, Resource, T, Wait, looks_like, page_of
-from specshield.client.models import Decision, LocalDecision, Map, Policy, SessionInfo
+from specshield.client.core import D, Feed, Flow, More, T, Wait, page_of
+from specshield.client.models import Decision, Page
+from specshield.client.resources import Maps, Policies, Sessions, Specs, performing
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import TRIES, Failure, Reply, Request
-from specshield.errors import NotFound, SpecshieldError
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
-    from specshield.client.models import Beginning
-
-
-class Run(Protocol):
-    def __call__(self, flow: Flow[T], /) -> T: ...
-
-
-def blocking(flow: Callable[P, Flow[T]]) -> Callable[Concatenate[Any, P], T]:
-    """The method of a client, or of a resource of its, that makes this call."""
-
-    @looks_like(flow)
-    def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        made: T = self._run(flow(*args, **kwargs))
-        return made
-
-    return method
+from specshield.client.wire import Failure, Reply, Request
 
 
 class ShieldClient:
@@ -68,10 +47,9 @@ class ShieldClient:
             base_url=url, headers=headers(api_key), transport=transport or bounded.Transport(url)
         )
         self._streams = SyncStreams(self._http) if stream else None
-        self.specs = Specs(self._run)
-        self.maps = Maps(self._run)
-        self.policies = Policies(self._run)
-        self.sessions = Sessions(self._run)
+        self.specs, self.maps = Specs(self), Maps(self)
+        self.policies, self.sessions = Policies(self), Sessions(self)
+        self._session = Session  # what `sessions` gives
 
     def __enter__(self) -> ShieldClient:
         return self
@@ -79,7 +57,7 @@ class ShieldClient:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    wait_until_ready = blocking(calls.wait_until_ready)
+    wait_until_ready = performing(calls.wait_until_ready)
 
     def close(self) -> None:
         self._http.close()
@@ -141,76 +119,21 @@ class ShieldClient:
             more.feed.close()
         return more.got(piece)
 
-
-def blocking_step(
-    flow: Callable[Concatenate[Session[Any], P], Flow[T]],
-) -> Callable[Concatenate[Session[Any], P], T]:
-    """The method of a session that makes this call, which is a method of its state."""
-
-    @looks_like(flow)
-    def method(self: Session[Any], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return self._run(flow(self, *args, **kwargs))
-
-    return method
-
-
-def deciding(
-    flow: Callable[Concatenate[Session[Any], P], Flow[Any]],
-) -> Callable[Concatenate[Session[D], P], D]:
-    """As `blocking_step`, of the call whose answer is what this session's steps give."""
-    return blocking_step(flow)
-
-
-def opening(flow: Callable[P, Flow[SessionInfo]]) -> Callable[Concatenate[Resource[Run], P], Session]:
-    """The method that makes this call and gives the session that it tells of."""
-
-    @looks_like(flow)
-    def method(self: Resource[Run], /, *args: P.args, **kwargs: P.kwargs) -> Session:
-        info, given = self._run(flow(*args, **kwargs)), cast(dict[str, Any], kwargs)
-        begun = Session[Any](self._run, info, given.get("initial_pose"), given.get("on_failure", "raise"))
-        self._run(begun._recall())
-        return begun
-
-    return method
-
-
-def pages(cls: type[T], resource: str) -> Callable[[Resource[Run]], Iterator[T]]:
-    """The method that lists all there are."""
-
-    def method(self: Resource[Run]) -> Iterator[T]:
-        """All of them, in the order of the server's pages."""
-        page = self._run(page_of(cls, resource, None))
-        while True:
+    def _listed(self, cls: type[T], resource: str) -> Iterator[T]:
+        page: Page[T] | None = None
+        while page is None or page.next is not None:
+            page = self._run(page_of(cls, resource, None if page is None else page.next))
             yield from page.items
-            if page.next is None:
-                return
-            page = self._run(page_of(cls, resource, page.next))
-
-    return method
 
 
 class Session(SessionState, Generic[D]):
     """A session; as a context manager it is closed at the end, and its trajectory stays."""
 
-    _run: Run
-
     def __enter__(self) -> Session[D]:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.closed:
-            return
-        # An error of the block's own is what the caller must see: then one try, whatever comes of it.
-        with contextlib.suppress(NotFound if error is None else SpecshieldError):
-            self._run(self._close(None, TRIES if error is None else 1))
-
-    step = deciding(SessionState._step)
-    switch = blocking_step(SessionState._switch)
-    trajectory = blocking_step(SessionState._trajectory)
-    save_record = blocking_step(SessionState._save_record)
-    close = blocking_step(SessionState._end)
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self._run(self._leave(error))
 
     def events(self, after: int | None = None) -> Iterator[Decision]:
         """The decisions after step `after` as they are made, by whoever asks for them; -1: from the first.
@@ -227,55 +150,3 @@ class Session(SessionState, Generic[D]):
         finally:
             if events.feed is not None:
                 events.feed.close()
-
-
-class Specs(Resource[Run]):
-    validate = blocking(calls.validate)
-
-
-class Maps(Resource[Run]):
-    create = blocking(calls.create_map)
-    upload = blocking(calls.upload_map)
-    procthor = blocking(calls.procthor_map)
-    occupancy_grid = blocking(calls.occupancy_grid_map)
-    get = blocking(calls.get_map)
-    image = blocking(calls.map_image)
-    delete = blocking(calls.delete_map)
-    list = pages(Map, "maps")
-
-
-class Policies(Resource[Run]):
-    create = blocking(calls.create_policy)
-    upload = blocking(calls.upload_policy)
-    get = blocking(calls.get_policy)
-    image = blocking(calls.policy_image)
-    delete = blocking(calls.delete_policy)
-    wait = blocking(calls.wait_policy)
-    list = pages(Policy, "policies")
-
-
-class Sessions(Resource[Run]):
-    if TYPE_CHECKING:
-
-        @overload
-        def create(
-            self, *, on_failure: Literal["raise"] = "raise", **options: Unpack[Beginning]
-        ) -> Session[Decision]: ...
-        @overload
-        def create(
-            self, *, on_failure: Literal["witness", "stop"], **options: Unpack[Beginning]
-        ) -> Session[Decision | LocalDecision]: ...
-        def create(self, **options: Any) -> Any: ...
-
-        @overload
-        def get(self, id: str, *, on_failure: Literal["raise"] = "raise") -> Session[Decision]: ...
-        @overload
-        def get(
-            self, id: str, *, on_failure: Literal["witness", "stop"]
-        ) -> Session[Decision | LocalDecision]: ...
-        def get(self, id: str, **options: Any) -> Any: ...
-    else:
-        create = opening(calls.create_session)
-        get = opening(calls.get_session)
-    delete = blocking(calls.delete_session)
-    list = pages(SessionInfo, "sessions")

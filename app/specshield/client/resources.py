@@ -1,0 +1,189 @@
+"""The calls of calls.py as methods of a client, whose `_run` performs them: blocking, or to be awaited."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Concatenate,
+    Generic,
+    Literal,
+    Protocol,
+    TypeAlias,
+    TypeVar,
+    cast,
+    overload,
+)
+
+from specshield.client import calls
+from specshield.client.core import Flow, P, T, looks_like
+from specshield.client.models import Map, Policy, SessionInfo
+
+C = TypeVar("C")
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Coroutine, Iterator
+
+    from typing_extensions import Unpack
+
+    from specshield.client.aio import AsyncSession, AsyncShieldClient
+    from specshield.client.core import D
+    from specshield.client.models import Beginning, Decision, LocalDecision
+    from specshield.client.sync import Session, ShieldClient
+
+    T_co = TypeVar("T_co", covariant=True)
+    Blocking: TypeAlias = "ShieldClient | Session[Any] | Resource[ShieldClient]"
+    Awaiting: TypeAlias = "AsyncShieldClient | AsyncSession[Any] | Resource[AsyncShieldClient]"
+
+    class Method(Protocol[P, T_co]):
+        """What a method is to type checkers that gives T, or is to be awaited for it."""
+
+        @overload
+        def __get__(self, of: Blocking, owner: Any) -> Callable[P, T_co]: ...
+        @overload
+        def __get__(self, of: Awaiting, owner: Any) -> Callable[P, Coroutine[Any, Any, T_co]]: ...
+
+    class Deciding(Protocol[P]):
+        """A method that gives what the steps of its session give."""
+
+        @overload
+        def __get__(self, of: Session[D], owner: Any) -> Callable[P, D]: ...
+        @overload
+        def __get__(self, of: AsyncSession[D], owner: Any) -> Callable[P, Coroutine[Any, Any, D]]: ...
+
+    class Listing(Protocol[T_co]):
+        """A method that lists all there are."""
+
+        @overload
+        def __get__(self, of: Resource[ShieldClient], owner: Any) -> Callable[[], Iterator[T_co]]: ...
+        @overload
+        def __get__(
+            self, of: Resource[AsyncShieldClient], owner: Any
+        ) -> Callable[[], AsyncIterator[T_co]]: ...
+
+
+class Resource(Generic[C]):
+    """Some of the calls, bound to a client."""
+
+    def __init__(self, client: C) -> None:
+        self._client: Any = client
+
+    def _run(self, flow: Flow[Any]) -> Any:
+        return self._client._run(flow)
+
+
+def performing(flow: Callable[P, Flow[T]]) -> Method[P, T]:
+    """The method of a client, or of a resource of its, that makes this call."""
+
+    @looks_like(flow)
+    def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
+        return self._run(flow(*args, **kwargs))
+
+    return cast("Method[P, T]", method)
+
+
+def stepping(flow: Callable[Concatenate[Any, P], Flow[T]]) -> Method[P, T]:
+    """The method of a session that makes this call, which is a method of its state."""
+
+    @looks_like(flow)
+    def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
+        return self._run(flow(self, *args, **kwargs))
+
+    return cast("Method[P, T]", method)
+
+
+def deciding(flow: Callable[Concatenate[Any, P], Flow[Any]]) -> Deciding[P]:
+    """As `stepping`, of the call whose answer is what the session's steps give."""
+    return cast("Deciding[P]", stepping(flow))
+
+
+def listing(cls: type[T], resource: str) -> Listing[T]:
+    def method(self: Any) -> Any:
+        """All of them, in the order of the server's pages."""
+        return self._client._listed(cls, resource)
+
+    return cast("Listing[T]", method)
+
+
+def opening(flow: Callable[..., Flow[SessionInfo]]) -> Any:
+    """The method that makes this call and gives the session that it tells of."""
+
+    def opened(client: Any, told: Flow[SessionInfo], given: dict[str, Any]) -> Flow[Any]:
+        info = yield from told
+        pose, on_failure = given.get("initial_pose"), given.get("on_failure", "raise")
+        begun = client._session(client._run, info, pose, on_failure)
+        yield from begun._recall()
+        return begun
+
+    @looks_like(flow)
+    def method(self: Any, /, *args: Any, **kwargs: Any) -> Any:
+        return self._run(opened(self._client, flow(*args, **kwargs), kwargs))
+
+    return method
+
+
+class Specs(Resource[C]):
+    validate = performing(calls.validate)
+
+
+class Maps(Resource[C]):
+    create = performing(calls.create_map)
+    upload = performing(calls.upload_map)
+    procthor = performing(calls.procthor_map)
+    occupancy_grid = performing(calls.occupancy_grid_map)
+    get = performing(calls.get_map)
+    image = performing(calls.map_image)
+    delete = performing(calls.delete_map)
+    list = listing(Map, "maps")
+
+
+class Policies(Resource[C]):
+    create = performing(calls.create_policy)
+    upload = performing(calls.upload_policy)
+    get = performing(calls.get_policy)
+    image = performing(calls.policy_image)
+    delete = performing(calls.delete_policy)
+    wait = performing(calls.wait_policy)
+    list = listing(Policy, "policies")
+
+
+class Sessions(Resource[C]):
+    if TYPE_CHECKING:
+        Here = Resource[ShieldClient]
+        There = Resource[AsyncShieldClient]
+        Away = Literal["witness", "stop"]
+        Either = Decision | LocalDecision
+
+        @overload
+        def create(
+            self: Here, *, on_failure: Literal["raise"] = "raise", **options: Unpack[Beginning]
+        ) -> Session[Decision]: ...
+        @overload
+        def create(self: Here, *, on_failure: Away, **options: Unpack[Beginning]) -> Session[Either]: ...
+        @overload
+        def create(
+            self: There, *, on_failure: Literal["raise"] = "raise", **options: Unpack[Beginning]
+        ) -> Coroutine[Any, Any, AsyncSession[Decision]]: ...
+        @overload
+        def create(
+            self: There, *, on_failure: Away, **options: Unpack[Beginning]
+        ) -> Coroutine[Any, Any, AsyncSession[Either]]: ...
+        def create(self, **options: Any) -> Any: ...
+
+        @overload
+        def get(self: Here, id: str, *, on_failure: Literal["raise"] = "raise") -> Session[Decision]: ...
+        @overload
+        def get(self: Here, id: str, *, on_failure: Away) -> Session[Either]: ...
+        @overload
+        def get(
+            self: There, id: str, *, on_failure: Literal["raise"] = "raise"
+        ) -> Coroutine[Any, Any, AsyncSession[Decision]]: ...
+        @overload
+        def get(self: There, id: str, *, on_failure: Away) -> Coroutine[Any, Any, AsyncSession[Either]]: ...
+        def get(self, id: str, **options: Any) -> Any: ...
+    else:
+        create = opening(calls.create_session)
+        get = opening(calls.get_session)
+    delete = performing(calls.delete_session)
+    list = listing(SessionInfo, "sessions")
