@@ -89,27 +89,22 @@ def deliver(request: Request) -> Flow[Delivery]:
     while True:
         outcome = yield request
         seconds += outcome.seconds
-        if isinstance(outcome, Reply) and isinstance(_unavailable(outcome), Starting):
+        # None for a reply that does not say that the service is not there now
+        error = outcome.error if isinstance(outcome, Failure) else _unavailable(outcome)
+        if isinstance(outcome, Reply) and isinstance(error, Starting):
             wait = _asked_for(outcome)
         else:
             tries += 1
             wait = BACKOFF * 2 ** (tries - 1)
         late = seconds + wait > PATIENCE * outcome.timeout or wait >= outcome.left
-        if not _passing(outcome) or tries == request.tries or late:
+        passing = error is not None and not isinstance(error, TrainingUnavailable)  # it may go in a moment
+        if not passing or tries == request.tries or late:
             if isinstance(outcome, Failure):
                 outcome.error.details.update(tries=tries, seconds=round(seconds, 3))
                 raise outcome.error
             return Delivery(outcome, tries, seconds)
         yield Wait(wait)
         seconds += wait
-
-
-def _passing(outcome: Reply | Failure) -> bool:
-    """Whether the same request may fare better in a moment."""
-    if isinstance(outcome, Failure):
-        return True
-    error = _unavailable(outcome)
-    return error is not None and not isinstance(error, TrainingUnavailable)
 
 
 def _unavailable(reply: Reply) -> SpecshieldError | None:

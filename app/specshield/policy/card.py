@@ -53,23 +53,20 @@ def make_card(
     metrics: measured figures, among them `wall_time_s`. spec: the spec as the caller gave it; by default the
     canonical formula and every region that it uses, the map's rooms included.
     """
+    if not spec:  # one that needs neither the map's rooms nor anything else
+        regions = {name: region_to_json(region) for name, region in task.regions.items()}
+        spec = {"formula": str(task.formula), "regions": regions}
+        spec |= {"signals": dict(task.signals)} if task.signals else {}
     return {
         "format": FORMAT,
         "id": policy_id(task.content_hash, method, options, seed),
         "method": method,
         "map_id": task.grid.content_hash,
         "robot": robot_to_json(task.robot),
-        "spec": dict(spec) if spec else _spec_of(task),
+        "spec": dict(spec),
         "task_hash": task.content_hash,
         "horizon": task.horizon,
         "options": dict(options),
         "seed": seed,
         "metrics": dict(metrics),
     }
-
-
-def _spec_of(task: Task) -> dict[str, Any]:
-    """The task's rule as a spec that needs neither the map's rooms nor anything else."""
-    regions = {name: region_to_json(region) for name, region in task.regions.items()}
-    spec: dict[str, Any] = {"formula": str(task.formula), "regions": regions}
-    return spec | ({"signals": dict(task.signals)} if task.signals else {})

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
-from specshield.reasons.course import Course, course
+from specshield.reasons.course import Goal, course
 from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known
 from specshield.reasons.lateness import driven, late_by, later, may_be_late, values_of
@@ -187,7 +187,8 @@ def _found(
         if isinstance(asked, str):
             continue
         until = shield.task.horizon + (MOST_LATE if late else 0)
-        found = search(known, ground, shield.body, asked.guards, _wanted(asked, late), until)
+        wanted = [_want(goal, goal.need.formula in late) for goal in asked.goals[:MOST_CONJUNCTS]]
+        found = search(known, ground, shield.body, asked.guards, wanted, until)
         if found is not None:
             yield found[None]
 
@@ -199,13 +200,11 @@ def _relaxed(need: Need) -> Need:
     return replace(need, last=need.last + MOST_LATE, part=need.formula)
 
 
-def _wanted(asked: Course, late: set[Formula]) -> list[Wanted]:
+def _want(goal: Goal, late: bool) -> Wanted:
     """A guard whose window is to come is wanted at its first step; being kept then, it is kept on."""
-    return [_want(goal.need, goal.far, goal.need.formula in late) for goal in asked.goals[:MOST_CONJUNCTS]]
-
-
-def _want(need: Need, far: Floats, late: bool) -> Wanted:
+    need = wanted = goal.need
     if need.first == need.last:
-        return Wanted(replace(need, stay=0), far, need.last)
-    within = not late or isinstance(need.part, Always)
-    return Wanted(need if within else replace(need, last=need.last - MOST_LATE), far, need.last)
+        wanted = replace(need, stay=0)
+    elif late and not isinstance(need.part, Always):
+        wanted = replace(need, last=need.last - MOST_LATE)
+    return Wanted(wanted, goal.far, need.last)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
@@ -102,29 +101,20 @@ def _training(server: Server, record: Record) -> Training:
     return Training("ready", 1.0) if record.card is not None else server.jobs.get(record.id)
 
 
-def _warnings(record: Record) -> list[str]:
-    """Those of its card, which a stranger may have sent."""
-    told = (record.card or {}).get("warnings", [])
-    return [str(each)[:500] for each in told[:16]] if isinstance(told, list) else []
-
-
-def _listed(server: Server, record: Record, names: Mapping[str, str]) -> dict[str, Any]:
-    shown = _shown(server, record, record.name or names.get(record.id))
-    return {**shown, "spec": {name: held for name, held in shown["spec"].items() if name != "regions"}}
-
-
 def _show(server: Server, record: Record, owner: str) -> dict[str, Any]:
     return _shown(server, record, server.policies.name_of(record, owner))
 
 
 def _shown(server: Server, record: Record, name: str | None) -> dict[str, Any]:
+    card = record.card or {}  # which a stranger may have sent
+    warnings = card.get("warnings", [])
     return {
         **vars(_training(server, record)),
         **vars(record.about),
         "id": record.id,
         "name": name,
-        "metrics": (record.card or {}).get("metrics", {}),
-        "warnings": _warnings(record),
+        "metrics": card.get("metrics", {}),
+        "warnings": [str(each)[:500] for each in warnings[:16]] if isinstance(warnings, list) else [],
         "horizon": record.horizon,
         "created_at": record.created_at,
     }
@@ -141,7 +131,10 @@ async def list_all(server: ServerState, owner: Owner, cursor: Cursor = None, lim
     def show() -> dict[str, Any]:
         found, following = server.policies.page(owner, cursor, limit)
         names = server.policies.claims.names("policies", owner)
-        return {"items": [_listed(server, record, names) for record in found], "next": following}
+        items = [_shown(server, record, record.name or names.get(record.id)) for record in found]
+        for item in items:
+            item["spec"] = {name: held for name, held in item["spec"].items() if name != "regions"}
+        return {"items": items, "next": following}
 
     return await asyncio.to_thread(show)
 

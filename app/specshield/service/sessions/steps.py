@@ -192,7 +192,10 @@ class Steps:
             made, seconds = await self._heavy.decide("step", session, request, session=session.id, key=ids)
             timing["rollout"] += seconds
             return made
-        learns = _learns(session, request)
+        # A step may take long where the map is no longer as the policies were made for.
+        carry = session.state.carry
+        changed = carry is not None and changes_map(carry.learned)
+        learns = changed or bool(request.occupied) or bool(request.free)
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
         cpu: float | None = None
         if learns or not pace.short:
@@ -230,10 +233,3 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
         shield, tables = shields.tables.of(session.config["nonce"], shield, known)
     before = record.link(state.head, session.rows[state.next_t :])
     return Decided(session, *decide(shield, asked, request.t, session.since, names, carry, before, tables))
-
-
-def _learns(session: Session, request: StepBody) -> bool:
-    """Whether the map is no longer as the policies were made for: then a step may take long."""
-    carry = session.state.carry
-    changed = carry is not None and changes_map(carry.learned)
-    return changed or bool(request.occupied) or bool(request.free)

@@ -166,7 +166,10 @@ class Store:
                 written = await self._wire.run(APPEND, keys(id), args)
             except FAILURES as error:
                 raise away(error) from error
-        return written if isinstance(written, bytes) else _record(*written)
+        if isinstance(written, bytes):
+            return written
+        config, state, version, rows, step = written
+        return None if config is None or rows is None else Record(config, state, version, rows, step or None)
 
     async def _replicated(self, id: str, version: bytes | None) -> None:
         """Waits until the replicas of this session's node have it; it is still of this version there. WAIT is
@@ -264,12 +267,6 @@ def _range(owner: str | None) -> tuple[str, str]:
 
 def keys(id: str) -> list[str]:
     return [f"specshield:v2:{{{id}}}:{part}" for part in ("session", "rows", "steps")]
-
-
-def _record(
-    config: bytes | None, state: bytes, version: bytes, rows: bytes | None, step: bytes | None
-) -> Record | None:
-    return None if config is None or rows is None else Record(config, state, version, rows, step or None)
 
 
 def no_more(most: int) -> LimitReached:

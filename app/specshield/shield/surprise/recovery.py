@@ -34,7 +34,8 @@ def most_kept(
     futures = tried._replace(poses=whole, motions=np.append(tried.motions, tried.motions[:1], 0))
     left, said, lost = np.ones(len(whole), np.bool_), list[str](), list[Formula]()
     nearest = np.zeros(len(whole))
-    for part in sorted(conjuncts(prefix.formula), key=_order):
+    safest = sorted(conjuncts(prefix.formula), key=lambda each: (not isinstance(each, Always), each.horizon))
+    for part in safest:
         rho, _ = rho_of(prefix.of(part), futures.poses)
         keeps = left & (rho > SATISFIED_ABOVE)
         if keeps.any():
@@ -57,7 +58,3 @@ def given_up(prefix: Prefix) -> tuple[str, ...]:
         *(f"{part} was not kept, and is given up" for part in lost),
         *(f"{part} was broken, and is kept again as soon as it can be" for part in broken),
     )
-
-
-def _order(part: Formula) -> tuple[bool, int]:
-    return not isinstance(part, Always), part.horizon
