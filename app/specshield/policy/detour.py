@@ -17,16 +17,14 @@ def find_twins(poses: Floats, twin: Ints) -> None:
     """For each motion, the first one that ends in the same pose, or itself. poses (M, n, 3), twin (M,)."""
     for m in range(poses.shape[0]):
         twin[m] = 0
-        while twin[m] < m and not _same(poses, twin[m], m):
+        while twin[m] < m and not is_same_pose(poses[twin[m], 0], poses[m, 0]):
             twin[m] += 1
 
 
 @leaf
-def _same(poses: Floats, a: int, b: int) -> bool:
-    same = True
-    for i in range(3):
-        same = same and poses[a, 0, i] == poses[b, 0, i]
-    return same
+def is_same_pose(pose: Floats, other: Floats) -> bool:
+    """Whether two poses (3,) are the same to the last bit."""
+    return bool(pose[0] == other[0] and pose[1] == other[1] and pose[2] == other[2])
 
 
 @leaf

@@ -9,7 +9,7 @@ import pytest
 
 from specshield.errors import FragmentError
 from specshield.policy.progress import BROKEN, PENDING, SETTLED, make_rules, replay
-from specshield.policy.progress.recall import pasts, recall
+from specshield.policy.progress.recall import Past, pasts, recall
 from specshield.robot import STRETCH
 from specshield.rule.values import signal_rows
 from specshield.task import make_task
@@ -49,8 +49,8 @@ def status_of(rules, xs, signals=()):
 
 
 def recalled(rules, past, xs):
-    status, run = recall(rules, past, *trace(xs))
-    return status.tolist(), run.tolist()
+    now = recall(rules, Past(past, *trace(xs)))
+    return now.status.tolist(), now.run.tolist()
 
 
 def trace(xs):
@@ -99,8 +99,8 @@ def test_what_was_kept_by_less_than_the_margin(formula, xs, by_margin, by_zero, 
     assert status_of(rules, xs).tolist() == by_margin
     assert recalled(rules, 0.5, xs)[0] == by_margin
     assert recalled(rules, 0.0, xs)[0] == by_zero
-    assert pasts(rules, *trace(xs)) == margins
-    assert pasts(rules._replace(margin=0.0), *trace(xs)) == (0.0,)
+    assert [past.margin for past in pasts(rules, *trace(xs))] == list(margins)
+    assert [past.margin for past in pasts(rules._replace(margin=0.0), *trace(xs))] == [0.0]
 
 
 @pytest.mark.parametrize(

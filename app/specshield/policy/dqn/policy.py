@@ -62,9 +62,7 @@ class Policy(Carded):
         proposals = []
         for past in pasts(scene.rules, history, rows):
             motions = np.empty((len(self._undoing), self.task.horizon + 1 - len(history)), np.int64)
-            preferred = propose_all(
-                scene, self.network, past, history, rows, self._undoing, self.literal, motions
-            )
+            preferred = propose_all(scene, self.network, past, self._undoing, self.literal, motions)
             proposals.append(Proposal(motions, preferred))
         return joined(*proposals)
 

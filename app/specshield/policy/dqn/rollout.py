@@ -6,21 +6,21 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
-from specshield.policy.detour import copy_ways, find_sibling, find_twins, join
+from specshield.policy.detour import copy_ways, find_sibling, find_twins, is_same_pose, join
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
 from specshield.policy.dqn.observation import State, arrive, make_state, observe, outcome, place
 from specshield.policy.dqn.scene import Scene
 from specshield.policy.progress import BROKEN, PENDING, SETTLED, Rules, advance
-from specshield.policy.progress.recall import recall
+from specshield.policy.progress.recall import Past, Present, recall
 from specshield.robot.dynamics import motion_count, step, successors
 
 
 @leaf
-def _begin(rules: Rules, pose: Floats, status: Int8s, run: Ints, state: State) -> None:
-    """Puts a rollout at x_t. status, run (K,): the progress there, which is copied."""
-    for k in range(status.shape[0]):
-        state.status[k], state.run[k] = status[k], run[k]
-    place(rules, pose[0], pose[1], pose[2], state)
+def _begin(rules: Rules, now: Present, state: State) -> None:
+    """Puts a rollout at x_t."""
+    for k in range(now.status.shape[0]):
+        state.status[k], state.run[k] = now.status[k], now.run[k]
+    place(rules, now.pose[0], now.pose[1], now.pose[2], state)
 
 
 @leaf
@@ -90,22 +90,8 @@ def _retrace(scene: Scene, t: int, state: State, motions: Ints, poses: Floats) -
     return outcome(state.status)
 
 
-@leaf
-def _is_at(pose: Floats, other: Floats) -> bool:
-    return bool(pose[0] == other[0] and pose[1] == other[1] and pose[2] == other[2])
-
-
 @kernel
-def propose_all(
-    scene: Scene,
-    net: Network,
-    past: float,
-    history: Floats,
-    signals: Floats,
-    undoing: Ints,
-    literal: bool,
-    motions: Ints,
-) -> int:
+def propose_all(scene: Scene, net: Network, past: Past, undoing: Ints, literal: bool, motions: Ints) -> int:
     """Writes a continuation for each first motion into motions (M, T - t).
 
     Returns the motion that pi_phi itself takes. Where `literal`, every row is pi_phi's own rollout after that
@@ -113,18 +99,17 @@ def propose_all(
     motion: from the same place (policy/detour.py) or by undoing the motion. Where neither settles everything,
     that row is pi_phi's own rollout as well.
 
-    history (t + 1, 3), signals (t + 1, S): scene.rules.signals is overwritten with the last row. past: the
-    margin by which the history is judged. undoing (M, 2): the motions that undo each, -1 for none.
+    undoing (M, 2): the motions that undo each, -1 for none.
     """
-    t = history.shape[0] - 1
-    status, run = recall(scene.rules, past, history, signals)
+    now = recall(scene.rules, past)
+    t = now.t
     state, layers = make_state(scene, net.w1.shape[0]), make_layers(net)
     poses = np.empty((*motions.shape, 3))
-    _begin(scene.rules, history[t], status, run, state)
+    _begin(scene.rules, now, state)
     _follow(scene, net, layers, t, -1, state, motions[0, :1], poses[0, :1])
     preferred, base, ways = motions[0, 0], -1, 0
     for m in range(motions.shape[0]):
-        x, y, theta = step(scene.body, history[t, 0], history[t, 1], history[t, 2], m)
+        x, y, theta = step(scene.body, now.pose[0], now.pose[1], now.pose[2], m)
         motions[m, 0] = m
         poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
     twin, known = np.empty(motions.shape[0], np.int64), np.empty(motions.shape[0], np.int64)
@@ -139,17 +124,17 @@ def propose_all(
             find_sibling(scene.body, poses, known[:ways], m, scene.wait >= 0, sibling)
             if sibling[0] >= 0:
                 join(sibling[1], -1, motions[sibling[0]], sibling[2], scene.wait, motions[m])
-                _begin(scene.rules, history[t], status, run, state)
+                _begin(scene.rules, now, state)
                 reached = _retrace(scene, t, state, motions[m], poses[m])
             if reached != SETTLED:
                 turn, move = undoing[m, 0], undoing[m, 1]
-                if _is_at(poses[m, 0], history[t]):  # contact held it: there is nothing to undo
+                if is_same_pose(poses[m, 0], now.pose):  # contact held it: there is nothing to undo
                     turn, move = -1, -1
                 join(turn, move, motions[base], 0, scene.wait, motions[m])
-                _begin(scene.rules, history[t], status, run, state)
+                _begin(scene.rules, now, state)
                 reached = _retrace(scene, t, state, motions[m], poses[m])
         if reached != SETTLED:
-            _begin(scene.rules, history[t], status, run, state)
+            _begin(scene.rules, now, state)
             reached = _follow(scene, net, layers, t, m, state, motions[m], poses[m])
             if reached == SETTLED:
                 known[ways] = m
@@ -174,10 +159,11 @@ def satisfies(scene: Scene, net: Network, starts: Floats, first: bool) -> Bools:
     for i in range(starts.shape[0]):
         status[:] = PENDING
         run[:] = 0
-        _begin(scene.rules, starts[i], status, run, state)
+        now = Present(0, starts[i], status, run)
+        _begin(scene.rules, now, state)
         advance(scene.rules, 0, state.predicates, status, run)
         for m in range(-1, motion_count(scene.body) if first else 0):
-            _begin(scene.rules, starts[i], status, run, state)
+            _begin(scene.rules, now, state)
             if _follow(scene, net, layers, 0, m, state, motions, poses) == SETTLED:
                 out[i] = True
                 break

@@ -5,6 +5,7 @@ something broke.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 from specshield.arrays import Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
@@ -13,43 +14,60 @@ from specshield.rule.residual import again, joined, left_over
 from specshield.stl import Formula
 
 
-@kernel
-def recall(rules: Rules, past: float, poses: Floats, signals: Floats) -> tuple[Int8s, Ints]:
-    """As `replay`, but the states x_0..x_t have to keep the margin `past` instead of the rules' own.
+class Past(NamedTuple):
+    """The states x_0..x_t: poses (t + 1, 3), signals (t + 1, S), and the margin that they have to keep."""
 
-    J asks the rules' own margin of every step of a dwell. So of a dwell that has begun only the steps that
-    keep that margin count. Where it is too late to begin the dwell anew, all steps that keep `past` count.
+    margin: float
+    poses: Floats
+    signals: Floats
+
+
+class Present(NamedTuple):
+    """Where a robot is: at x_t, pose (3,), with the progress status, run (K,) by then."""
+
+    t: int
+    pose: Floats
+    status: Int8s
+    run: Ints
+
+
+@kernel
+def recall(rules: Rules, past: Past) -> Present:
+    """As `replay`, but the states x_0..x_t have to keep their own margin instead of the rules'.
+
+    J asks the rules' margin of every step of a dwell. So of a dwell that has begun only the steps that keep
+    that margin count. Where it is too late to begin the dwell anew, all steps that keep their own do.
     """
-    status, run = replay(rules, past, poses, signals)
-    if past != rules.margin:
+    margin, poses, signals = past
+    status, run = replay(rules, margin, poses, signals)
+    if margin != rules.margin:
         asked, whole = replay(rules, rules.margin, poses, signals)
         for k in range(status.shape[0]):
             if status[k] == PENDING and asked[k] == PENDING:
                 run[k] = whole[k]
-    return status, run
+    return Present(poses.shape[0] - 1, poses[-1], status, run)
 
 
 @kernel
-def resume(rules: Rules, past: float, poses: Floats, signals: Floats) -> tuple[Int8s, Ints]:
+def resume(rules: Rules, past: Past) -> Present:
     """As `recall`, with what broke by x_t forgiven."""
-    status, run = recall(rules, past, poses, signals)
-    forgive(rules, poses.shape[0] - 1, status)
-    return status, run
+    now = recall(rules, past)
+    forgive(rules, now.t, now.status)
+    return now
 
 
-def pasts(rules: Rules, poses: Floats, signals: Floats) -> tuple[float, ...]:
-    """The margins by which proposals have to `recall` the states x_0..x_t, given what J asks for.
+def pasts(rules: Rules, poses: Floats, signals: Floats) -> list[Past]:
+    """The states x_0..x_t with each margin by which proposals have to `recall` them, given what J asks for.
 
     Where it can be had, J asks the rules' margin of the whole trajectory; then what was settled by less than
     that margin has to be settled anew. Elsewhere J asks it only of what is still open; then what was settled
     at all counts as settled. Where both may apply, a proposal is made for each.
     """
-    if rules.margin == 0.0:
-        return (0.0,)
-    lost, less = _fall_short(rules, poses, signals)
-    if lost:
-        return (0.0,)
-    return (rules.margin, 0.0) if less else (rules.margin,)
+    lost = less = False
+    if rules.margin > 0.0:
+        lost, less = _fall_short(rules, poses, signals)
+    margins = [0.0] if lost else [rules.margin, 0.0] if less else [rules.margin]
+    return [Past(margin, poses, signals) for margin in margins]
 
 
 @kernel

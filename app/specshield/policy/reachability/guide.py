@@ -17,7 +17,7 @@ from specshield.policy.progress import (
     advance,
     value_count,
 )
-from specshield.policy.progress.recall import recall
+from specshield.policy.progress.recall import Past, recall
 from specshield.policy.progress.values import region_count
 from specshield.policy.reachability.tables import Guide, Scratch, Tables, goals_settled, slack
 from specshield.rule.values import REGIONS, fill_pose, fill_region
@@ -105,32 +105,28 @@ def fill(n: int, wait: int, motions: Ints, poses: Floats) -> None:
             poses[rest, c] = poses[n - 1, c]
 
 
-def hurried(guide: Guide, early: int, past: float, history: Floats, signals: Floats) -> tuple[Guide, bool]:
+def hurried(guide: Guide, early: int, past: Past) -> tuple[Guide, bool]:
     """The guide for deadlines that come `early` steps earlier, though no window keeps less than half its
     length: those of every F that is open at step t and can still be met so early. And whether any deadline
     does come earlier; for a robot that cannot wait, none does.
-
-    past, history (t + 1, 3), signals (t + 1, S): as `recall` has them.
     """
     if guide.wait < 0:
         return guide, False
     rules = guide.rules._replace(b=guide.rules.b.copy(), c1=guide.rules.c1.copy())
-    least, sooner = _hasten(guide.rules, early, past, history, signals, rules.b, rules.c1)
+    least, sooner = _hasten(guide.rules, early, past, rules.b, rules.c1)
     return guide._replace(rules=rules, tables=guide.tables._replace(early=least)), sooner
 
 
 @kernel
-def _hasten(
-    rules: Rules, early: int, past: float, history: Floats, signals: Floats, b: Ints, c1: Ints
-) -> tuple[int, bool]:
+def _hasten(rules: Rules, early: int, past: Past, b: Ints, c1: Ints) -> tuple[int, bool]:
     """Brings the ends b, c1 (K,) of `hurried` forward; by how much at least [steps], and whether one is."""
-    status, _ = recall(rules, past, history, signals)
+    now = recall(rules, past)
     least, met, moved = 0, False, False
     for k in range(rules.kind.shape[0]):
         dwells = rules.kind[k] == EVENTUALLY_ALWAYS
         end = rules.c1[k] if dwells else rules.b[k]
         sooner = end - min(early, (end - rules.a[k]) // 2)
-        if status[k] != PENDING or rules.kind[k] == ALWAYS or sooner + rules.c2[k] < history.shape[0]:
+        if now.status[k] != PENDING or rules.kind[k] == ALWAYS or sooner + rules.c2[k] <= now.t:
             continue
         if dwells:
             c1[k] = sooner

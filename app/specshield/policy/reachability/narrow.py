@@ -13,6 +13,7 @@ from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways
 from specshield.policy.progress import SETTLED
+from specshield.policy.progress.recall import Past
 from specshield.policy.reachability.finish import Search, finish
 from specshield.policy.reachability.guide import copy_progress, fill, update_progress
 from specshield.policy.reachability.search import begin, go_back, join_sibling, take
@@ -37,9 +38,7 @@ def continue_narrow(
     narrow: Bools,
     top: Floats,
     effort: Floats,
-    past: float,
-    history: Floats,
-    signals: Floats,
+    past: Past,
     wanted: Bools,
     lowest: float,
     motions: Ints,
@@ -50,17 +49,17 @@ def continue_narrow(
     top [tables]: the latest feasible time of each table [steps]. effort [searches, 4]: for the way from x_t.
     The other arguments are those of `continue_all`. The robot has to be one that can wait.
     """
-    starts, scratch = begin(guide, past, history, signals, wanted, motions, poses)
-    t, order, twin, settled = history.shape[0] - 1, starts.order, starts.twin, starts.settled
+    starts, scratch = begin(guide, past, wanted, motions, poses)
+    now, order, twin, settled = starts.now, starts.order, starts.twin, starts.settled
     if not np.any(wanted & (starts.slack >= lowest)):
         return -1
     known = np.empty(order.shape[0], np.int64)
     # The way from x_t itself, as if a motion before had led there.
     way, led, ways = np.full(motions.shape[1] + 1, -1), np.empty((motions.shape[1] + 1, 3)), 0
-    led[0] = history[t]
-    copy_progress(starts.status[-1], starts.run[-1], scratch.status, scratch.run)
+    led[0] = now.pose
+    copy_progress(now.status, now.run, scratch.status, scratch.run)
     base = -1
-    if _go(guide, narrow, top, effort, t - 1, way, led, scratch):
+    if _go(guide, narrow, top, effort, now.t - 1, way, led, scratch):
         base = twin[way[1]]
         motions[base, 1:], poses[base, 1:] = way[2:], led[2:]
         settled[base] = True
@@ -71,12 +70,12 @@ def continue_narrow(
         if base < 0:  # no first motion leads on, as far as the search from x_t can tell
             fill(1, guide.wait, motions[m], poses[m])
             continue
-        settled[m] = join_sibling(guide, t, known[:ways], int(m), starts, scratch)
+        settled[m] = join_sibling(guide, now.t, known[:ways], int(m), starts, scratch)
         if not settled[m]:
-            settled[m] = go_back(guide, t, int(m), way[1:], led[1:], starts, scratch)
+            settled[m] = go_back(guide, now.t, int(m), way[1:], led[1:], starts, scratch)
         if not settled[m]:
             copy_progress(starts.status[m], starts.run[m], scratch.status, scratch.run)
-            settled[m] = _go(guide, narrow, top, AFTER, t, motions[m], poses[m], scratch)
+            settled[m] = _go(guide, narrow, top, AFTER, now.t, motions[m], poses[m], scratch)
             if settled[m]:
                 known[ways], ways = m, ways + 1
     copy_ways(motions, poses, twin)

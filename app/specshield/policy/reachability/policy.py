@@ -150,33 +150,31 @@ class ReachabilityPolicy(Carded):
         for past in pasts(rules, history, rows):
             guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
             if self.wanted is not None:
-                guide, sooner = hurried(guide, self.early, past, history, rows)
+                guide, sooner = hurried(guide, self.early, past)
                 if not sooner:
                     continue
             motions, ways, poses = np.empty(shape, np.int64), np.empty(shape, np.int64), np.empty((*shape, 3))
             around = NO_WAY
             if self.guess:
                 fields = self._fields if guide.wait < 0 else NO_FIELDS
-                around = go_around(guide, past, history, rows, fields, poses, ways, FEWER)
+                around = go_around(guide, past, fields, poses, ways, FEWER)
             if around == GAVE_UP:
                 still = calmest_motion(self._body)
                 ways[:], ways[:, 0] = still, np.arange(len(ways))
                 proposals.append(Proposal(ways, still))
                 continue
             if guide.wait >= 0 and True in self.narrow.tolist():
-                preferred = continue_narrow(
-                    guide, self.narrow, self._top, effort, past, history, rows, wanted, least, motions, poses
-                )
+                of_narrow = self.narrow, self._top, effort
+                preferred = continue_narrow(guide, *of_narrow, past, wanted, least, motions, poses)
             else:
-                preferred = continue_all(
-                    guide, self.settings.beam, past, history, rows, wanted, least, motions, poses
-                )
+                beam = self.settings.beam
+                preferred = continue_all(guide, beam, past, wanted, least, motions, poses)
             if preferred >= 0:
                 proposals.append(Proposal(motions[chosen], int(preferred)))
             if not self.guess and self.wanted is None and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
-                if not is_known(guide, past, history, rows, free):
-                    around = go_around(guide, past, history, rows, self._fields, poses, ways, POSES)
+                if not is_known(guide, past, free):
+                    around = go_around(guide, past, self._fields, poses, ways, POSES)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))
         return joined(*proposals or [Proposal(np.empty((0, shape[1]), np.int64), 0)])

@@ -16,7 +16,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins
-from specshield.policy.progress.recall import resume
+from specshield.policy.progress.recall import Past, Present, resume
 from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search
 from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
 from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, slack
@@ -39,14 +39,14 @@ SMALL_SHARE = 512  # poses that a beam keeps for each first motion on such a lat
 class Starts(NamedTuple):
     """What is known after each first motion [M].
 
-    motions [M, T - t], poses [M, T - t, 3]: the way that begins with it, and where that leads. status, run
-    [M + 1, K]: the progress; in the last row that at x_t. slack [steps]. turn, move: the motions that nearly
-    undo it, NOT_NEEDED where one is enough; the turn may be IMPOSSIBLE. settled: whether a way that settles
-    every goal was found. twin: the first motion that ends in the same pose. order: the motions by falling
-    slack, the lowest index first on ties. wanted: whether a way is asked for. sibling (3,): scratch of
-    `find_sibling`.
+    now: before it. motions [M, T - t], poses [M, T - t, 3]: the way that begins with it, and where that
+    leads. status, run [M, K]: the progress. slack [steps]. turn, move: the motions that nearly undo it,
+    NOT_NEEDED where one is enough; the turn may be IMPOSSIBLE. settled: whether a way that settles every goal
+    was found. twin: the first motion that ends in the same pose. order: the motions by falling slack, the
+    lowest index first on ties. wanted: whether a way is asked for. sibling (3,): scratch of `find_sibling`.
     """
 
+    now: Present
     motions: Ints
     poses: Floats
     status: Int8s
@@ -62,18 +62,15 @@ class Starts(NamedTuple):
 
 
 @kernel
-def begin(
-    guide: Guide, past: float, history: Floats, signals: Floats, wanted: Bools, motions: Ints, poses: Floats
-) -> tuple[Starts, Scratch]:
+def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats) -> tuple[Starts, Scratch]:
     """Makes every motion once from x_t. Twins are wanted together. The arguments are those of
     `continue_all`.
     """
     body, rules, (count, _) = guide.body, guide.rules, motions.shape
-    t, pose, k_count = history.shape[0] - 1, history[-1], rules.kind.shape[0]
+    now, k_count = resume(rules, past), rules.kind.shape[0]
+    pose = now.pose
     scratch = make_scratch(rules, count)
-    status, run = np.empty((count + 1, k_count), np.int8), np.empty((count + 1, k_count), np.int64)
-    now, ran = resume(rules, past, history, signals)
-    copy_progress(now, ran, status[count], run[count])
+    status, run = np.empty((count, k_count), np.int8), np.empty((count, k_count), np.int64)
     slacks, twin = np.empty(count), np.empty(count, np.int64)
     turn, move = np.empty(count, np.int64), np.empty(count, np.int64)
     for m in range(count):
@@ -82,41 +79,34 @@ def begin(
         poses[m, 0, 0], poses[m, 0, 1], poses[m, 0, 2] = x, y, theta
         turn[m] = turn_by(body, -displacement(body, m)[1]) if theta != pose[2] else NOT_NEEDED
         move[m] = move_back(body, m, math.hypot(x - pose[0], y - pose[1]))
-        copy_progress(status[count], run[count], scratch.status, scratch.run)
-        update_progress(rules, t + 1, x, y, theta, scratch)
+        copy_progress(now.status, now.run, scratch.status, scratch.run)
+        update_progress(rules, now.t + 1, x, y, theta, scratch)
         copy_progress(scratch.status, scratch.run, status[m], run[m])
-        slacks[m] = slack(guide, x, y, theta, t + 1, scratch)
+        slacks[m] = slack(guide, x, y, theta, now.t + 1, scratch)
     find_twins(poses, twin)
     for m in range(count):
         wanted[twin[m]] |= wanted[m]
     order, settled = np.argsort(-slacks, kind="mergesort"), np.zeros(count, np.bool_)
     sibling = np.empty(3, np.int64)
-    starts = Starts(motions, poses, status, run, slacks, turn, move, settled, twin, order, wanted, sibling)
+    starts = Starts(
+        now, motions, poses, status, run, slacks, turn, move, settled, twin, order, wanted, sibling
+    )
     return starts, scratch
 
 
 @kernel
 def continue_all(
-    guide: Guide,
-    width: int,
-    past: float,
-    history: Floats,
-    signals: Floats,
-    wanted: Bools,
-    lowest: float,
-    motions: Ints,
-    poses: Floats,
+    guide: Guide, width: int, past: Past, wanted: Bools, lowest: float, motions: Ints, poses: Floats
 ) -> int:
     """Writes a continuation after each `wanted` (M,) first motion into motions (M, T - t), and where it leads
     into poses (M, T - t, 3); returns the motion of most slack. -1, and nothing is written, where none that is
     wanted has a slack of at least `lowest` [steps]; no beam looks for a way after one that has less.
 
-    history (t + 1, 3), signals (t + 1, S). width: the poses that a beam keeps for each first motion. past:
-    the margin that the history is judged by. The rules' signals are left at their last row. What is written
-    of motions that are not wanted need not be a way.
+    width: the poses that a beam keeps for each first motion. What is written of motions that are not wanted
+    need not be a way.
     """
-    starts, scratch = begin(guide, past, history, signals, wanted, motions, poses)
-    t, order, twin, settled = history.shape[0] - 1, starts.order, starts.twin, starts.settled
+    starts, scratch = begin(guide, past, wanted, motions, poses)
+    t, order, twin, settled = starts.now.t, starts.order, starts.twin, starts.settled
     if not np.any(wanted & (starts.slack >= lowest)):
         return -1
     walked = np.empty(order.shape[0], np.int64)

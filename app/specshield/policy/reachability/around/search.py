@@ -21,7 +21,7 @@ from specshield.compiled import kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
 from specshield.policy.progress import ALWAYS, EVENTUALLY_ALWAYS, PENDING, Rules, advance
-from specshield.policy.progress.recall import resume
+from specshield.policy.progress.recall import Past, resume
 from specshield.policy.reachability.around.field import spare_on
 from specshield.policy.reachability.guide import (
     copy_progress,
@@ -67,48 +67,36 @@ LEGS = 8  # searches for one way, each to the next goal
 
 
 @kernel
-def is_known(guide: Guide, past: float, history: Floats, signals: Floats, poses: Floats) -> bool:
-    """Whether one of the ways poses (M, T - t, 3) settles every goal and breaks nothing. The other arguments
-    are those of `continue_all`.
-    """
-    status, run = resume(guide.rules, past, history, signals)
-    scratch = make_scratch(guide.rules, 1)
+def is_known(guide: Guide, past: Past, poses: Floats) -> bool:
+    """Whether one of the ways poses (M, T - t, 3) settles every goal and breaks nothing."""
+    now, scratch = resume(guide.rules, past), make_scratch(guide.rules, 1)
     for m in range(poses.shape[0]):
-        copy_progress(status, run, scratch.status, scratch.run)
+        copy_progress(now.status, now.run, scratch.status, scratch.run)
         for i in range(poses.shape[1]):
             x, y, theta = poses[m, i, 0], poses[m, i, 1], poses[m, i, 2]
-            update_progress(guide.rules, history.shape[0] + i, x, y, theta, scratch)
+            update_progress(guide.rules, now.t + 1 + i, x, y, theta, scratch)
         if goals_settled(guide.rules, scratch.status):
             return True
     return False
 
 
 @kernel
-def go_around(
-    guide: Guide,
-    past: float,
-    history: Floats,
-    signals: Floats,
-    fields: Floats,
-    poses: Floats,
-    motions: Ints,
-    most: int,
-) -> int:
+def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: Ints, most: int) -> int:
     """Searches for a way from x_t to every goal. Returns its first motion; then motions (M, T - t) hold it,
     and after each other motion the way back to it. Else NO_WAY, or GAVE_UP where the search came to `most`
     poses. A robot that cannot wait needs `fields`.
 
-    fields [K, ny, nx]: the distances to the goals (field.py), or none. poses (M, T - t, 3): overwritten. The
-    other arguments are those of `continue_all`.
+    fields [K, ny, nx]: the distances to the goals (field.py), or none. poses (M, T - t, 3): overwritten.
     """
-    t, (count, steps) = history.shape[0] - 1, motions.shape
-    starts, scratch = begin(guide, past, history, signals, np.ones(count, np.bool_), motions, poses)
+    count, steps = motions.shape
+    starts, scratch = begin(guide, past, np.ones(count, np.bool_), motions, poses)
+    now, t = starts.now, starts.now.t
     tree = make_tree(most, guide.rules.kind.shape[0])
     way, led = np.empty(steps, np.int64), np.empty((steps, 3))
-    copy_progress(starts.status[count], starts.run[count], scratch.status, scratch.run)
+    copy_progress(now.status, now.run, scratch.status, scratch.run)
     n, outcome = 0, FAILED
     for _ in range(LEGS):
-        here = led[n - 1] if n > 0 else history[t]
+        here = led[n - 1] if n > 0 else now.pose
         found = _reach(guide, fields, t + n, steps - n, here, tree, scratch)
         if found < 0:
             return int(found)
