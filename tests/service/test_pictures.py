@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from specshield.robot import robot_from_json
-from specshield.service.heavy.latest import latest
-from specshield.service.heavy.pictures import FINEST, kept_from
+from specshield.service.heavy.pictures import FINEST, kept_from, latest
 from specshield.shield.decision import make_shield
 from specshield.shield.proposal import Proposal
 from specshield.task import Task, make_task
@@ -97,7 +96,7 @@ def test_a_fork_ends_with_the_process_that_wants_its_values():
     """Whoever asks for a picture may go away, and then what draws it is killed."""
     code = (
         "import os, sys, time\n"
-        "from specshield.service.heavy.latest import latest\n"
+        "from specshield.service.heavy.pictures import latest\n"
         "def values():\n"
         "    yield os.getpid()\n"
         "    print(os.getpid(), flush=True)\n"

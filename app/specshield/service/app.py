@@ -26,8 +26,7 @@ from specshield.service.leaving import drain_at_sigterm
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies
-from specshield.service.middleware.guard import Guard
-from specshield.service.middleware.observe import Observe
+from specshield.service.middleware import Guard, Observe
 from specshield.service.routes import events, maps, pictures, policies, robots, sessions, specs, system
 from specshield.service.routes.steps import StepRoute
 from specshield.service.routes.stream import StreamRoute

@@ -17,11 +17,11 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from specshield.errors import Busy, HeadersTooLarge, InputError, RequestTimeout, SpecshieldError
 from specshield.service import metrics, problems
-from specshield.service.bounds.corked import Corked
 from specshield.service.settings import Settings
 
 ARRIVED = "arrived"  # in `scope["state"]` once all of a request is here: no wait for it needs a limit
 PIECE = 2048  # [bytes]; chosen by hand: a step fits, and as many pings as fit take some 5 ms
+AT_ONCE = 1 << 16  # [bytes] of an answer: what is larger gains nothing by waiting
 KEPT_FILES = 256  # descriptors for the store, files and child processes
 
 
@@ -174,3 +174,36 @@ class BoundedStream(WebSocketsSansIOProtocol):
         if self.queue.empty():
             self.data_received()
         return message
+
+
+class Corked:
+    """A transport that sends what is written in one go together: the head of an answer and its body. It
+    leaves when the event loop comes round, before that reads anything more.
+
+    uvloop writes at once, so uvicorn's two writes an answer are two system calls, of which each costs as much
+    as parsing a request (measured with py-spy under `python -m benchmarks.step_cost`).
+    """
+
+    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
+        self._transport, self._loop = transport, loop
+        self._held: list[bytes] = []
+
+    def write(self, data: bytes) -> None:
+        if not self._held:
+            self._loop.call_soon(self._flush)
+        self._held.append(data)
+        if len(data) > AT_ONCE:
+            self._flush()
+
+    def close(self) -> None:
+        self._flush()
+        self._transport.close()
+
+    def _flush(self) -> None:
+        if self._held:
+            content = b"".join(self._held) if len(self._held) > 1 else self._held[0]
+            self._held.clear()
+            self._transport.write(content)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)

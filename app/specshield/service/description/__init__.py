@@ -13,7 +13,7 @@ from fastapi import FastAPI
 
 from specshield.errors import tree
 from specshield.service import problems
-from specshield.service.middleware.guard import guarded
+from specshield.service.middleware import guarded
 from specshield.service.routes import policies, specs
 from specshield.service.schemas.base import Problem
 from specshield.service.state import problem_documents

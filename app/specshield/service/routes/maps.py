@@ -11,7 +11,7 @@ from specshield.service.access.owners import Caller, Owner
 from specshield.service.bounds.body import received
 from specshield.service.heavy.uploads import FILES
 from specshield.service.schemas.base import Id
-from specshield.service.schemas.maps import MapList, MapResponse
+from specshield.service.schemas.specs import MapList, MapResponse
 from specshield.service.state import TOO_MUCH, Cursor, Limit, ServerState, problems
 from specshield.world.formats import FORMATS
 
