@@ -6,7 +6,7 @@ import signal
 import socket
 import threading
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 import httpx
 import msgpack
@@ -18,6 +18,7 @@ from websockets.asyncio.client import connect as aconnect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from specshield.client import ShieldClient
 from specshield.errors import InputError
 from specshield.service.routes.messages import read_step
 from specshield.service.schemas.steps import StepRequest
@@ -191,6 +192,32 @@ def test_a_flood_of_small_frames_holds_up_nobody(server, client, begin, frame):
         flood.shutdown(socket.SHUT_RDWR)
         sending.join()
     assert took < 5, "20 requests, each of a few ms"
+
+
+def test_streams_that_are_idle_make_room_and_one_that_is_used_stays(tmp_path):
+    few = {"SPECSHIELD_MAX_CONNECTIONS": "8", "SPECSHIELD_KEEP_ALIVE_TIMEOUT": "2"}
+    with serving(tmp_path, **few) as server, ExitStack() as held:
+        with httpx.Client(base_url=server.url, timeout=None) as client:
+            client.post("/v1/maps", json=grid_json())
+            asked = {"policy_id": send_policy(client)["id"], "initial_pose": START}
+            path = stream_of(server, client.post("/v1/sessions", json=asked).json())
+        robot = held.enter_context(ShieldClient(server.url, stream=True, timeout=60)).sessions.create(**asked)
+        assert robot.step(START, LOGITS).t == 0  # holds a stream and a connection
+        used, *idle = (held.enter_context(connect(path)) for _ in range(6))
+        until = time.monotonic() + 4
+        while time.monotonic() < until:
+            used.send("{")
+            assert json.loads(used.recv())["status"] == 422
+            time.sleep(0.1)
+        for _ in range(6):
+            assert httpx.get(f"{server.url}/livez", timeout=None).status_code == 200
+            held.enter_context(connect(path))
+        used.send(json.dumps(body(0)))
+        assert json.loads(used.recv())["t"] == 0
+        assert robot.step(ahead(1)[-1], LOGITS).t == 1  # its stream made room too: it opens another
+        for stream in idle:
+            with pytest.raises(ConnectionClosed):
+                stream.recv()
 
 
 def test_a_server_that_stops_says_so_to_its_streams(tmp_path):

@@ -48,9 +48,11 @@ class BoundedProtocol(HttpToolsProtocol):
     """A connection waits until the head of its first request is there. When there are too many, the one that
     has waited longest makes room for a new one; where none waits, the new one is refused. So those who open
     connections and say nothing are the first to lose them, and robots that are at work keep theirs.
+    A WebSocket waits too, once it has brought no message for as long as one is kept without a request.
     """
 
-    waiting: dict[BoundedProtocol, None] = {}  # noqa: RUF012  (of the whole process, the oldest first)
+    # Of the whole process, the oldest first.
+    waiting: dict[BoundedProtocol | BoundedStream, None] = {}  # noqa: RUF012
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self._head, self._most = 0, _settings().max_header_bytes
@@ -169,7 +171,11 @@ class BoundedStream(WebSocketsSansIOProtocol):
             self.loop.call_soon(self.data_received)
 
     async def receive(self) -> Any:
+        waiting = BoundedProtocol.waiting
+        idle = self.loop.call_later(_settings().keep_alive_timeout, waiting.setdefault, self)
         message = await self.queue.get()
+        idle.cancel()
+        waiting.pop(self, None)
         await asyncio.sleep(0)
         if self.queue.empty():
             self.data_received()
