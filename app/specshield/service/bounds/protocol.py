@@ -173,9 +173,11 @@ class BoundedStream(WebSocketsSansIOProtocol):
     async def receive(self) -> Any:
         waiting = BoundedProtocol.waiting
         idle = self.loop.call_later(_settings().keep_alive_timeout, waiting.setdefault, self)
-        message = await self.queue.get()
-        idle.cancel()
-        waiting.pop(self, None)
+        try:
+            message = await self.queue.get()
+        finally:
+            idle.cancel()
+            waiting.pop(self, None)
         await asyncio.sleep(0)
         if self.queue.empty():
             self.data_received()
