@@ -77,6 +77,10 @@ def test_what_a_caller_does_not_take_is_not_what_is_answered(client, begin):
         (msgpack.packb({f"f{i}": i for i in range(60_000)}), "invalid-input", ...),
         (b"\xc1", "invalid-input", ...),
         (b"", "invalid-input", ...),
+        (b"\x81\xa1\xff\x01", "invalid-input", ...),
+        (b"\x91" * 2000 + b"\x01", "invalid-input", ...),
+        (msgpack.packb(msgpack.Timestamp(5)), "invalid-input", ""),
+        (msgpack.packb(body(0, logits=[msgpack.ExtType(5, b"abc")])), "invalid-logits", "logits[0]"),
     ],
 )
 def test_messagepack_that_is_no_step(client, begin, content, type, path):
@@ -86,6 +90,7 @@ def test_messagepack_that_is_no_step(client, begin, content, type, path):
     assert found.headers["content-type"] == "application/problem+json"
     assert path is ... or found.json()["path"] == path
     assert len(found.content) < 20_000
+    assert not any(word in found.text for word in ("Error", "object at", "datetime")), found.text
 
 
 def test_a_stream_answers_in_order_in_the_form_it_was_asked(server, client, begin, step):

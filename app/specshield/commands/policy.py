@@ -110,6 +110,8 @@ def _read(path: Path, option: str) -> dict[str, Any]:
     """An object in JSON or YAML. Raises InputError where the file cannot be read or holds none."""
     import yaml
 
+    from specshield.world.checks import shown
+
     try:
         if path.stat().st_size > LARGEST:
             raise InputError(f"{path} is too large", path=option, expected=f"at most {LARGEST >> 20} MiB")
@@ -122,6 +124,5 @@ def _read(path: Path, option: str) -> dict[str, Any]:
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
     if not isinstance(value, dict):
-        kind = type(value).__name__
-        raise InputError(f"{path} holds no object", path=option, got=kind, expected="an object")
+        raise InputError(f"{path} holds no object", path=option, got=shown(value), expected="an object")
     return value

@@ -11,6 +11,7 @@ import numpy as np
 
 from specshield.arrays import Bools, Ints
 from specshield.errors import RobotError
+from specshield.world.checks import shown
 
 # A witness is stored as one byte a motion: the uint8 in shield/judgement.py and shield/feasibility.py holds
 # no motion above 255. More actions than this would need wider witnesses there.
@@ -137,7 +138,7 @@ def robot_from_json(spec: Any) -> Robot:
         raise RobotError(
             "a robot has a list of actions",
             path="actions",
-            got=type(items).__name__,
+            got=shown(items),
             expected=f"1 to {MAX_ACTIONS} actions",
         )
     actions = tuple(_action(item, f"actions[{i}]") for i, item in enumerate(items))
@@ -194,10 +195,7 @@ def _action(item: Any, path: str) -> Action:
 def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
     if not isinstance(item, dict):
         raise RobotError(
-            "not an object",
-            path=path or None,
-            got=type(item).__name__,
-            expected=f"an object with {sorted(required)}",
+            "not an object", path=path or None, got=shown(item), expected=f"an object with {sorted(required)}"
         )
     missing, unknown = required - item.keys(), item.keys() - required - optional
     if missing or unknown:

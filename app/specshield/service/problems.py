@@ -100,7 +100,7 @@ def plain(value: Any, room: int = 400) -> Any:
     try:
         text = json.dumps(value, allow_nan=False)
     except (TypeError, ValueError, RecursionError):
-        return f"{value!r:.{room}}"[:room]
+        return str(value)[:room]
     return value if len(text) <= room else text[:room] + "…"
 
 

@@ -69,5 +69,5 @@ def shown(value: Any) -> Any:
     if value is None or isinstance(value, bool | float) or (isinstance(value, int) and abs(value) < 1 << 63):
         return value
     if isinstance(value, Mapping | Sequence):
-        return f"{type(value).__name__} of {len(value)}"
+        return f"{'an object' if isinstance(value, Mapping) else 'a list'} of {len(value)}"
     return type(value).__name__
