@@ -13,15 +13,15 @@ def cores() -> int:
     """At least 1: what the scheduler allows this process, and no more than the share of its container."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
-        group = Path("/proc/self/cgroup").read_text().rpartition("0::/")[2].strip()
+        group = Path("/proc/self/cgroup").read_text().partition("0::/")[2].partition("\n")[0]
     except OSError:  # no Linux
         return allowed
     return math.ceil(min(allowed, share(CGROUPS, group)))
 
 
 def share(root: Path, group: str) -> float:
-    """How many processors' time a control group of Linux (version 2) and all that it lies in leave it; inf
-    where none sets a limit. root: where the groups are mounted. group: its path below that.
+    """How many processors a control group may use (cgroup v2): its own limit or the least of those of
+    the groups that it lies in, inf without one. root: where they are mounted. group: its path below that.
     """
     least, folder = math.inf, root / group
     for each in (folder, *folder.parents):

@@ -149,12 +149,22 @@ def test_an_action_that_there_is_not_does_not_reach_the_environment() -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "wrong"), [("seed", -1), ("seed", None), ("possible", lambda env: np.ones(6, bool))]
+    ("path", "wrong"),
+    [("seed", -1), ("seed", None), ("seed", 1.5), ("possible", lambda env: np.ones(6, bool))],
 )
 def test_a_seed_and_a_mask_that_cannot_be_used_are_refused(path: str, wrong: Any) -> None:
-    env = ShieldWrapper(House(), LocalShield.shipped("case1"), lambda env: START, **{path: wrong})
     with pytest.raises(InputError, match=path):
-        env.reset()
+        ShieldWrapper(House(), LocalShield.shipped("case1"), lambda env: START, **{path: wrong}).reset()
+
+
+def test_a_seed_of_numpy_is_a_seed() -> None:
+    shield, actions = LocalShield.shipped("case1"), list[int]()
+    for seed in (3, np.int64(3)):
+        env = ShieldWrapper(House(), shield, lambda env: START, seed=seed)
+        env.reset(seed=0)
+        assert env.decision is not None
+        actions.append(env.decision.action)
+    assert actions[0] == actions[1]
 
 
 @pytest.mark.parametrize("space", [gymnasium.spaces.Discrete(7), gymnasium.spaces.Discrete(20, start=1)])

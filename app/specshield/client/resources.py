@@ -33,11 +33,13 @@ if TYPE_CHECKING:
     from specshield.client.sync import Session, ShieldClient
 
     T_co = TypeVar("T_co", covariant=True)
-    Blocking: TypeAlias = "ShieldClient | Session[Any] | Resource[ShieldClient]"
-    Awaiting: TypeAlias = "AsyncShieldClient | AsyncSession[Any] | Resource[AsyncShieldClient]"
+    Sync: TypeAlias = "Resource[ShieldClient]"
+    Async: TypeAlias = "Resource[AsyncShieldClient]"
+    Blocking: TypeAlias = "ShieldClient | Session[Any] | Sync"
+    Awaiting: TypeAlias = "AsyncShieldClient | AsyncSession[Any] | Async"
 
     class Method(Protocol[P, T_co]):
-        """What a method is to type checkers that gives T, or is to be awaited for it."""
+        """For type checkers: a method that gives T, or that is awaited for it in an asyncio client."""
 
         @overload
         def __get__(self, of: Blocking, owner: Any) -> Callable[P, T_co]: ...
@@ -56,11 +58,9 @@ if TYPE_CHECKING:
         """A method that lists all there are."""
 
         @overload
-        def __get__(self, of: Resource[ShieldClient], owner: Any) -> Callable[[], Iterator[T_co]]: ...
+        def __get__(self, of: Sync, owner: Any) -> Callable[[], Iterator[T_co]]: ...
         @overload
-        def __get__(
-            self, of: Resource[AsyncShieldClient], owner: Any
-        ) -> Callable[[], AsyncIterator[T_co]]: ...
+        def __get__(self, of: Async, owner: Any) -> Callable[[], AsyncIterator[T_co]]: ...
 
 
 class Resource(Generic[C]):
@@ -74,7 +74,7 @@ class Resource(Generic[C]):
 
 
 def performing(flow: Callable[P, Flow[T]]) -> Method[P, T]:
-    """The method of a client, or of a resource of its, that makes this call."""
+    """The method of a client, or of one of its resources, that makes this call."""
 
     @looks_like(flow)
     def method(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
@@ -150,37 +150,36 @@ class Policies(Resource[C]):
 
 class Sessions(Resource[C]):
     if TYPE_CHECKING:
-        Here = Resource[ShieldClient]
-        There = Resource[AsyncShieldClient]
-        Away = Literal["witness", "stop"]
+        Raise = Literal["raise"]
+        Local = Literal["witness", "stop"]  # the loop goes on by itself
         Either = Decision | LocalDecision
 
         @overload
         def create(
-            self: Here, *, on_failure: Literal["raise"] = "raise", **options: Unpack[Beginning]
+            self: Sync, *, on_failure: Raise = "raise", **options: Unpack[Beginning]
         ) -> Session[Decision]: ...
         @overload
-        def create(self: Here, *, on_failure: Away, **options: Unpack[Beginning]) -> Session[Either]: ...
+        def create(self: Sync, *, on_failure: Local, **options: Unpack[Beginning]) -> Session[Either]: ...
         @overload
         def create(
-            self: There, *, on_failure: Literal["raise"] = "raise", **options: Unpack[Beginning]
+            self: Async, *, on_failure: Raise = "raise", **options: Unpack[Beginning]
         ) -> Coroutine[Any, Any, AsyncSession[Decision]]: ...
         @overload
         def create(
-            self: There, *, on_failure: Away, **options: Unpack[Beginning]
+            self: Async, *, on_failure: Local, **options: Unpack[Beginning]
         ) -> Coroutine[Any, Any, AsyncSession[Either]]: ...
         def create(self, **options: Any) -> Any: ...
 
         @overload
-        def get(self: Here, id: str, *, on_failure: Literal["raise"] = "raise") -> Session[Decision]: ...
+        def get(self: Sync, id: str, *, on_failure: Raise = "raise") -> Session[Decision]: ...
         @overload
-        def get(self: Here, id: str, *, on_failure: Away) -> Session[Either]: ...
+        def get(self: Sync, id: str, *, on_failure: Local) -> Session[Either]: ...
         @overload
         def get(
-            self: There, id: str, *, on_failure: Literal["raise"] = "raise"
+            self: Async, id: str, *, on_failure: Raise = "raise"
         ) -> Coroutine[Any, Any, AsyncSession[Decision]]: ...
         @overload
-        def get(self: There, id: str, *, on_failure: Away) -> Coroutine[Any, Any, AsyncSession[Either]]: ...
+        def get(self: Async, id: str, *, on_failure: Local) -> Coroutine[Any, Any, AsyncSession[Either]]: ...
         def get(self, id: str, **options: Any) -> Any: ...
     else:
         create = opening(calls.create_session)

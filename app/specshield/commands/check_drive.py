@@ -15,9 +15,7 @@ def check_drive(
     policy: Annotated[str, typer.Option(help="A policy that came with specshield, or the folder of one.")],
     step_seconds: Annotated[
         float,
-        typer.Option(
-            help="How long a step of the rule is, in seconds.", min=1e-3, max=86_400.0, show_default=False
-        ),
+        typer.Option(help="How long a step is, in seconds.", min=1e-3, max=86_400.0, show_default=False),
     ],
     topic: Annotated[
         str | None, typer.Option(help="Poses in the map's frame. By default the only topic with poses.")

@@ -44,8 +44,8 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
     the shield's robot. Each episode has its own seed, made of the one in `settings` and the one of `reset`.
 
     Raises RobotError at `reset` unless actions are numbered as the robot's, InfeasibleStart there where
-    the rule cannot be kept, and InputError at `step` for an action that there is not; also for a seed, or for
-    what `possible` says, that cannot be used.
+    the rule cannot be kept, and InputError at `step` for an action that there is not. Raises InputError too
+    for a seed that is no whole number, at once, and where `possible` does not give A booleans.
     """
 
     def __init__(
@@ -63,6 +63,11 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
         gymnasium.Wrapper.__init__(self, env)
         self._shield, self._pose_of, self._logits, self._possible = shield, pose_of, logits, possible
         self._settings = {"uncertainty": "none", "learn_map": False, "seed": 0, **settings}
+        try:
+            np.random.SeedSequence(index(self._settings["seed"]))
+        except (TypeError, ValueError):
+            got, expected = self._settings["seed"], "a whole number, 0 or more"
+            raise InputError("this is no seed", path="seed", got=got, expected=expected) from None
         self._since = [0, -1]  # the last seed that `reset` was given, and the episodes since
         self.session: LocalSession | None = None
         self.decision: Decision | None = None
@@ -77,10 +82,7 @@ class ShieldWrapper(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Recor
             what = "the environment's actions are not the robot's"
             raise RobotError(what, path="action_space", got=str(space), expected=f"Discrete({n})")
         self._since = [self._since[0], self._since[1] + 1] if seed is None else [seed, 0]
-        given = self._settings["seed"]
-        if not isinstance(given, int) or given < 0:
-            raise InputError("this is no seed", path="seed", got=given, expected="a whole number, 0 or more")
-        own = np.random.SeedSequence([given, *self._since])
+        own = np.random.SeedSequence([self._settings["seed"], *self._since])
         settings = self._settings | {"seed": int(own.generate_state(1)[0])}
         self.session = shield.session(initial_pose=self._pose_of(self.env), **settings)
         return observation, {**info, **self._decide(self.session, observation, None, False)}

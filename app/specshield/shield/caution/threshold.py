@@ -135,7 +135,7 @@ def _in_time(
 
     due (K, 3): of `_deadline`. late (MOST_SLIPS + 1, MOST_SLIPS + 2): scratch; how likely it is that so many
     motions slipped, and the robot is so many steps late and was in time for all that was due before. More
-    slips, and what is less likely than UNLIKELY, count as being too late. What noise costs is rounded.
+    slips, and what is less likely than UNLIKELY, are too late. What noise costs is rounded to whole steps.
     """
     last, made, top = 0, 0, 0  # top: the most slips that are likely
     for c in range(due.shape[0]):
