@@ -119,7 +119,7 @@ def _cached(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """
     compiled = called = _kept(njit(cache=True, pipeline_class=linking.Entry, **options)(function))
     if function.__closure__ is None:
-        linking.load_whole(compiled)
+        linking.entry(compiled)
         called = linking.callee(function, options, _kept)
     template = called.get_call_template
     compiled.get_call_template = lambda args, kws: template([unliteral(arg) for arg in args], kws)

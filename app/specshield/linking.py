@@ -109,11 +109,31 @@ def callee(function: Function, options: dict[str, Any], kept: Callable[[Any], An
         save(types, kernel)
 
     cache.save_overload = link_and_save
-    load_whole(compiled)
+    _load_whole(compiled)
     return compiled
 
 
-def load_whole(compiled: Any) -> None:
+def entry(compiled: Any) -> None:
+    """From now on, this is kept without what callers would be given: kernels call another. Reading that took
+    a twelfth of a start with every kernel on the disk.
+    """
+    save = compiled._cache.save_overload
+
+    def outline_and_save(types: Any, kernel: Any) -> None:
+        defined = [
+            function.name
+            for function in kernel.library._final_module.functions
+            if not function.is_declaration
+        ]
+        outline = "".join(f'define void @"{name}"() {{ ret void }}\n' for name in defined)
+        kernel.library._shared_module = parse_assembly(outline)
+        save(types, kernel)
+
+    compiled._cache.save_overload = outline_and_save
+    _load_whole(compiled)
+
+
+def _load_whole(compiled: Any) -> None:
     """From now on, what this takes from the disk loads all that it calls, or is compiled anew."""
     load = compiled._cache._load_overload
 

@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from specshield import compiled
 from specshield.client import ShieldClient
 from specshield.cores import cores
 from specshield.errors import Starting, TransportError
-from specshield.service.startup import READY
+from specshield.service.startup import COMPLETE, READY
 from tests.serving import serving, wait_for
 
 
@@ -99,3 +100,11 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
         server.kill()
         wait_for(lambda: not compiling(kernels))
     assert re.search(r"INFO: +compiling the kernels: .* takes about \d+ s", server.log.read_text())
+
+
+def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path):
+    kernels = tmp_path / "kernels"
+    shutil.copytree(compiled.BASE, kernels, ignore=shutil.ignore_patterns(f"{COMPLETE}-*"))
+    with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(kernels)):
+        wait_for(lambda: list(kernels.glob(f"{COMPLETE}-*[!k]")))
+    assert list(kernels.rglob("first_motions.plan_all-*.nbi"))

@@ -33,7 +33,7 @@ from specshield.service.routes.stream import StreamRoute
 from specshield.service.sessions.mover import Mover
 from specshield.service.sessions.sessions import Sessions
 from specshield.service.settings import Settings
-from specshield.service.startup import Startup, prepare
+from specshield.service.startup import Startup, complete, prepare
 from specshield.service.state import Server
 from specshield.service.storage.archive import Archive
 from specshield.service.storage.archiving import ArchivingStore
@@ -138,6 +138,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     drain_at_sigterm(startup, settings.drain)
     running = (
         prepare(startup, check),
+        complete(startup),
         tend(embedded, worker, startup),
         mover.run(),
         watchers.run(),

@@ -4,6 +4,7 @@
 
 The first start of an installation compiles the kernels, in a process for each part, and they stay on the
 disk. Any later start takes them from there. Of several server processes one compiles, the others wait for it.
+What few rules and robots need is compiled once the server is ready, at the lowest priority.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import gc
 import logging
 import os
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,8 +26,10 @@ from specshield.cores import cores
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
-READY = "ready"  # the file of this name (`compiled.mark`) says that every kernel of a start is on the disk
-KERNELS = 254  # on the disk after a first start: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
+# The files of these names (`compiled.mark`) say that every kernel of a start is on the disk, and every other
+# that a decision may need.
+READY, COMPLETE = "ready", "complete"
+KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 34  # [s] that a first start took on two quiet cores: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
@@ -84,7 +87,12 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
     try:
         mark = compiled.mark(READY)
         if mark is not None and not mark.exists():
-            await _compile(startup, mark)
+            startup.before = compiled.on_disk()
+            telling = asyncio.create_task(_tell(startup))
+            try:
+                await _compile(startup, warmup.PARTS, mark, cores())
+            finally:
+                telling.cancel()
         for part in warmup.PARTS:  # takes them from the disk; what is not there is compiled here
             await asyncio.to_thread(warmup.warm_up, part)
         gc.freeze()  # what the kernels brought stays too
@@ -106,18 +114,27 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         )
 
 
-async def _compile(startup: Startup, mark: Path) -> None:
-    startup.before = compiled.on_disk()
-    telling = asyncio.create_task(_tell(startup))
-    free = asyncio.Semaphore(cores())
-    try:
-        async with _one_at_a_time(mark.with_suffix(".lock")):
-            if mark.exists():  # another process has done it meanwhile
-                return
-            if all(await asyncio.gather(*(_compile_part(part, startup, free) for part in warmup.PARTS))):
-                mark.touch()
-    finally:
-        telling.cancel()
+async def complete(startup: Startup) -> None:
+    """Once the server is ready, compiles what few need: a decision that waits for a compiler keeps all others
+    waiting, for up to a minute.
+    """
+    while not startup.ready:
+        await asyncio.sleep(CHECK_EVERY)
+    mark = await asyncio.to_thread(compiled.mark, COMPLETE)
+    if mark is not None and not mark.exists():
+        log.info("compiling what few rules and robots need, beside what is asked")
+        with contextlib.suppress(OSError):  # no room for another process
+            await _compile(startup, warmup.LATER, mark, 1)
+
+
+async def _compile(startup: Startup, parts: Iterable[str], mark: Path, at_once: int) -> None:
+    """Compiles these parts, a process each, so many at once, and makes the mark once all are on the disk."""
+    free = asyncio.Semaphore(at_once)
+    async with _one_at_a_time(mark.with_suffix(".lock")):
+        if mark.exists():  # another process has done it meanwhile
+            return
+        if all(await asyncio.gather(*(_compile_part(part, startup, free) for part in parts))):
+            mark.touch()
 
 
 async def _compile_part(part: str, startup: Startup, free: asyncio.Semaphore) -> bool:
@@ -166,6 +183,8 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     startup = Startup()
     asyncio.run(prepare(startup))
+    if startup.ready:
+        asyncio.run(complete(startup))
     sys.exit(startup.failure)
 
 

@@ -2,8 +2,9 @@
 
     python -m specshield.service.warmup PART     # compiles one part, for `startup`; the disk keeps it
 
-The parts have few kernels in common, so that two processes can compile them side by side. What only a
-planner's or a look-ahead session needs is compiled when the first of them is made.
+The parts have few kernels in common, so that two processes can compile them side by side. What few rules and
+robots need is compiled once the server is ready, so that no decision of theirs waits for it; what only a
+look-ahead session needs, when the first of them is made.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
-from specshield.robot.dynamics import make_body, motion_count
+from specshield.robot.dynamics import make_body, motion_count, step, successors
 from specshield.service.sessions import record
 from specshield.service.storage.keeper import at_end_of_input
 from specshield.shield import episode
+from specshield.shield.caution.experience import was_stopped
 from specshield.shield.decision import Config, make_shield
 from specshield.shield.surprise.contact import cells_met
 from specshield.shield.uncertainty import Uncertainty
@@ -45,13 +47,13 @@ REGIONS = {
     "B": {"type": "rectangle", "min": [0.0, 0.0], "max": [2.0, 2.0]},
     "C": {"type": "polygon", "vertices": [[1.2, 1.2], [2.0, 1.2], [2.0, 2.0]]},
 }
-START = (1.0, 1.0, 0.0)
+START, AWAY = (1.0, 1.0, 0.0), (0.2, 0.2, 0.8)  # in A and out of it
 
 
 def warm_up(part: str) -> None:
     """Runs this part's kernels once: compiles them, or takes them from the disk."""
     _hasten()
-    PARTS[part](_task())
+    {**PARTS, **LATER}[part](_task())
 
 
 def _propose(task: Task) -> None:
@@ -92,17 +94,43 @@ def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
     episode.decide(shield, [START, START], logits, carry=first.carry, occupied=around)
     episode.decide(shield, [START, (1.766, 1.434, 0.0)], logits, carry=first.carry)  # in C
     cells_met(shield.body, np.array(START), 0, np.array([START]))
+    was_stopped(shield, first.carry, np.array([START, START]))
+    successors(shield.body, np.array(START), np.empty((motion_count(shield.body), 3)))
+    step(shield.body, *START, 0)
     for config in (Config(0.5), Config(0.5, uncertainty=Uncertainty(), threshold_over="episode")):
         episode.decide(make_shield([policy], config), [START], logits)
 
 
+def _decide_rarely(task: Task) -> None:
+    """What late robots, narrow places, robots that only go ahead, and reasons in words take."""
+    ahead = replace(task.robot, actions=tuple(each for each in task.robot.actions if each.translate >= 0.0))
+    for each in (
+        task,
+        _task(A={"type": "circle", "center": [1.0, 1.0], "radius": 0.06}),
+        replace(task, robot=ahead),
+    ):
+        policy = synthesise(each)
+        policy.earlier(1, np.full(len(each.robot.motions), True)).propose(np.array([AWAY]), {}, 0.0)
+        shield = make_shield([policy], Config(uncertainty=Uncertainty(), learn_map=True))
+        episode.decide(shield, [AWAY], np.zeros(len(each.robot.actions)), explain=explanations)
+        refusal(shield, np.array([AWAY]), {})
+
+
+def _plan(task: Task) -> None:
+    """What a planner takes."""
+    from specshield.policy.planner import policy as planner
+
+    planner.synthesise(task).propose(np.array([START]), {}, 0.0)
+
+
 PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
+LATER: dict[str, Callable[[Task], None]] = {"what few need": _decide_rarely, "planner": _plan}
 
 
-def _task() -> Task:
+def _task(**regions: dict[str, Any]) -> Task:
     """A task in which every cell can be reached: for others scipy is imported, which takes 0.2 s."""
-    small = replace(STRETCH, radius=0.01)
-    return make_task(OccupancyGrid(np.zeros((20, 20), bool), 0.1), small, FORMULA, REGIONS)
+    small, empty = replace(STRETCH, radius=0.01), OccupancyGrid(np.zeros((20, 20), bool), 0.1)
+    return make_task(empty, small, FORMULA, {**REGIONS, **regions})
 
 
 def _network(task: Task) -> Network:
@@ -125,4 +153,5 @@ def _hasten() -> None:
 
 if __name__ == "__main__":
     at_end_of_input(lambda: os._exit(1))  # the server is gone
+    os.nice(19 if sys.argv[1] in LATER else 0)
     warm_up(sys.argv[1])
