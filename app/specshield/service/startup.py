@@ -114,9 +114,9 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         )
 
 
-async def complete(startup: Startup) -> None:
-    """Once the server is ready, compiles what few need: a decision that waits for a compiler keeps all others
-    waiting, for up to a minute.
+async def complete(startup: Startup, at_once: int = 1) -> None:
+    """Once the server is ready, compiles what few need, in so many processes: a decision that waits for a
+    compiler keeps all others waiting, for up to a minute.
     """
     while not startup.ready:
         await asyncio.sleep(CHECK_EVERY)
@@ -124,7 +124,7 @@ async def complete(startup: Startup) -> None:
     if mark is not None and not mark.exists():
         log.info("compiling what few rules and robots need, beside what is asked")
         with contextlib.suppress(OSError):  # no room for another process
-            await _compile(startup, warmup.LATER, mark, 1)
+            await _compile(startup, warmup.LATER, mark, at_once)
 
 
 async def _compile(startup: Startup, parts: Iterable[str], mark: Path, at_once: int) -> None:
@@ -184,7 +184,7 @@ def main() -> None:
     startup = Startup()
     asyncio.run(prepare(startup))
     if startup.ready:
-        asyncio.run(complete(startup))
+        asyncio.run(complete(startup, cores()))
     sys.exit(startup.failure)
 
 
