@@ -21,8 +21,8 @@ log = logging.getLogger("specshield")
 READY_EVERY = 0.25  # s between two questions whether the server is ready
 
 
-def wait_until_ready(timeout: float = 120.0) -> Flow[None]:
-    """Return when the server is ready to decide: its first start takes about half a minute.
+def wait_until_ready(timeout: float = 300.0) -> Flow[None]:
+    """Return when the server is ready to decide: its first start takes about a minute.
 
     A server that cannot be reached yet is waited for too. Raises TransportTimeout after `timeout` [s],
     which says how far the server was.

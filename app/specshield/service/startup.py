@@ -30,7 +30,7 @@ from specshield.service import warmup
 # that a decision may need.
 READY, COMPLETE = "ready", "complete"
 KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
-TAKES = 34  # [s] that a first start took on two quiet cores: `make wheels` prints what it takes
+TAKES = 70  # [s] a first start on two quiet cores, which took 34 to 73: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
 # [objects] more than there were, at which a collection looks for cycles among them. With Python's 700 it took

@@ -27,7 +27,7 @@ async def livez() -> Health:
 async def readyz(server: ServerState) -> Health:
     """Whether it can decide: the store answers, and the kernels are compiled.
 
-    The first start of an installation compiles them, in about half a minute; `kernels` says how many of how
+    The first start of an installation compiles them, in about a minute; `kernels` says how many of how
     many are done. Until then every path under /v1 answers 503 `starting`, with Retry-After. A server that was
     told to stop says so here first, and answers everything else until it stops.
     """
