@@ -28,6 +28,7 @@ from benchmarks.judge import Judge, distance
 from benchmarks.worlds import KINDS, SHAPES, Kind, World, make_world
 from specshield.client import Session, ShieldClient
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, PoseError
+from specshield.policy.methods import Run
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.robot.dynamics import in_collision, make_body, motion_count, successors
 from specshield.sim.service import own_server
@@ -100,7 +101,7 @@ class Service:
             }
             data = (100 * grid.occupied.astype(int)).ravel().tolist()
             self.client.maps.occupancy_grid({**info, "origin": pose}, data)
-            policy = synthesise(task, Settings(pitch=world.kind.pitch), spec)
+            policy = synthesise(task, Settings(pitch=world.kind.pitch), Run(spec=spec))
             sent = self.client.policies.upload(policy.weights(), policy.card)
             self.made[task.content_hash] = sent.id
         return self.made[task.content_hash]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -58,21 +58,18 @@ def race(case_name: str, rate: float, minutes: float, seed: int) -> dict[str, An
 
 
 def _ours(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]]:
-    from specshield.policy.dqn.train import Progress, Stopped, train
+    from specshield.policy.dqn.train import Training
 
     curve: list[list[float]] = []
-    began = time.perf_counter()
-
-    def note(progress: Progress) -> None:
-        if progress.satisfied is not None and (not curve or progress.update % 500 == 0):
-            curve.append([time.perf_counter() - began, progress.satisfied])
-
-    def enough() -> bool:
-        return _enough(curve, rate) or time.perf_counter() - began > 60 * minutes
-
-    settings = replace(Settings(), evaluate_every=500, evaluation_starts=STARTS)
-    with suppress(Stopped):
-        train(case.task, settings, seed, note, should_stop=enough)
+    began, settings = time.perf_counter(), replace(Settings(), evaluation_starts=STARTS)
+    training = Training(case.task, settings, seed)
+    with ThreadPoolExecutor(1) as stepper:
+        while training.update < settings.updates and time.perf_counter() - began <= 60 * minutes:
+            if training.advance(stepper) and training.update % 500 == 0:
+                training.evaluate()
+                curve.append([time.perf_counter() - began, float(training.latest or 0.0)])
+                if _enough(curve, rate):
+                    break
     return curve
 
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from specshield import shipped
+from specshield.policy.methods import Run
 from specshield.policy.planner import policy as planner
 from specshield.robot import robot_from_json
 from specshield.service.schemas.base import Problem
@@ -360,7 +361,7 @@ def test_look_ahead_where_it_cannot_be_had(client, policy):
     spec = {**SPEC, "formula": "G[0,6] F[0,4] Goal"}
     grid, robot = OccupancyGrid(cells(), RESOLUTION), robot_from_json(ROBOT)
     task = make_task(grid, robot, spec["formula"], spec["regions"], None, spec["signals"])
-    made = planner.synthesise(task, spec=spec)
+    made = planner.synthesise(task, run=Run(spec=spec))
     files = {"weights": ("w", made.weights()), "card": ("c", json.dumps(made.card).encode())}
     id = client.post("/v1/policies", files=files).json()["id"]
     body = {"policy_id": id, "initial_pose": [1.8, 1.5, 0.0], "allow_infeasible": True}

@@ -9,6 +9,7 @@ from specshield.errors import InfeasibleStart
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.train import train
+from specshield.policy.methods import Run
 from specshield.robot.dynamics import in_collision, make_body, successors
 from specshield.shield.episode import Config, decide, make_shield, start
 from specshield.world.regions import signed_distance
@@ -25,7 +26,7 @@ def policy():
         units=32, updates=1000, robots=128, batch=256, learning_rate=2e-3, discount=0.95, polyak=0.02,
         replay=80_000, evaluate_every=500, evaluation_starts=100,
     )  # fmt: skip
-    return train(TASK, settings, seed=0)
+    return train(TASK, settings, Run())
 
 
 def keeps(history):

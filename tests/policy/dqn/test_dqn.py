@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,8 @@ import pytest
 from specshield.errors import FragmentError
 from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import NAMES
-from specshield.policy.dqn.train import Progress, Replay, Run, Stopped, measure, train, weights_of
-from specshield.policy.methods import load_policy
+from specshield.policy.dqn.train import Replay, Stopped, Training, measure, train, weights_of
+from specshield.policy.methods import Run, load_policy
 from specshield.policy.options import read_options
 from tests.policy.rooms import flat
 
@@ -28,19 +29,19 @@ def same(a, b):
 
 
 def test_a_short_training_beats_chance_clearly():
-    reports: list[Progress] = []
-    policy = train(TASK, SMALL, seed=0, on_progress=reports.append)
-    untrained = measure(TASK, weights_of(Run(TASK, SMALL, 0).q_network), 200, 0)
+    reports: list[tuple[float, float, str]] = []
+    policy = train(TASK, SMALL, Run(on_progress=lambda *report: reports.append(report)))
+    untrained = measure(TASK, weights_of(Training(TASK, SMALL, 0).q_network), 200, 0)
     metrics = policy.card["metrics"]
     assert metrics["satisfied"] > 0.4 + untrained["satisfied"]
     assert metrics["feasible_start"] >= metrics["satisfied"]
     low, high = metrics["satisfied_interval"]
     assert low < metrics["satisfied"] < high
     assert metrics["wall_time_s"] > 0
-    assert [report.update for report in reports] == list(range(100, 1501, 100))
-    assert reports[-1].eta_s == 0.0
-    assert reports[1].satisfied is None
-    assert 0.0 <= reports[2].satisfied <= 1.0
+    assert [done for done, _, _ in reports] == [update / 1500 for update in range(100, 1501, 100)]
+    assert reports[-1][1] == 0.0
+    assert reports[1][2] == "update 200 of 1500, not measured yet"
+    assert re.fullmatch(r"update 300 of 1500, satisfied [0-9]{1,3}\.[0-9]%", reports[2][2])
     again = load_policy(policy.weights(), policy.card, TASK)
     assert same(again.network._asdict(), policy.network._asdict())
     assert read_options(Settings, policy.card["options"]) == SMALL
@@ -49,7 +50,7 @@ def test_a_short_training_beats_chance_clearly():
 @pytest.mark.parametrize("reward", ["progress", "paper"])
 def test_one_seed_one_policy(reward):
     settings = replace(TINY, reward=reward)
-    first, second, other = (train(TASK, settings, seed).network._asdict() for seed in (1, 1, 2))
+    first, second, other = (train(TASK, settings, Run(seed)).network._asdict() for seed in (1, 1, 2))
     assert same(first, second)
     assert not same(first, other)
 
@@ -57,13 +58,13 @@ def test_one_seed_one_policy(reward):
 def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path):
     asked = iter(range(1000))
     with pytest.raises(Stopped):  # the replay buffer fills for 40 steps first, then updates 1 to 30
-        train(TASK, TINY, 3, checkpoint=tmp_path, should_stop=lambda: next(asked) >= 70)
-    resumed = Run(TASK, TINY, 3)
+        train(TASK, TINY, Run(3, checkpoints=tmp_path, should_stop=lambda: next(asked) >= 70))
+    resumed = Training(TASK, TINY, 3)
     resumed.resume(tmp_path)
     assert (resumed.update, resumed.best_rate) == (20, resumed.latest)
-    assert not same(weights_of(resumed.q_network), weights_of(Run(TASK, TINY, 3).q_network))
+    assert not same(weights_of(resumed.q_network), weights_of(Training(TASK, TINY, 3).q_network))
     resumed.save(tmp_path)
-    again = Run(TASK, TINY, 3)
+    again = Training(TASK, TINY, 3)
     again.resume(tmp_path)
     for name in ("q_network", "target_network", "best"):
         assert same(weights_of(getattr(again, name)), weights_of(getattr(resumed, name)))
@@ -71,23 +72,23 @@ def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path):
     for one, two in zip(again.q_network.parameters(), resumed.q_network.parameters(), strict=True):
         moments, expected = again.optimizer.state[one], resumed.optimizer.state[two]
         assert all((moments[name] == expected[name]).all() for name in ("step", "exp_avg", "exp_avg_sq"))
-    counts = []
-    policy = train(TASK, TINY, 3, lambda report: counts.append(report.update), tmp_path)
-    assert counts == [40]
+    told = []
+    policy = train(TASK, TINY, Run(3, checkpoints=tmp_path, on_progress=lambda done, *_: told.append(done)))
+    assert told == [1.0]
     assert policy.card["metrics"]["wall_time_s"] >= 0
 
 
 def test_another_tasks_checkpoint_is_ignored(tmp_path):
-    train(TASK, TINY, 0, checkpoint=tmp_path)
+    train(TASK, TINY, Run(checkpoints=tmp_path))
     for task, settings in ((flat("F[0,31] West"), TINY), (TASK, replace(TINY, discount=0.9))):
-        run = Run(task, settings, 0)
-        run.resume(tmp_path)
-        assert run.update == 0
+        training = Training(task, settings, 0)
+        training.resume(tmp_path)
+        assert training.update == 0
 
 
 def test_nothing_is_trained_outside_the_fragment():
     with pytest.raises(FragmentError):
-        train(flat("West U[0,9] East"), TINY, 0)
+        train(flat("West U[0,9] East"), TINY, Run())
 
 
 def test_the_replay_returns_n_steps_by_hand():
@@ -117,6 +118,6 @@ def test_measured_rates_have_exact_intervals():
         ("F[0,1] x > -99", 1.0, [0.8316, 1.0]),
     ):
         task = flat(formula)
-        measured = measure(task, weights_of(Run(task, TINY, 0).q_network), 20, 0)
+        measured = measure(task, weights_of(Training(task, TINY, 0).q_network), 20, 0)
         for name in ("satisfied", "feasible_start"):
             assert (measured[name], measured[f"{name}_interval"]) == (rate, interval)

@@ -10,7 +10,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from specshield.errors import InfeasibleStart, PolicyError
-from specshield.policy.methods import load_policy
+from specshield.policy.methods import Run, load_policy
 from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.dynamics import make_body, simulate
@@ -211,7 +211,8 @@ def test_an_until_stays_in_a_corridor_up_to_where_it_leads():
 def test_who_waits_for_a_policy_is_told_how_far_it_is():
     told = []
     task = make_task(ROOM, STRETCH, "G[0,20] F[0,40] B", {"B": rectangle(4, 4, 5, 5)})
-    synthesise(task, Settings(pitch=0.2), on_progress=lambda done, left, said: told.append((done, left)))
+    run = Run(on_progress=lambda done, left, said: told.append((done, left)))
+    synthesise(task, Settings(pitch=0.2), run)
     shares = [done for done, _ in told]
     assert len(set(shares)) > 20
     assert shares == sorted(shares)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from specshield.errors import PolicyError
-from specshield.policy.methods import Made, Method, Run, lazily
+from specshield.policy.methods import Method, lazily
 from specshield.policy.options import option
 
 if TYPE_CHECKING:
@@ -58,22 +58,11 @@ def _check(task: Task, options: Settings) -> None:
         )
 
 
-def _make(task: Task, options: Settings, run: Run) -> Made:
-    from specshield.policy.dqn.train import Progress, train
-
-    def report(progress: Progress) -> None:
-        rate = "not measured yet" if progress.satisfied is None else f"satisfied {progress.satisfied:.1%}"
-        said = f"update {progress.update} of {progress.updates}, {rate}"
-        run.on_progress(progress.update / progress.updates, progress.eta_s, said)
-
-    return train(task, options, run.seed, report, run.checkpoints, run.should_stop, run.spec)
-
-
 METHOD = Method(
     "Learned in minutes by deep Q-learning, as in the paper. For the formulas that `reachability` takes.",
     Settings,
     _check,
-    _make,
+    lazily("specshield.policy.dqn.train:train"),
     lazily("specshield.policy.dqn.policy:load_dqn"),
     needs=("torch",),
 )

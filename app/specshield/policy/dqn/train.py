@@ -10,10 +10,9 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +31,7 @@ from specshield.policy.dqn.network import NAMES, make_network
 from specshield.policy.dqn.policy import Policy
 from specshield.policy.dqn.rollout import satisfies
 from specshield.policy.dqn.scene import make_scene
+from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json
 from specshield.task import Task
 
@@ -41,60 +41,43 @@ LEAST_RATE = 0.02  # share of the learning rate that it falls to, linearly, by t
 REPORT_EVERY = 100  # updates
 
 
-class Progress(NamedTuple):
-    """A report from a running training. satisfied: the rate measured last, None before the first."""
-
-    update: int
-    updates: int
-    satisfied: float | None
-    eta_s: float
-
-
 class Stopped(Exception):
     """`should_stop` ended the training."""
 
 
-def train(
-    task: Task,
-    settings: Settings,
-    seed: int,
-    on_progress: Callable[[Progress], None] = lambda _: None,
-    checkpoint: Path | None = None,
-    should_stop: Callable[[], bool] = lambda: False,
-    spec: dict[str, Any] | None = None,
-) -> Policy:
+def train(task: Task, settings: Settings, run: Run) -> Policy:
     """Trains pi_phi and returns it with its card.
 
-    checkpoint: a folder that the training saves to at every evaluation, and resumes from after a kill; the
-    replay buffer is not saved but filled anew. spec: for the card. Raises FragmentError for a formula outside
-    the fragment, Stopped when `should_stop` says so.
+    It saves to `run.checkpoints` at every evaluation, and resumes from there after a kill; the replay buffer
+    is not saved but filled anew. Raises FragmentError for a formula outside the fragment, Stopped when
+    `run.should_stop` says so.
     """
-    # One core is for the robots. A thread that waits for a core spins, which was forty times slower at worst.
-    torch.set_num_threads(max(cores() - 1, 1))
-    run = Run(task, settings, seed)
-    if checkpoint is not None:
-        run.resume(checkpoint)
-    began, first = time.monotonic(), run.update
+    training = Training(task, settings, run.seed)
+    if run.checkpoints is not None:
+        training.resume(run.checkpoints)
+    began, first = time.monotonic(), training.update
     with ThreadPoolExecutor(1) as stepper:
-        while run.update < settings.updates:
-            if should_stop():
+        while training.update < settings.updates:
+            if run.should_stop():
                 raise Stopped
-            if not run.advance(stepper):
+            if not training.advance(stepper):
                 continue
-            last = run.update == settings.updates
-            if last or run.update % settings.evaluate_every == 0:
-                run.evaluate()
-                if checkpoint is not None:
-                    run.save(checkpoint)
-            if last or run.update % REPORT_EVERY == 0:
-                pace = (time.monotonic() - began) / (run.update - first)
-                left = pace * (settings.updates - run.update)
-                on_progress(Progress(run.update, settings.updates, run.latest, left))
-    weights = weights_of(run.best)
-    metrics = measure(task, weights, settings.evaluation_starts, seed)
-    metrics["wall_time_s"] = round(time.monotonic() - run.began, 1)
-    card = make_card(task, "dqn", options_to_json(settings), seed, metrics, spec)
-    return Policy(task, card, make_network(weights, run.inputs, run.outputs))
+            last = training.update == settings.updates
+            if last or training.update % settings.evaluate_every == 0:
+                training.evaluate()
+                if run.checkpoints is not None:
+                    training.save(run.checkpoints)
+            if last or training.update % REPORT_EVERY == 0:
+                pace = (time.monotonic() - began) / (training.update - first)
+                left = pace * (settings.updates - training.update)
+                rate = "not measured yet" if training.latest is None else f"satisfied {training.latest:.1%}"
+                said = f"update {training.update} of {settings.updates}, {rate}"
+                run.on_progress(training.update / settings.updates, left, said)
+    weights = weights_of(training.best)
+    metrics = measure(task, weights, settings.evaluation_starts, run.seed)
+    metrics["wall_time_s"] = round(time.monotonic() - training.began, 1)
+    card = make_card(task, "dqn", options_to_json(settings), run.seed, metrics, run.spec)
+    return Policy(task, card, make_network(weights, training.inputs, training.outputs))
 
 
 def measure(task: Task, weights: dict[str, Singles], starts: int, seed: int) -> dict[str, Any]:
@@ -160,8 +143,8 @@ class Replay:
         return self.observation[first], self.motion[first], returns, factor, self.observation[then]
 
 
-class Run:
-    """One training: the robots, the networks, and how far it is."""
+class Training:
+    """The robots, the networks, and how far it is."""
 
     def __init__(self, task: Task, settings: Settings, seed: int) -> None:
         self.task, self.settings = task, settings
@@ -169,6 +152,8 @@ class Run:
         self.environment = Environment(task, settings.robots, seed, literal=settings.reward == "paper")
         self.inputs, self.outputs = self.environment.observations.shape[1], len(task.robot.motions)
         self.random = np.random.default_rng([seed, 2])
+        # One core is for the robots. A thread that waits for a core spins: forty times slower at worst.
+        torch.set_num_threads(max(cores() - 1, 1))
         torch.manual_seed(seed)
         self.q_network, self.target_network, self.best = (
             make_q_network(self.inputs, settings.units, self.outputs).to(self.device) for _ in range(3)

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from specshield.policy.methods import Made, Method, Run, lazily
+from specshield.policy.methods import Method, lazily
 from specshield.policy.options import option
-
-if TYPE_CHECKING:
-    from specshield.task import Task
 
 
 @dataclass(frozen=True)
@@ -26,16 +22,10 @@ class Settings:
     )
 
 
-def _make(task: Task, options: Settings, run: Run) -> Made:
-    from specshield.policy.planner import policy
-
-    return policy.synthesise(task, options, run.spec, run.on_progress)
-
-
 METHOD = Method(
     "Made in seconds for any formula; it searches for a plan at every decision, which then takes longer.",
     Settings,
     lazily("specshield.policy.planner.policy:check"),
-    _make,
+    lazily("specshield.policy.planner.policy:synthesise"),
     lazily("specshield.policy.planner.policy:load_planner"),
 )

@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from safetensors.numpy import save as save_tensors
@@ -33,6 +32,7 @@ from specshield.errors import PolicyError
 from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.extent import COARSEST, fitting_pitch
 from specshield.policy.lattice import Lattice, make_lattice, number_cells, pose_of, values_at
+from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to
@@ -193,19 +193,14 @@ class PlannerPolicy(Carded):
         return save_tensors({"cell": self.fields.cell, "code": self.fields.code, "chosen": self.chosen})
 
 
-def synthesise(
-    task: Task,
-    settings: Settings | None = None,
-    spec: Mapping[str, Any] | None = None,
-    on_progress: Callable[[float, float, str], None] = lambda done, seconds_left, said: None,
-) -> PlannerPolicy:
-    """Computes the fields. Raises PolicyError for a map too large. on_progress: as `Run` has it."""
+def synthesise(task: Task, settings: Settings | None = None, run: Run | None = None) -> PlannerPolicy:
+    """Computes the fields. Raises PolicyError for a map too large."""
     began = time.perf_counter()
+    settings, run = settings or Settings(), run or Run()
 
     def tell(done: float) -> None:
-        on_progress(done, (time.perf_counter() - began) * (1.0 - done) / done, "")
+        run.on_progress(done, (time.perf_counter() - began) * (1.0 - done) / done, "")
 
-    settings = settings or Settings()
     pitch = _pitch(task, settings)
     packed, literals = literals_of(task, task.formula)
     lattice = make_lattice(make_body(task.robot, task.grid), pitch)
@@ -244,7 +239,7 @@ def synthesise(
         "size_bytes": int(code.nbytes + cell.nbytes),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
-    card = make_card(task, "planner", options_to_json(settings), 0, metrics, spec)
+    card = make_card(task, "planner", options_to_json(settings), 0, metrics, run.spec)
     return PlannerPolicy(task, card, settings, fields, chosen)
 
 

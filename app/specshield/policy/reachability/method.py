@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from specshield.policy.methods import Made, Method, Run, lazily
+from specshield.policy.methods import Method, lazily
 from specshield.policy.options import option
-
-if TYPE_CHECKING:
-    from specshield.task import Task
 
 
 @dataclass(frozen=True)
@@ -24,17 +20,11 @@ class Settings:
     )
 
 
-def _make(task: Task, options: Settings, run: Run) -> Made:
-    from specshield.policy.reachability import policy
-
-    return policy.synthesise(task, options, run.spec)
-
-
 METHOD = Method(
     "Computed in seconds: the latest time at which each pose can still keep the rule. For conjunctions of "
     "`F[a,b]`, `G[a,b]` and `F[a,c] G[d,b]` over boolean combinations of predicates.",
     Settings,
     lazily("specshield.policy.reachability.policy:check"),
-    _make,
+    lazily("specshield.policy.reachability.policy:synthesise"),
     lazily("specshield.policy.reachability.policy:load_reachability"),
 )

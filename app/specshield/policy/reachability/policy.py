@@ -19,6 +19,7 @@ from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
 from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattice, number_cells, reads_heading
+from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.progress import Rules, make_rules
 from specshield.policy.progress.recall import pasts
@@ -214,14 +215,12 @@ class ReachabilityPolicy(Carded):
         return bool(rho.max() > SATISFIED_ABOVE)
 
 
-def synthesise(
-    task: Task, settings: Settings | None = None, spec: Mapping[str, Any] | None = None
-) -> ReachabilityPolicy:
+def synthesise(task: Task, settings: Settings | None = None, run: Run | None = None) -> ReachabilityPolicy:
     """Makes the tables. Raises FragmentError for a formula that they do not cover, and PolicyError for a map
     that is too large.
     """
     began = time.perf_counter()
-    settings = settings or Settings()
+    settings, run = settings or Settings(), run or Run()
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     pitch, cells = _extent(task, body, rules, settings)
     tables, narrow = _tables(task, body, rules, pitch, cells)
@@ -232,7 +231,7 @@ def synthesise(
         "size_bytes": sum(t.code.nbytes + t.bits.nbytes + t.cell.nbytes for t in (tables, wide) if t),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
-    card = make_card(task, "reachability", options_to_json(settings), 0, metrics, spec)
+    card = make_card(task, "reachability", options_to_json(settings), 0, metrics, run.spec)
     return replace(policy, card=card)
 
 
