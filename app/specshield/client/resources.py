@@ -3,18 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import (
-    TYPE_CHECKING,
-    Any,
-    Concatenate,
-    Generic,
-    Literal,
-    Protocol,
-    TypeAlias,
-    TypeVar,
-    cast,
-    overload,
-)
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, TypeVar, cast
 
 from specshield.client import calls
 from specshield.client.core import Flow, P, T, looks_like
@@ -24,6 +13,7 @@ C = TypeVar("C")
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine, Iterator
+    from typing import Literal, Protocol, TypeAlias, overload
 
     from typing_extensions import Unpack
 

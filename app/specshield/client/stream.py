@@ -32,19 +32,6 @@ LONGEST = 4 << 20  # bytes of an answer; a step of 256 actions with all its witn
 PROBLEM = {"content-type": "application/problem+json"}
 
 
-def check_installed() -> None:
-    """InputError where the packages are missing."""
-    try:
-        import msgpack  # noqa: F401
-        import websockets  # noqa: F401
-    except ImportError as error:
-        raise InputError(
-            f"stream=True needs the package {error.name}, which is not installed",
-            path="stream",
-            expected="pip install 'specshield[stream]', or stream=False",
-        ) from error
-
-
 def packed(request: Request) -> bytes | None:
     """The message of a step; None for what goes over HTTP."""
     import msgpack
@@ -59,7 +46,16 @@ class Streams:
     """What both shells share: where a session's stream is, and what an answer means."""
 
     def __init__(self, http: httpx.Client | httpx.AsyncClient) -> None:
-        check_installed()
+        """InputError where the packages are missing."""
+        try:
+            import msgpack  # noqa: F401
+            import websockets  # noqa: F401
+        except ImportError as error:
+            raise InputError(
+                f"stream=True needs the package {error.name}, which is not installed",
+                path="stream",
+                expected="pip install 'specshield[stream]', or stream=False",
+            ) from error
         self._http = http
 
     def _address(self, request: Request) -> str:

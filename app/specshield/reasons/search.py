@@ -27,7 +27,6 @@ MOST_NODES = 60_000
 WIDTH = 120  # poses that one step goes on from, for each set of goals that are met,
 MOST_MOTIONS = 1_500  # and motions from all of these
 BEHIND = 8.0  # [steps] to spare by which these may fall behind the best: what it takes to turn round
-TINY = 1e-9  # [m] a step of a robot that does not move
 CELL, HEADINGS = 0.05, 120  # [m] and per turn: poses that are one place
 
 

@@ -14,8 +14,9 @@ from fastapi import FastAPI
 from specshield.errors import tree
 from specshield.service import problems
 from specshield.service.middleware import guarded
-from specshield.service.routes import policies, specs
 from specshield.service.schemas.base import Problem
+from specshield.service.schemas.policies import PolicyRequest
+from specshield.service.schemas.specs import SpecRequest
 from specshield.service.state import problem_documents
 
 TAGS = [
@@ -62,7 +63,7 @@ def described(app: FastAPI) -> dict[str, Any]:
         schemas = schema["components"]["schemas"]
         for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own, which never leave it
             schemas.pop(name, None)
-        for model in (Problem, *specs.MODELS, *policies.MODELS):  # referred to by hand
+        for model in (Problem, SpecRequest, PolicyRequest):  # referred to by hand
             described = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas.update(described.pop("$defs", {}))
             schemas[model.__name__] = described

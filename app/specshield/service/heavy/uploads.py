@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import msgspec
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import create_form_parser
 
@@ -225,11 +226,5 @@ def parse(adapter: TypeAdapter[T], content: bytes, below: str = "") -> T:
         return adapter.validate_json(content)
     except ValidationError as invalid:
         found = [{**item, "loc": ("body", *item["loc"])} for item in invalid.errors(include_url=False)]
-        raise from_validation(found, _body(content), below) from None
-
-
-def _body(content: bytes) -> Any:
-    try:
-        return TypeAdapter(Any).validate_json(content)
-    except ValidationError:
-        return None
+        body = None if found[0]["type"] == "json_invalid" else from_json(content)
+        raise from_validation(found, body, below) from None

@@ -18,12 +18,11 @@ from specshield.service.heavy.uploads import PARTS, is_multipart
 from specshield.service.library.maps import undeletable
 from specshield.service.library.policies import Record
 from specshield.service.schemas.base import Id
-from specshield.service.schemas.policies import PolicyList, PolicyRequest, PolicyResponse
+from specshield.service.schemas.policies import PolicyList, PolicyResponse
 from specshield.service.state import TOO_MUCH, Cursor, Limit, Server, ServerState, json_content, problems
 from specshield.service.training.jobs import Training
 
 router = APIRouter(prefix="/v1/policies", tags=["policies"])
-MODELS = (PolicyRequest,)  # documented by hand
 PolicyId = Annotated[
     Id, Path(description="Id or name of a policy.", openapi_examples={"case1": {"value": "case1"}})
 ]

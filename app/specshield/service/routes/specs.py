@@ -10,11 +10,10 @@ from fastapi import APIRouter, Request
 from specshield.service import examples
 from specshield.service.access.owners import Owner
 from specshield.service.heavy.uploads import explain
-from specshield.service.schemas.specs import SpecRequest, SpecResponse
+from specshield.service.schemas.specs import SpecResponse
 from specshield.service.state import TOO_MUCH, ServerState, json_content, problems
 
 router = APIRouter(prefix="/v1/specs", tags=["specifications"])
-MODELS = (SpecRequest,)  # documented by hand
 SHORT = 16 << 10  # [bytes] of a body that is read in a few ms
 
 
