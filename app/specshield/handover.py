@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from specshield.errors import StepConflict
-from specshield.shield.decision import Carry
+from specshield.shield.decision import Carry, Decision
 from specshield.shield.taught import Taught
 
+E = TypeVar("E")
 NEVER = -2  # the step of a decision that no other follows: nothing is compared with what it foresaw
 
 
@@ -64,6 +65,16 @@ def check_main_task(over: bool, told: bool) -> None:
 def finite(value: float) -> float | None:
     """As it is told in JSON: None for what has no number there."""
     return value if math.isfinite(value) else None
+
+
+def explained(
+    decision: Decision, form: Callable[[str, float | None, int | None, str | None], E]
+) -> tuple[E | None, ...]:
+    """What is said of each action, in the form of an answer's; None for one that is allowed."""
+    return tuple(
+        None if why is None else form(why.conjunct, finite(why.robustness), why.late_by, why.detail)
+        for why in decision.explanations
+    )
 
 
 def rule_told(about: Mapping[str, Any], begins: int, origin: int, clock: str, status: str) -> dict[str, Any]:

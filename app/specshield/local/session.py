@@ -287,7 +287,7 @@ def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool,
         "next_poses": tuple(map(tuple, made.next_poses.tolist())),
         "residual": None if made.residual is None else Residual(*made.residual),
         "witnesses": made.witnesses if witnesses else None,
-        "explanations": _explained(made) if explain else None,
+        "explanations": handover.explained(made, Explanation) if explain else None,
         "timings": {},
     }
     execute = execute_of(values, info.terminal_actions, over)
@@ -299,12 +299,3 @@ def _told(why: Explanation | None) -> dict[str, Any] | None:
     if why is None:
         return None
     return {name: value for name, value in vars(why).items() if name != "detail" or value is not None}
-
-
-def _explained(made: core.Decision) -> tuple[Explanation | None, ...]:
-    return tuple(
-        None
-        if why is None
-        else Explanation(why.conjunct, handover.finite(why.robustness), why.late_by, why.detail)
-        for why in made.explanations
-    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,7 +32,7 @@ def notices(policy: Proposer) -> tuple[str, ...]:
         poses = free_poses(task, shield.body, STARTS, np.random.default_rng(0))
     except MapError:
         return (f"the robot fits nowhere on this map: its footprint has a radius of {task.robot.radius:g} m",)
-    refused = [pose for pose in poses if not _kept(shield, pose)]
+    refused = [pose for pose in poses if not may_begin(shield, pose.tolist())]
     missed = sum(way(shield, pose[None], {}) is not None for pose in refused[:MOST_SEARCHED])
     if missed:
         tried = min(len(refused), MOST_SEARCHED)
@@ -65,10 +66,10 @@ def _of_signals(shield: Shield, poses: Floats, silent: int) -> tuple[str, ...]:
     )
 
 
-def _kept(shield: Shield, pose: Floats) -> bool:
-    """Whether a session may begin at a free pose."""
+def may_begin(shield: Shield, pose: Sequence[float]) -> bool:
+    """Whether a session may begin at a pose (x, y, theta). Raises PoseError for one that is not free."""
     try:
-        start(shield, pose.tolist())
+        start(shield, pose)
     except (InfeasibleStart, SampleError):
         return False
     return True

@@ -18,14 +18,14 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.drawing.outline import way_ahead
 from specshield.drawing.svg import Plan
-from specshield.errors import InfeasibleStart, PoseError, SampleError
+from specshield.errors import PoseError
+from specshield.policy.notices import may_begin
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.library.policies import Description
 from specshield.service.sessions import record
 from specshield.service.settings import Settings
 from specshield.service.storage.keeper import follow_parent
 from specshield.shield.decision import Shield, make_shield
-from specshield.shield.episode import start
 
 V = TypeVar("V")
 FORK = get_context("fork")
@@ -145,9 +145,6 @@ def kept_from(shield: Shield, deadline: float) -> Iterator[tuple[Floats, float, 
 def _kept(shield: Shield, x: float, y: float, theta: float) -> float:
     """Whether an episode may begin there, as 1 or 0; NaN where the robot does not fit."""
     try:
-        start(shield, (x, y, theta))
+        return float(may_begin(shield, (x, y, theta)))
     except PoseError:
         return math.nan
-    except (InfeasibleStart, SampleError):  # or the formula has no value there
-        return 0.0
-    return 1.0

@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.handover import finite
+from specshield.handover import explained
 from specshield.service.schemas.answers import Explanation, Residual, StepAnswer
 from specshield.service.sessions.packing import COLUMNS, full, pack_table, sparse, unpack_table
 from specshield.shield.decision import Decision
@@ -189,7 +189,7 @@ def make(
         occupied=None if occupied is None else occupied.astype("<f8").tobytes(),
         free=None if free is None else free.astype("<f8").tobytes(),
         explain=explain,
-        explanations=_explained(decision),
+        explanations=explained(decision, Explanation),
         tables=tables,
         any_signal=decision.any_signal,
         **_alike(decision),
@@ -201,19 +201,12 @@ def told(decision: Decision, all_witnesses: bool, explain: bool) -> StepAnswer:
     return _answer(
         decision,
         all_witnesses,
-        _explained(decision) if explain else None,
+        explained(decision, Explanation) if explain else None,
         action_name=decision.action_name,
         distribution=decision.distribution.tolist(),
         j_values=list(decision.j_values),
         robustness=list(decision.robustness),
         next_poses=decision.next_poses.tolist(),
-    )
-
-
-def _explained(decision: Decision) -> tuple[Explanation | None, ...]:
-    return tuple(
-        None if why is None else Explanation(why.conjunct, finite(why.robustness), why.late_by, why.detail)
-        for why in decision.explanations
     )
 
 
