@@ -60,6 +60,11 @@ def columns_of(rules: Sequence[Config]) -> list[str]:
     return names
 
 
+def signals_in(rows: Floats, names: Iterable[str]) -> dict[str, Floats]:
+    """What rows [n, 3 + signals] hold of these signals, [n] each. names: by column."""
+    return {name: rows[:, 3 + i] for i, name in enumerate(names)}
+
+
 def widened(rows: Floats, names: Sequence[str], signals: Mapping[str, float]) -> Floats:
     """The rows with the columns that a rule with these signals adds; they hold the initial values."""
     first = [signals[name] for name in added(names, signals)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import msgspec
@@ -102,6 +102,64 @@ class Session(NamedTuple):
         first = min(stored, len(self.rows) - 1)
         return pack(self.rows[first:]), first * 8 * self.rows.shape[1]
 
+    def check_step(self, request: StepBody) -> None:
+        """Raises what is wrong with asking for a step that was not decided before."""
+        self.check_ahead(request.t, f"step {request.t} was passed over and can no longer be decided")
+        check_last(request.t, self.config["max_steps"])
+        check_main_task(self.state.main_task_done, request.main_task_done)
+
+    def check_ahead(self, t: int, otherwise: str) -> None:
+        """Raises SessionFinished, or StepConflict saying `otherwise`, unless t can follow those decided."""
+        if self.state.finished:
+            raise self.over(t)
+        ahead = self.state.next_t
+        if t < ahead:
+            raise StepConflict(otherwise, path="t", got=t, expected=f"{ahead} or later", expected_t=ahead)
+
+    def over(self, t: int) -> SessionFinished:
+        """The error of a step that is asked for after the end."""
+        return SessionFinished(
+            f"session {self.id!r} is over: no further step is decided",
+            path="t",
+            got=t,
+            expected="a step already decided, to read it again",
+        )
+
+    def replay(self, step: bytes, request: StepBody) -> StepAnswer:
+        """The stored answer. Raises StepConflict where it answered another request."""
+        kept, row = record.decode(step), self.rows[request.t]
+        asked, before = asked_of(request), kept.asked(row, self.signal_names)
+        if not (
+            (asked.pose, asked.signals, asked.main_task_done)
+            == (before.pose, before.signals, before.main_task_done)
+            and _equal(asked.logits, before.logits)
+            and _equal(asked.occupied, before.occupied)
+            and _equal(asked.free, before.free)
+        ):
+            raise StepConflict(
+                f"step {request.t} was decided for another x_t, logits, signals, main_task_done, occupied or "
+                "free",
+                path="t",
+                got=request.t,
+                expected=f"the same request again, or step {self.state.next_t}",
+                expected_t=self.state.next_t,
+            )
+        history.join(self.poses, request.t, np.array(request.poses))
+        return record.answer(kept, row, self.rules[ruled.at(self.rules, request.t)]["actions"])
+
+    def lines(self, steps: Sequence[bytes]) -> Iterator[bytes]:
+        """One JSON object a step: t, pose, signals, which rule held, the logits sent, the answer given."""
+        for t, row in enumerate(self.rows):
+            held, rule = row.tolist(), ruled.at(self.rules, t)
+            config, values = self.rules[rule], dict(zip(self.signal_names, held[3:], strict=True))
+            signals = {name: values[name] for name in sorted(config["spec"]["signals"])}
+            head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals, "rule": rule})
+            step = steps[t] if t < len(steps) else b""
+            kept = record.decode(step) if step else None
+            logits = msgspec.json.encode(None if kept is None else record.logits_json(kept))
+            told = b"null" if kept is None else to_json(record.answer(kept, row, config["actions"]))
+            yield head[:-1] + b',"logits":' + logits + b',"decision":' + told + b"}"
+
 
 # What others are not told of a config.
 INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before", "way")
@@ -129,49 +187,10 @@ def needed(rules: Sequence[Mapping[str, Any]], state: State) -> set[str]:
     return {id for config in [*waiting, rules[-1]] for id in config["policy_ids"]}
 
 
-def check_step(session: Session, request: StepBody) -> None:
-    """Raises what is wrong with asking for a step that was not decided before."""
-    check_ahead(session, request.t, f"step {request.t} was passed over and can no longer be decided")
-    check_last(request.t, session.config["max_steps"])
-    check_main_task(session.state.main_task_done, request.main_task_done)
-
-
-def check_ahead(session: Session, t: int, otherwise: str) -> None:
-    """Raises SessionFinished, or StepConflict saying `otherwise`, unless step t can follow those decided."""
-    if session.state.finished:
-        raise over(session, t)
-    ahead = session.state.next_t
-    if t < ahead:
-        raise StepConflict(otherwise, path="t", got=t, expected=f"{ahead} or later", expected_t=ahead)
-
-
 def check_last(t: int, last: int) -> None:
     """last: the session's. Raises InputError for a step that comes after it."""
     if t > last:
         raise InputError(f"step {t} is past max_steps", path="t", got=t, expected=f"at most {last}")
-
-
-def replay(session: Session, step: bytes, request: StepBody) -> StepAnswer:
-    """The stored answer. Raises StepConflict where it answered another request."""
-    kept, row = record.decode(step), session.rows[request.t]
-    asked, before = asked_of(request), kept.asked(row, session.signal_names)
-    if not (
-        (asked.pose, asked.signals, asked.main_task_done)
-        == (before.pose, before.signals, before.main_task_done)
-        and _equal(asked.logits, before.logits)
-        and _equal(asked.occupied, before.occupied)
-        and _equal(asked.free, before.free)
-    ):
-        raise StepConflict(
-            f"step {request.t} was decided for another x_t, logits, signals, main_task_done, occupied or "
-            "free",
-            path="t",
-            got=request.t,
-            expected=f"the same request again, or step {session.state.next_t}",
-            expected_t=session.state.next_t,
-        )
-    history.join(session.poses, request.t, np.array(request.poses))
-    return record.answer(kept, row, session.rules[ruled.at(session.rules, request.t)]["actions"])
 
 
 def asked_of(request: StepBody) -> Asked:
@@ -214,7 +233,7 @@ def decide(
         since[:, :3],
         asked.logits,
         asked.main_task_done,
-        columns(since, names),
+        ruled.signals_in(since, names),
         carry,
         asked.all_witnesses,
         asked.occupied,
@@ -226,35 +245,8 @@ def decide(
     return decision, record.make(decision, asked, since[-1], names, before, tables)
 
 
-def lines(session: Session, steps: Sequence[bytes]) -> Iterator[bytes]:
-    """One JSON object a step: t, pose, signals, which rule held, the logits sent, and the answer given."""
-    for t, row in enumerate(session.rows):
-        held, rule = row.tolist(), ruled.at(session.rules, t)
-        config, values = session.rules[rule], dict(zip(session.signal_names, held[3:], strict=True))
-        signals = {name: values[name] for name in sorted(config["spec"]["signals"])}
-        head = msgspec.json.encode({"t": t, "pose": held[:3], "signals": signals, "rule": rule})
-        step = steps[t] if t < len(steps) else b""
-        kept = record.decode(step) if step else None
-        logits = msgspec.json.encode(None if kept is None else record.logits_json(kept))
-        told = b"null" if kept is None else to_json(record.answer(kept, row, config["actions"]))
-        yield head[:-1] + b',"logits":' + logits + b',"decision":' + told + b"}"
-
-
-def columns(rows: Floats, names: Iterable[str]) -> dict[str, Floats]:
-    return {name: rows[:, 3 + i] for i, name in enumerate(names)}
-
-
 def pack(rows: Floats) -> bytes:
     return np.ascontiguousarray(rows, "<f8").tobytes()
-
-
-def over(session: Session, t: int) -> SessionFinished:
-    return SessionFinished(
-        f"session {session.id!r} is over: no further step is decided",
-        path="t",
-        got=t,
-        expected="a step already decided, to read it again",
-    )
 
 
 def there(found: F | None, key: str) -> F:

@@ -33,13 +33,10 @@ from specshield.service.sessions.session import (
     RACES,
     Session,
     check_last,
-    columns,
     contended,
     describe,
-    lines,
     missing,
     needed,
-    over,
     pack,
     there,
 )
@@ -153,7 +150,7 @@ class Sessions:
                 check_last(request.t, session.config["max_steps"] + 1)  # where the last step led
                 session = session.extended(request.t, np.array(request.poses), {})
                 if state.closed and len(session.rows) > state.length:
-                    raise over(session, request.t)
+                    raise session.over(request.t)
             session, status, bounds = await self._run(self._closed, session)
             if not state.closed:
                 state = msgspec.structs.replace(
@@ -184,7 +181,7 @@ class Sessions:
         """One JSON object a step, as `lines` has it; and the rules, as one JSON list."""
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
-        return lines(session, found.steps), files.to_json(describe(session.rules, session.state)["rules"])
+        return session.lines(found.steps), files.to_json(describe(session.rules, session.state)["rules"])
 
     async def record(self, id: str) -> tuple[bytes, str]:
         """The session's record as a file, and its seal."""
@@ -247,7 +244,7 @@ def begin(
     task, about = shield.task, records[0].about
     signals = dict(sorted(task.signals.items()))
     rows = np.array([[*request.initial_pose, *signals.values()]])
-    status, _ = episode.close(shield, rows[:, :3], columns(rows, signals))
+    status, _ = episode.close(shield, rows[:, :3], rules.signals_in(rows, signals))
     config = {
         "id": request.id or f"{time.time_ns() // 1_000_000:012x}-{secrets.token_hex(8)}",
         **asked_by(ids, about, task),

@@ -20,7 +20,7 @@ from specshield.service.heavy.tables import Tables
 from specshield.service.library import files
 from specshield.service.library.policies import Description, Policies
 from specshield.service.sessions import record, rules
-from specshield.service.sessions.session import Session, columns
+from specshield.service.sessions.session import Session
 from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.preference import Preference
@@ -97,7 +97,7 @@ class Shields:
             return "pending", (-math.inf, math.inf)
         asked = [config[name] for name in ("map_id", "robot", "spec")]
         judge = self._judges.get(record.digest(files.to_json(asked)), lambda: self._judge(*asked))
-        return episode.close(judge, since[:, :3], columns(since, names))
+        return episode.close(judge, since[:, :3], rules.signals_in(since, names))
 
     def _judge(self, map_id: str, robot: str | dict[str, Any], spec: dict[str, Any]) -> Shield:
         """A task made anew for each verdict would stay for as long as what is prepared of it (`view_of`)."""

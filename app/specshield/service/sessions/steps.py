@@ -22,16 +22,7 @@ from specshield.service.schemas.answers import StepAnswer
 from specshield.service.schemas.steps import StepBody
 from specshield.service.sessions import record
 from specshield.service.sessions.record import StepRecord
-from specshield.service.sessions.session import (
-    RACES,
-    Session,
-    asked_of,
-    check_step,
-    contended,
-    decide,
-    missing,
-    replay,
-)
+from specshield.service.sessions.session import RACES, Session, asked_of, contended, decide, missing
 from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State, pack_carry
 from specshield.service.storage.store import Change, Store
@@ -71,17 +62,13 @@ class Pace:
 
     def __init__(self) -> None:
         self._threaded = SEVERAL  # how many are still to be made in threads
-        self._doubted = 0  # how many are still to be measured on the event loop
+        self.doubted = 0  # how many are still to be measured on the event loop
         self._since_late = WATCHED  # decisions on the event loop since one that took longer than SHORT
         self._long = 0
 
     @property
     def short(self) -> bool:
         return self._threaded == 0
-
-    @property
-    def doubted(self) -> bool:
-        return self._doubted > 0
 
     @property
     def long(self) -> bool:
@@ -91,10 +78,10 @@ class Pace:
         """computed: the seconds of a processor, None where they were not measured."""
         if computed is None:
             late = seconds > SHORT
-            self._doubted = SEVERAL if late and self._since_late < SEVERAL else 0
+            self.doubted = SEVERAL if late and self._since_late < SEVERAL else 0
             self._since_late = 0 if late else self._since_late + 1
             return
-        self._doubted = max(self._doubted - 1, 0)
+        self.doubted = max(self.doubted - 1, 0)
         self._threaded = WATCHED if computed > SHORT else max(self._threaded - 1, 0)
         self._long += computed > LONG
 
@@ -139,9 +126,9 @@ class Steps:
                 session, step, current = Session.of(found), found.step, True
             if step is not None:
                 metrics.replayed()
-                return replay(session, step, request)
+                return session.replay(step, request)
             try:
-                check_step(session, request)
+                session.check_step(request)
                 decided = await self._decide(session, request, timing)
             except SpecshieldError:
                 if current:

@@ -18,17 +18,7 @@ from specshield.service.library import files
 from specshield.service.schemas.sessions import SwitchRequest
 from specshield.service.sessions import history, record, rules
 from specshield.service.sessions.config import asked_by, settings_of
-from specshield.service.sessions.session import (
-    RACES,
-    Session,
-    check_ahead,
-    check_last,
-    columns,
-    contended,
-    describe,
-    pack,
-    there,
-)
+from specshield.service.sessions.session import RACES, Session, check_last, contended, describe, pack, there
 from specshield.service.sessions.shields import Run, Shields
 from specshield.service.sessions.state import pack_carry
 from specshield.service.settings import Settings
@@ -121,7 +111,7 @@ def _wanted(
 ) -> Wanted:
     """step: what the decision before x_t left. Raises what is wrong with asking for it."""
     t = request.t
-    check_ahead(session, t, f"step {t} is decided, or was passed over: no other rule can hold there")
+    session.check_ahead(t, f"step {t} is decided, or was passed over: no other rule can hold there")
     if len(session.rules) >= rules.MOST_RULES:
         raise LimitReached(
             f"a session has at most {rules.MOST_RULES} rules", expected="a new session for what follows"
@@ -203,11 +193,11 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
     elsewhere = any(old[name] != config[name] for name in ("map_id", "robot"))
-    way = refusal.switch(shield, seen[:, :3], columns(seen, names), known, elsewhere)
+    way = refusal.switch(shield, seen[:, :3], rules.signals_in(seen, names), known, elsewhere)
     config["way"] = (way or b"").hex()
     carry = rules.carried_over(carry, old, config)
     rows = made.since
-    status = episode.close(shield, rows[:, :3], columns(rows, names))[0] if len(rows) else "pending"
+    status = episode.close(shield, rows[:, :3], rules.signals_in(rows, names))[0] if len(rows) else "pending"
     state = msgspec.structs.replace(
         session.state,
         length=len(made.rows),
@@ -217,6 +207,6 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         head=record.digest(files.to_json(config)),
         carry=None if carry is None else pack_carry(carry),
         verdicts=(*session.state.verdicts, verdict),
-        any_signal=any_signal(shield, seen[:, :3], columns(seen, names)),
+        any_signal=any_signal(shield, seen[:, :3], rules.signals_in(seen, names)),
     )
     return made._replace(state=state)

@@ -25,18 +25,7 @@ from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import Session, there
 from specshield.service.sessions.state import State
 from specshield.service.storage.store import News, Store
-from specshield.service.watch.feed import (
-    KEPT,
-    Feed,
-    Told,
-    begun,
-    events,
-    last_event,
-    last_of_several,
-    outdated,
-    reached,
-    ruled,
-)
+from specshield.service.watch.feed import KEPT, Feed, Told, begun, ruled
 
 EVERY = 0.1  # [s] between two looks at a session; chosen by hand: a page need not be quicker
 SELDOM = 10  # looks at the others to one at those that are decided here: whose end, or switch, shows so
@@ -155,7 +144,7 @@ class Watchers:
                     told += [each.whole for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
-                        told.append(last_of_several(feed))
+                        told.append(feed.last_of_several())
                         del places[feed]
                 if told or time.monotonic() - told_at > HEARTBEAT:
                     told_at = time.monotonic()
@@ -199,7 +188,7 @@ class Watchers:
                 if t < feed.end:
                     continue
                 if feed.over:
-                    yield last_event(feed)
+                    yield feed.last_event()
                     return
                 try:
                     await asyncio.wait_for(changed.wait(), HEARTBEAT)
@@ -227,7 +216,7 @@ class Watchers:
                         feed.version = b""
                     else:
                         feed.close()
-                elif not outdated(feed, new) or not await self._switched(feed):
+                elif not feed.outdated(new) or not await self._switched(feed):
                     self._gone_on(feed, version, new)
         since = time.monotonic() - AWAY
         for feed, known, now in seen:
@@ -238,8 +227,8 @@ class Watchers:
         if begun(version) != begun(feed.version or version):
             feed.close()  # it was erased, and another session of this id was begun
             return
-        state, (found, end) = State.of(new.state), events(feed, feed.end, new)
-        upto = reached(feed, end, new)
+        state, (found, end) = State.of(new.state), feed.events(feed.end, new)
+        upto = feed.reached(end, new)
         feed.add(state, found, end, upto)
         if upto >= state.next_t:  # else there is more, for the next look
             feed.version = version
@@ -258,7 +247,7 @@ class Watchers:
             feed.close()
         else:
             new = News(dump.state, dump.rows[feed.end * feed.width :], dump.steps[feed.end :])
-            state, (found, _) = State.of(dump.state), events(feed, feed.end, new)
+            state, (found, _) = State.of(dump.state), feed.events(feed.end, new)
             feed.add(state, found, state.next_t, state.next_t)
         feed.version = None
 
@@ -272,7 +261,7 @@ class Watchers:
             if dump is None or not feed.rule(Session.of(dump)):
                 return [], feed.end
             new = News(dump.state, dump.rows[t * feed.width :], dump.steps[t : t + KEPT])
-        elif outdated(feed, new):
+        elif feed.outdated(new):
             return [], t if await self._switched(feed) else feed.end
-        found, end = events(feed, t, new)
+        found, end = feed.events(t, new)
         return found, end if end > t else feed.end

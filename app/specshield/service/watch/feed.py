@@ -119,54 +119,49 @@ class Feed:
         self.changed.set()
         self.changed = asyncio.Event()
 
+    def events(self, t: int, new: News) -> tuple[list[Told], int]:
+        """The decisions of the steps from t on that `new` has, and the step that follows them. The first one
+        after a switch brings the switch.
+        """
+        found = []
+        switched = [rule for rule in self.told[1:] if rule["from"] >= t]
+        for i, step in enumerate(new.steps):
+            if step:
+                row = np.frombuffer(new.rows[i * self.width : (i + 1) * self.width], "<f8")
+                rule = rules.at(self.rules, t + i)
+                kept = record.decode(step)
+                answer = record.answer(kept, row, self.rules[rule]["actions"])
+                switch = b""
+                while switched and switched[0]["from"] <= t + i:
+                    switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
+                found.append(Told(shown(self.id), t + i, switch, rule, row[:3].tolist(), kept, answer))
+        return found, t + len(new.steps)
 
-def events(feed: Feed, t: int, new: News) -> tuple[list[Told], int]:
-    """The decisions of the steps from t on that `new` has, and the step that follows them. The first one
-    after a switch brings the switch.
-    """
-    found = []
-    switched = [rule for rule in feed.told[1:] if rule["from"] >= t]
-    for i, step in enumerate(new.steps):
-        if step:
-            row = np.frombuffer(new.rows[i * feed.width : (i + 1) * feed.width], "<f8")
-            rule = rules.at(feed.rules, t + i)
-            kept = record.decode(step)
-            answer = record.answer(kept, row, feed.rules[rule]["actions"])
-            switch = b""
-            while switched and switched[0]["from"] <= t + i:
-                switch += b"event: switch\ndata: %s\n\n" % json.dumps(switched.pop(0)).encode()
-            found.append(Told(shown(feed.id), t + i, switch, rule, row[:3].tolist(), kept, answer))
-    return found, t + len(new.steps)
+    def reached(self, end: int, new: News) -> int:
+        """The step that follows those that `new` has, which end before `end`, and those that the last switch
+        passed over: these are not in the list until one is decided after them. The state does not tell of
+        them: it may be newer than the steps.
+        """
+        return end if len(new.steps) == KEPT else max(end, rules.begins(self.rules[-1]))
 
+    def outdated(self, new: News) -> bool:
+        """Whether the session has had a switch that this does not know of; its rows may be wider since."""
+        return len(State.of(new.state).verdicts) >= len(self.rules)
 
-def reached(feed: Feed, end: int, new: News) -> int:
-    """The step that follows those that `new` has, which end before `end`, and those that the last switch
-    passed over: these are not in the list until one is decided after them. The state does not tell of them:
-    it may be newer than the steps.
-    """
-    return end if len(new.steps) == KEPT else max(end, rules.begins(feed.rules[-1]))
+    def last_event(self) -> bytes:
+        told = {"next_t": self.end, "spec_status": self.status, "finished": True}
+        return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
 
-
-def outdated(feed: Feed, new: News) -> bool:
-    """Whether the session has had a switch that the feed does not know of; its rows may be wider since."""
-    return len(State.of(new.state).verdicts) >= len(feed.rules)
+    def last_of_several(self) -> bytes:
+        """In a stream of several sessions."""
+        told = {"session": shown(self.id), "next_t": self.end, "spec_status": self.status, "finished": True}
+        return b"data: %s\n\n" % json.dumps(told).encode()
 
 
 def ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str, Any]], int]:
     """`Feed.rules`, `told` and `width`."""
     told = describe(session.rules, session.state)["rules"]
     return session.rules, told, 8 * session.rows.shape[1]
-
-
-def last_of_several(feed: Feed) -> bytes:
-    """In a stream of several sessions."""
-    told = {"session": shown(feed.id), "next_t": feed.end, "spec_status": feed.status, "finished": True}
-    return b"data: %s\n\n" % json.dumps(told).encode()
-
-
-def last_event(feed: Feed) -> bytes:
-    told = {"next_t": feed.end, "spec_status": feed.status, "finished": True}
-    return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
 
 
 def begun(version: bytes) -> bytes:
