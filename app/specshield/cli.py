@@ -107,11 +107,10 @@ def serve(
     import uvicorn
 
     from specshield.service.heavy.pool import STARTS_WITHIN
-    from specshield.service.leaving import GRACE
+    from specshield.service.leaving import GRACE, notice_killed
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_files
     from specshield.service.watch import logs
-    from specshield.service.workers import notice_killed
 
     settings = _settings()  # what is wrong with them is said here, in one line
     _check_address(host, port)

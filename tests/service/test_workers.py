@@ -9,7 +9,7 @@ from multiprocessing import get_context
 from uvicorn import Config
 from uvicorn.supervisors.multiprocess import Process
 
-from specshield.service.workers import notice_killed
+from specshield.service.leaving import notice_killed
 from tests.serving import HUNG
 
 

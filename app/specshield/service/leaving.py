@@ -1,5 +1,5 @@
 """How a server leaves: /readyz says so first, so that balancers send nothing new, and then it stops. What
-streams are open is told as soon as the server is.
+streams are open is told as soon as the server is. And how uvicorn's supervisor sees that one was killed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ import signal
 import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
+
+from uvicorn.supervisors.multiprocess import Process
 
 if TYPE_CHECKING:  # the parent of several servers decides nothing
     from specshield.service.startup import Startup
@@ -58,6 +60,21 @@ def drain_at_sigterm(startup: Startup, seconds: float) -> None:
                 loop.call_soon_threadsafe(loop.call_later, seconds, stop, signum, frame)
 
     signal.signal(signal.SIGTERM, told)  # uvicorn puts its caller's handler back at the end
+
+
+def notice_killed() -> None:
+    """From now on the supervisor closes its own copy of a worker's end of the pipe between them.
+
+    It asks each worker for a sign of life through that pipe. With the copy open, it does not see the end of
+    one that is killed while it is asked, and waits as long as a worker may take to start.
+    """
+    start = Process.start
+
+    def start_and_close(worker: Process) -> None:
+        start(worker)
+        worker.child_conn.close()
+
+    Process.start = start_and_close  # type: ignore[assignment, method-assign]
 
 
 def _has_signals() -> bool:
