@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from specshield.errors import PolicyError
 from specshield.policy.methods import Method, lazily
 from specshield.policy.options import option
-
-if TYPE_CHECKING:
-    from specshield.task import Task
 
 
 @dataclass(frozen=True)
@@ -45,23 +40,10 @@ class Settings:
     evaluation_starts: int = option(1000, "Starts of a measurement.", low=1, high=100_000)
 
 
-def _check(task: Task, options: Settings) -> None:
-    from specshield.policy.progress import make_rules
-
-    make_rules(task)
-    if task.horizon < 1:
-        raise PolicyError(
-            "there is nothing to learn: the rule looks at the first state alone",
-            path="spec.formula",
-            got=str(task.formula),
-            expected="a horizon of at least 1; or method 'reachability'",
-        )
-
-
 METHOD = Method(
     "Learned in minutes by deep Q-learning, as in the paper. For the formulas that `reachability` takes.",
     Settings,
-    _check,
+    lazily("specshield.policy.dqn.policy:check"),
     lazily("specshield.policy.dqn.train:train"),
     lazily("specshield.policy.dqn.policy:load_dqn"),
     needs=("torch",),

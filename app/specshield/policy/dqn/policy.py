@@ -11,7 +11,9 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from specshield.arrays import Floats, Ints
+from specshield.errors import PolicyError
 from specshield.policy.card import Card, Carded
+from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import Network, make_network
 from specshield.policy.dqn.observation import observation_size
 from specshield.policy.dqn.rollout import propose_all
@@ -76,3 +78,15 @@ def load_dqn(weights: bytes | Path, card: Card, task: Task) -> Policy:
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     inputs, outputs = observation_size(rules, body), motion_count(body)
     return Policy(task, card, make_network(read_tensors(weights), inputs, outputs))
+
+
+def check(task: Task, settings: Settings) -> None:
+    """Raises what `train` would for a task that it cannot serve, without making anything."""
+    make_rules(task)
+    if task.horizon < 1:
+        raise PolicyError(
+            "there is nothing to learn: the rule looks at the first state alone",
+            path="spec.formula",
+            got=str(task.formula),
+            expected="a horizon of at least 1; or method 'reachability'",
+        )
