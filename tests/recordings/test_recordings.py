@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from specshield.errors import InputError
 from specshield.local import LocalShield
 from specshield.recordings import drive
 from specshield.recordings.recording import Recording
@@ -119,8 +121,10 @@ def test_rerun_writes_a_file(recording: Recording, tmp_path: Path) -> None:
     assert (tmp_path / "s.rrd").stat().st_size > 10_000
 
 
-def bag_of(folder: Path, poses: list[tuple[float, float, float]], step_seconds: float) -> Path:
-    """A rosbag2 of geometry_msgs/PoseStamped, four times as often as there are steps."""
+def bag_of(
+    folder: Path, poses: list[tuple[float, float, float]], step_seconds: float, begun: int = 1_000_000_000
+) -> Path:
+    """A rosbag2 of geometry_msgs/PoseStamped, four times as often as there are steps. begun: [ns]."""
     writer = pytest.importorskip("rosbags.rosbag2")
     from rosbags.typesys import Stores, get_typestore
 
@@ -130,7 +134,7 @@ def bag_of(folder: Path, poses: list[tuple[float, float, float]], step_seconds: 
         connection = bag.add_connection("/robot_pose", "geometry_msgs/msg/PoseStamped", typestore=store)
         for i in range(4 * (len(poses) - 1) + 1):
             x, y, theta = poses[i // 4]
-            at = 1_000_000_000 + round(i * step_seconds / 4 * 1e9)
+            at = begun + round(i * step_seconds / 4 * 1e9)
             stamp = kind["Time"](sec=at // 10**9, nanosec=at % 10**9)
             turned = kind["Quaternion"](x=0.0, y=0.0, z=math.sin(theta / 2), w=math.cos(theta / 2))
             message = kind["PoseStamped"](
@@ -166,6 +170,72 @@ def test_a_drive_that_kept_the_rule_and_one_that_lost_it(shield: LocalShield, tm
     assert lost.last == pytest.approx(stays[-1], abs=1e-9)
     assert "until step" in "\n".join(drive.told(shield, lost, 0.4))
     assert step(body, *poses[0], 0)  # the drives are of this robot
+
+
+def test_a_drive_of_today_is_read_as_one_of_1970(tmp_path: Path) -> None:
+    """Some 1.7e18 ns after 1970 a float of seconds is off by more than a tenth of a microsecond."""
+    poses = [(0.01 * i, 0.0, 0.0) for i in range(150)]
+    read = drive.read_drive(bag_of(tmp_path / "today", poses, 0.1, begun=1_700_000_000_123_456_789), 0.1)
+    assert read == pytest.approx(np.array(poses), abs=1e-12)
+
+
+def test_poses_of_one_topic_from_two_nodes_are_all_read(tmp_path: Path) -> None:
+    """In a rosbag1 each node that sends has a connection: a localisation that was started anew has two."""
+    writer = pytest.importorskip("rosbags.rosbag1")
+    from rosbags.typesys import Stores, get_typestore
+
+    store, kind = get_typestore(Stores.ROS1_NOETIC), "geometry_msgs/msg/PoseStamped"
+    made = store.types
+    turned = made["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+    with writer.Writer(tmp_path / "two.bag") as bag:
+        nodes = [bag.add_connection("/pose", kind, typestore=store, callerid=f"/{i}") for i in range(2)]
+        for i in range(6):
+            message = made[kind](
+                header=made["std_msgs/msg/Header"](
+                    seq=i, stamp=made["builtin_interfaces/msg/Time"](sec=i, nanosec=0), frame_id="map"
+                ),
+                pose=made["geometry_msgs/msg/Pose"](
+                    position=made["geometry_msgs/msg/Point"](x=float(i), y=0.0, z=0.0), orientation=turned
+                ),
+            )
+            bag.write(nodes[i // 3], i * 10**9, store.serialize_ros1(message, kind))
+    assert drive.read_drive(tmp_path / "two.bag", 1.0)[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+def test_a_bag_that_cannot_be_a_drive_is_refused_in_words(tmp_path: Path) -> None:
+    content = (bag_of(tmp_path / "whole", [START] * 20, 1.0) / "whole.db3").read_bytes()
+    kind = b"geometry_msgs/msg/PoseStamped"
+    for name, other, told in (
+        ("none", b"", "the bag cannot be read"),
+        ("cut", content[:-100], "the bag cannot be read"),  # a page of the table is not whole
+        ("text", content.replace(kind, b"\xb9" + kind[1:]), "the bag cannot be read"),
+        ("unset", content.replace(struct.pack("<d", 1.0), bytes(8)), "not a unit quaternion"),
+    ):
+        folder = bag_of(tmp_path / name, [START] * 20, 1.0)
+        (folder / f"{name}.db3").write_bytes(other)
+        with pytest.raises(InputError, match=told):
+            drive.read_drive(folder, 1.0)
+    set_anew = bag_of(tmp_path / "clock", [START] * 2, 1.7e9)  # from 1970 to today in one step
+    with pytest.raises(InputError, match="too far apart in time"):
+        drive.read_drive(set_anew, 1e-3)
+
+
+def test_a_drive_that_kept_the_rule_as_no_known_motion_does_is_no_failure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It stands until the robot, as told, is too late, and is then at the charger in one step."""
+    typer = pytest.importorskip("typer")
+    pytest.importorskip("rosbags")
+    from specshield.commands.check_drive import check_drive
+
+    poses = np.array([START] * 59 + [(0.9, 5.0, 0.0)] * 90)
+    monkeypatch.setattr(drive, "read_drive", lambda *asked: poses)
+    with pytest.raises(typer.Exit) as ended:
+        check_drive(Path("bag"), "case1", 1.0)
+    told = capsys.readouterr().out
+    assert "the rule is kept" in told
+    assert "none was found from step" in told
+    assert ended.value.exit_code == 0
 
 
 def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer, tmp_path: Path) -> None:

@@ -40,4 +40,4 @@ def check_drive(
     judged = drive.check_drive(shield, drive.read_drive(bag, step_seconds, topic))
     for line in drive.told(shield, judged, step_seconds):
         typer.echo(line)
-    raise typer.Exit(1 if judged.lost is not None else 0)
+    raise typer.Exit(1 if judged.lost is not None and judged.verdict.spec_status != "satisfied" else 0)

@@ -19,6 +19,7 @@ POSES = {  # message types that hold a pose in one frame, and where in them
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
 }
+MOST_STEPS = 1_000_000  # of a drive; chosen by hand, some hundred times what a rule can look ahead
 
 
 class Judged(NamedTuple):
@@ -39,33 +40,45 @@ def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floa
     bag: a folder of rosbag2 (or a rosbag1 file). topic: one with poses in the map's frame; None: the only
     one there is. Raises InputError.
     """
-    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            known = {c.topic: c for c in reader.connections if c.msgtype in POSES}
-            if topic is None and len(known) == 1:
-                topic = next(iter(known))
-            if topic not in known:
+            known = [c for c in reader.connections if c.msgtype in POSES]
+            topics = sorted({c.topic for c in known})
+            if topic is None and len(topics) == 1:
+                topic = topics[0]
+            if topic not in topics:
                 raise InputError(
-                    "the bag does not say which poses are meant" if topic is None else "no poses there",
+                    "no poses there" if topic or not topics else "the bag does not say which poses are meant",
                     path="--topic",
                     got=topic,
-                    expected=f"one of {', '.join(sorted(known)) or 'none in this bag'}",
+                    expected=f"one of {', '.join(topics)}" if topics else f"a bag with {' or '.join(POSES)}",
                 )
+            meant = [c for c in known if c.topic == topic]  # each node that sends poses there has its own
             found = [
-                (at * 1e-9, *_planar(POSES[c.msgtype](reader.deserialize(raw, c.msgtype))))
-                for c, at, raw in reader.messages(connections=[known[topic]])
+                (at, _planar(POSES[c.msgtype](reader.deserialize(raw, c.msgtype))))
+                for c, at, raw in reader.messages(connections=meant)
             ]
-    except (AnyReaderError, OSError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # rosbags lets through whatever its parsers raise of a damaged file
         raise InputError(f"the bag cannot be read: {error}", path="BAG", got=str(bag)) from None
     if not found:
         raise InputError("no poses on this topic", path="--topic", got=topic, expected="at least one")
-    samples = np.array(found)
-    wanted = np.arange(samples[0, 0], samples[-1, 0] + 1e-9, step_seconds)
-    newest = np.searchsorted(samples[:, 0], wanted + 1e-9, side="right") - 1
-    poses: Floats = samples[newest, 1:]
+    # From the first on: a float of the seconds since 1970 is too coarse to find the pose of a step by.
+    times = 1e-9 * np.array([at - found[0][0] for at, _ in found])
+    if times[-1] > MOST_STEPS * step_seconds:
+        raise InputError(
+            "the poses are too far apart in time; was a clock set while they were recorded?",
+            path="BAG",
+            got=f"{times[-1]:g} s",
+            expected=f"at most {MOST_STEPS:,} steps of {step_seconds:g} s",
+        )
+    wanted = np.arange(0.0, times[-1] + 1e-9, step_seconds)
+    newest = np.searchsorted(times, wanted + 1e-9, side="right") - 1
+    poses: Floats = np.array([pose for _, pose in found])[newest]
     return poses
 
 
@@ -115,5 +128,12 @@ def told(shield: LocalShield, judged: Judged, step_seconds: float) -> Iterator[s
 
 def _planar(pose: Any) -> Pose:
     p, q = pose.position, pose.orientation
+    if abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1.0) > 1e-3:
+        raise InputError(
+            "the orientation of a pose is not a unit quaternion",
+            path="BAG",
+            got=[q.x, q.y, q.z, q.w],
+            expected="x, y, z, w with a length of 1",
+        )
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
     return p.x, p.y, yaw
