@@ -238,6 +238,15 @@ def test_a_drive_that_kept_the_rule_as_no_known_motion_does_is_no_failure(
     assert ended.value.exit_code == 0
 
 
+def test_what_is_taken_of_signals_is_said() -> None:
+    """A bag has none of them, so a rule that reads one is judged by what its policy begins with."""
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.2)
+    shield = LocalShield.make(grid, "G[0,3] (x > 1 and battery > 10)", signals={"battery": 90.0})
+    judged = drive.check_drive(shield, np.array([(3.0, 3.0, 0.0)] * 4))
+    assert judged.verdict.spec_status == "satisfied"
+    assert "taken for the whole drive: {'battery': 90.0}" in "\n".join(drive.told(shield, judged, 1.0))
+
+
 def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer, tmp_path: Path) -> None:
     import os
     import subprocess

@@ -110,6 +110,8 @@ def told(shield: LocalShield, judged: Judged, step_seconds: float) -> Iterator[s
     """What came of it, in lines for people."""
     yield f"rule: {shield.task.formula}"
     yield f"drive: {judged.steps} steps of {step_seconds:g} s"
+    if signals := shield.task.signals:
+        yield f"no signals are read from a bag; taken for the whole drive: {dict(sorted(signals.items()))}"
     status = judged.verdict.spec_status
     words = {"satisfied": "kept", "violated": "broken", "pending": f"open: {judged.left} steps are missing"}
     yield f"the rule is {words[status]}"
