@@ -70,7 +70,10 @@ def serve(calls: socket.socket) -> None:
         head = stream.read(LENGTH.size)
         if len(head) < LENGTH.size:
             return
-        call = stream.read(LENGTH.unpack(head)[0])
+        size = LENGTH.unpack(head)[0]
+        call = stream.read(size)
+        if len(call) < size:  # the server was killed while it wrote
+            return
         write(stream, (*_call(call), resident()))
 
 
