@@ -97,7 +97,7 @@ def test_a_session_is_created_under_an_id_of_our_own():
     )
 
 
-@pytest.mark.parametrize("ids", [{}, {"policy_id": "p", "policy_ids": ["q"]}])
+@pytest.mark.parametrize("ids", [{}, {"policy_id": "p", "policy_ids": ["q"]}, {"policy_ids": "case1"}])
 def test_exactly_one_way_to_name_policies(ids):
     error, sent, _ = drive(create(**{"policy_id": None, "policy_ids": None, **ids}))
     assert type(error) is errors.InputError

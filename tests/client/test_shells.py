@@ -122,20 +122,37 @@ def test_a_host_that_no_name_can_be_is_a_transport_error(use):
         use(NO_NAME, validate, timeout=60.0)
 
 
-@pytest.mark.parametrize("url", ["127.0.0.1:8000", "localhost", "http://", "ftp://robot", "http://a:b", ""])
+@pytest.mark.parametrize(
+    "url", ["127.0.0.1:8000", "localhost", "http://", "ftp://robot", "http://a:b", "", None]
+)
 def test_an_address_that_is_none_is_refused_at_once(use, url):
     with pytest.raises(errors.InputError) as caught:
         use(url, validate)
     assert (caught.value.path, caught.value.got) == ("base_url", url)
 
 
-@pytest.mark.parametrize("key", ["ключ", "abc\n", " abc", ""])
+@pytest.mark.parametrize("key", ["ключ", "abc\n", " abc", "", b"abc"])
 def test_a_key_that_cannot_be_sent_is_refused_at_once(use, key):
     handler, seen = failing()
     with pytest.raises(errors.InputError) as caught:
         use(handler, validate, api_key=key)
     assert caught.value.path == "api_key"
     assert seen == []
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, float("nan"), float("inf"), None, "5"])
+@pytest.mark.parametrize("client", [ShieldClient, AsyncShieldClient])
+def test_a_timeout_that_is_no_time_is_refused_at_once(client, timeout):
+    with pytest.raises(errors.InputError) as caught:
+        client("http://robot.test", timeout=timeout)
+    assert caught.value.path == "timeout"
+
+
+def test_a_timeout_may_be_longer_than_a_socket_takes():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        url = f"http://127.0.0.1:{server.getsockname()[1]}"
+    with ShieldClient(url, timeout=1e12) as client, pytest.raises(errors.TransportError, match="refused"):
+        validate(client)
 
 
 def test_a_closed_client_says_so():

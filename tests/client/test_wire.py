@@ -96,7 +96,9 @@ def test_float32_logits_keep_their_value():
     assert value == float(np.float32(0.1))
 
 
-@pytest.mark.parametrize("bad", [[0.0, math.nan], [0.0, math.inf], [0.0, "x"], [[0.0, 1.0]], 3.0])
+@pytest.mark.parametrize(
+    "bad", [[0.0, math.nan], [0.0, math.inf], [0.0, "x"], [[0.0, 1.0]], 3.0, {0: 5.0, 1: 7.0}, {0.0, 1.0}]
+)
 def test_bad_logits_are_refused_before_anything_is_sent(bad):
     with pytest.raises(errors.LogitsError) as caught:
         wire.logit_values(bad)
@@ -129,6 +131,11 @@ def test_bad_signals_name_the_signal(bad):
     with pytest.raises(errors.SampleError) as caught:
         wire.signal_values({"battery": bad})
     assert caught.value.path == "signals.battery"
+
+
+@pytest.mark.parametrize("seconds", [2, 2.0, np.float32(2.0), np.int64(2)])
+def test_seconds_may_be_any_real_number(seconds):
+    assert wire.seconds_value(seconds, "deadline") == 2.0
 
 
 def test_bodies_take_arrays_and_refuse_what_json_cannot_hold():

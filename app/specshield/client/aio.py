@@ -19,7 +19,7 @@ from specshield.client.resources import Maps, Policies, Sessions, Specs, perform
 from specshield.client.state import SessionState
 from specshield.client.stream import AsyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import Failure, Reply, Request
+from specshield.client.wire import Failure, Reply, Request, seconds_value
 
 
 class AsyncShieldClient:
@@ -34,7 +34,7 @@ class AsyncShieldClient:
         stream: bool = False,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        self._timeout = timeout
+        self._timeout = seconds_value(timeout, "timeout")
         url = address(base_url)
         self._http = httpx.AsyncClient(
             base_url=url, headers=headers(api_key), transport=transport or bounded.AsyncTransport(url)

@@ -124,7 +124,7 @@ class SessionState:
         again at pauses of 0.25 to 4 s, once, and steps in between cost nothing, those that say to stop too: a
         robot that stands asks again at its own pace.
         """
-        yield Within(None if deadline is None else wire.deadline_value(deadline))
+        yield Within(None if deadline is None else wire.seconds_value(deadline, "deadline"))
         x_t = wire.pose_values(pose)
         body: dict[str, Any] = {
             "logits": None if logits is None else wire.logit_values(logits),

@@ -18,7 +18,7 @@ from specshield.client.resources import Maps, Policies, Sessions, Specs, perform
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
 from specshield.client.transport import STALE, Exchange, address, check_open, headers
-from specshield.client.wire import Failure, Reply, Request
+from specshield.client.wire import Failure, Reply, Request, seconds_value
 
 
 class ShieldClient:
@@ -41,7 +41,7 @@ class ShieldClient:
         stream: bool = False,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        self._timeout = timeout
+        self._timeout = seconds_value(timeout, "timeout")
         url = address(base_url)
         self._http = httpx.Client(
             base_url=url, headers=headers(api_key), transport=transport or bounded.Transport(url)

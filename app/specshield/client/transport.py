@@ -24,7 +24,7 @@ def address(base_url: str) -> httpx.URL:
     """InputError unless it is the address of a server."""
     try:
         url = httpx.URL(base_url)
-    except httpx.InvalidURL:
+    except (httpx.InvalidURL, TypeError):  # TypeError: it is no text
         url = httpx.URL("")
     if url.scheme not in ("http", "https") or not url.host:
         raise InputError(
@@ -38,7 +38,8 @@ def address(base_url: str) -> httpx.URL:
 
 def headers(api_key: str | None) -> dict[str, str]:
     """InputError for a key that no header can carry."""
-    if api_key is not None and not re.fullmatch(r"[!-~]([ -~]*[!-~])?", api_key):
+    sendable = isinstance(api_key, str) and re.fullmatch(r"[!-~]([ -~]*[!-~])?", api_key)
+    if api_key is not None and not sendable:
         raise InputError(
             "the API key cannot be sent in a header",
             path="api_key",

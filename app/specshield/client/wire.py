@@ -6,9 +6,10 @@ import contextlib
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 from urllib.parse import quote
@@ -42,6 +43,7 @@ Numbers = Iterable[float] | Array
 Logits = Iterable[float | None] | Array
 Points = Iterable[Numbers] | Array
 TRIES = 5
+LONGEST = 1e6  # s; a socket takes no timeout of more than 2**31 ms
 Content = bytes | str | os.PathLike[str]
 
 
@@ -218,18 +220,20 @@ def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
     return values
 
 
-def deadline_value(deadline: float) -> float:
-    """InputError unless it is a positive number of seconds."""
-    if not (isinstance(deadline, int | float) and 0.0 < deadline < math.inf):
-        raise InputError(
-            "a deadline is a time in seconds", path="deadline", got=deadline, expected="a number above 0"
-        )
-    return float(deadline)
+def seconds_value(seconds: object, name: str) -> float:
+    """InputError unless it is a positive number of seconds; what is longer than any wait is `LONGEST`."""
+    value = float(seconds) if isinstance(seconds, Real) else math.nan
+    if not 0.0 < value < math.inf:
+        expected = "a number above 0"
+        raise InputError(f"a {name} is a time in seconds", path=name, got=seconds, expected=expected)
+    return min(value, LONGEST)
 
 
 def _floats(values: Any, error: type[InputError], where: str, expected: str) -> list[float]:
     """None is minus infinity, which only a logit may be."""
-    listed = values.tolist() if hasattr(values, "tolist") else [values] if isinstance(values, str) else values
+    listed = values.tolist() if hasattr(values, "tolist") else values
+    if isinstance(values, str | Mapping | Set):  # these could be gone through, but not as numbers in order
+        listed = [values]
     try:
         return [-math.inf if value is None else float(value) for value in listed]
     except (TypeError, ValueError, OverflowError) as cause:
