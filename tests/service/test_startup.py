@@ -5,6 +5,7 @@ import fcntl
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -102,9 +103,38 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
     assert re.search(r"INFO: +compiling the kernels: .* takes about \d+ s", server.log.read_text())
 
 
-def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path):
+@pytest.fixture
+def incomplete(tmp_path):
+    """The kernels of this checkout, without the word that none is left to be compiled."""
     kernels = tmp_path / "kernels"
-    shutil.copytree(compiled.BASE, kernels, ignore=shutil.ignore_patterns(f"{COMPLETE}-*"))
-    with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(kernels)):
-        wait_for(lambda: list(kernels.glob(f"{COMPLETE}-*[!k]")))
-    assert list(kernels.rglob("first_motions.plan_all-*.nbi"))
+    unfinished = "*.tmp.*"  # by another test
+    shutil.copytree(compiled.BASE, kernels, ignore=shutil.ignore_patterns(f"{COMPLETE}-*", unfinished))
+    return kernels
+
+
+def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path, incomplete):
+    for file in incomplete.rglob("first_motions.plan_all-*"):
+        file.unlink()
+    with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(incomplete)):
+        wait_for(lambda: list(incomplete.glob(f"{COMPLETE}-*[!k]")))
+    assert list(incomplete.rglob("first_motions.plan_all-*.nbi"))
+
+
+def test_a_server_told_to_stop_while_it_compiles_what_few_need_leaves_nothing_running(tmp_path, incomplete):
+    with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(incomplete)) as server:
+        wait_for(lambda: compiling(incomplete))
+        server.process.send_signal(signal.SIGTERM)
+        wait_for(lambda: server.process.poll() is not None)
+        wait_for(lambda: not compiling(incomplete))
+    assert "Traceback" not in server.log.read_text()
+
+
+def test_an_image_is_not_built_without_what_few_need(incomplete):
+    digest = compiled.mark(COMPLETE).name
+    (incomplete / f"{digest}.lock").mkdir()  # where a file has to be
+    command = [sys.executable, "-m", "specshield.service.startup"]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(incomplete)}
+    told = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert told.returncode == 1
+    assert "what few rules and robots need cannot be compiled: IsADirectoryError" in told.stderr
+    assert "Traceback" not in told.stderr

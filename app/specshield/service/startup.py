@@ -26,8 +26,8 @@ from specshield.cores import cores
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
-# The files of these names (`compiled.mark`) say that every kernel of a start is on the disk, and every other
-# that a decision may need.
+# The files of these names (`compiled.mark`) say that every kernel of a start is on the disk, and every one
+# that few need.
 READY, COMPLETE = "ready", "complete"
 KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 70  # [s] a first start on two quiet cores, which took 34 to 73: `make wheels` prints what it takes
@@ -114,17 +114,24 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         )
 
 
-async def complete(startup: Startup, at_once: int = 1) -> None:
+async def complete(startup: Startup, at_once: int = 1) -> bool:
     """Once the server is ready, compiles what few need, in so many processes: a decision that waits for a
-    compiler keeps all others waiting, for up to a minute.
+    compiler keeps all others waiting, for up to a minute. False where something was left out.
     """
     while not startup.ready:
         await asyncio.sleep(CHECK_EVERY)
-    mark = await asyncio.to_thread(compiled.mark, COMPLETE)
-    if mark is not None and not mark.exists():
+    try:
+        mark = await asyncio.to_thread(compiled.mark, COMPLETE)
+        if mark is None or mark.exists():
+            return True
         log.info("compiling what few rules and robots need, beside what is asked")
-        with contextlib.suppress(OSError):  # no room for another process
-            await _compile(startup, warmup.LATER, mark, at_once)
+        await _compile(startup, warmup.LATER, mark, at_once)
+        if mark.exists():
+            return True
+        log.warning("not all that few rules and robots need could be compiled: some will wait for the rest")
+    except Exception as error:  # no room for a file or another process, say
+        log.warning("what few rules and robots need cannot be compiled: %r", error)
+    return False
 
 
 async def _compile(startup: Startup, parts: Iterable[str], mark: Path, at_once: int) -> None:
@@ -183,8 +190,8 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     startup = Startup()
     asyncio.run(prepare(startup))
-    if startup.ready:
-        asyncio.run(complete(startup, cores()))
+    if startup.ready and not asyncio.run(complete(startup, cores())):
+        sys.exit("what few rules and robots need is not compiled")
     sys.exit(startup.failure)
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -152,6 +153,7 @@ def _hasten() -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     at_end_of_input(lambda: os._exit(1))  # the server is gone
     os.nice(19 if sys.argv[1] in LATER else 0)
     warm_up(sys.argv[1])
