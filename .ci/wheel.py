@@ -3,8 +3,9 @@ them in an empty folder.
 
     make wheels     # into dist/; prints how long starts and demos take, with kernels to compile and without
 
-One wheel fits any processor and Python, and its first start compiles. The other brings what a server
-compiles, the demo and a look-ahead. It fits this version of Python, on processors of this kind.
+One wheel fits any processor and Python, and its first start compiles. The other brings the
+kernels of a server, of the demo and of a look-ahead. It fits this version of Python, on processors of
+this kind.
 Raises CalledProcessError or AssertionError where something does not work.
 """
 
@@ -49,7 +50,7 @@ with ShieldClient(sys.argv[1], timeout=600.0) as client:
                 decision = session.step(pose, [random.gauss(0.0, 2.0) for _ in session.info.actions])
                 pose = decision.next_poses[decision.execute]
 print("ok")
-"""  # what is left to be compiled by the first who needs it, a look-ahead's kernels say
+"""  # compiles what is left to the first who needs it, such as a look-ahead's kernels
 
 
 def main() -> None:

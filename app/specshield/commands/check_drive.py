@@ -23,7 +23,7 @@ def check_drive(
 ) -> None:
     """Say whether a drive from a rosbag2 kept the rule of a policy, and from where it could not any more.
 
-    The exit status is 0 where the rule is kept or open, 1 where it is broken or no way was left to keep it.
+    The exit status is 1 where the rule is broken, or open and no way was left to keep it; else 0.
     """
     try:
         import rosbags  # noqa: F401
