@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -105,16 +106,16 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
 
 @pytest.fixture
 def incomplete(tmp_path):
-    """The kernels of this checkout, without the word that none is left to be compiled."""
+    """The kernels of this checkout, but one of a planner and the word that none is left to be compiled."""
     kernels = tmp_path / "kernels"
     unfinished = "*.tmp.*"  # by another test
     shutil.copytree(compiled.BASE, kernels, ignore=shutil.ignore_patterns(f"{COMPLETE}-*", unfinished))
+    for file in kernels.rglob("first_motions.plan_all-*"):
+        file.unlink()
     return kernels
 
 
 def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path, incomplete):
-    for file in incomplete.rglob("first_motions.plan_all-*"):
-        file.unlink()
     with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(incomplete)):
         wait_for(lambda: list(incomplete.glob(f"{COMPLETE}-*[!k]")))
     assert list(incomplete.rglob("first_motions.plan_all-*.nbi"))
@@ -138,3 +139,14 @@ def test_an_image_is_not_built_without_what_few_need(incomplete):
     assert told.returncode == 1
     assert "what few rules and robots need cannot be compiled: IsADirectoryError" in told.stderr
     assert "Traceback" not in told.stderr
+
+
+def test_a_disk_that_takes_no_kernel_is_not_taken_for_one_that_has_them_all(incomplete):
+    told = subprocess.run(
+        [sys.executable, "-m", "specshield.service.startup"],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(incomplete)}, capture_output=True, text=True, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (512, 512)),  # bytes of a file
+    )  # fmt: skip
+    assert told.returncode == 1
+    assert "the kernels cannot be kept: " in told.stderr
+    assert not list(incomplete.glob(f"{COMPLETE}-*[!k]"))

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from llvmlite.binding import ffi
+from numba.core.caching import IndexDataCacheFile
 from numba.core.compiler import Flags
 
 from specshield.policy.dqn.network import Network
@@ -152,8 +153,23 @@ def _hasten() -> None:
             flags.values = lambda flags: {**defaults, **flags._values}
 
 
+def _keep_all() -> None:
+    """From now on a kernel that the disk does not take ends this process: it compiles for the disk alone."""
+    files: Any = IndexDataCacheFile
+    save = files.save
+
+    def save_or_end(*kernel: Any) -> None:
+        try:
+            save(*kernel)
+        except OSError as error:
+            sys.exit(f"the kernels cannot be kept: {error}")
+
+    files.save = save_or_end
+
+
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     at_end_of_input(lambda: os._exit(1))  # the server is gone
     os.nice(19 if sys.argv[1] in LATER else 0)
+    _keep_all()
     warm_up(sys.argv[1])
