@@ -61,6 +61,9 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
                 app.command(command.__name__.removesuffix("_policy").replace("_", "-"))(command)
         app()
     except SpecshieldError as error:
+        from specshield.sim.progress import StatusLine
+
+        StatusLine().clear()  # where a command said what it was doing
         sys.exit(str(error))
     except OSError as error:
         if error.filename is None:  # else it is most likely a file or folder that the caller named

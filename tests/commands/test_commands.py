@@ -6,6 +6,7 @@ import re
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
 from typing import get_type_hints
@@ -57,8 +58,7 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
 def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
     (tmp_path / "flat.json").write_text('{"rooms?": []}')
     refused = command(
-        "policy", "--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 1", "--url", "http://127.0.0.1:9",
-        "--out", tmp_path,
+        "policy", "--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 1", "--out", tmp_path
     )  # fmt: skip
     assert refused.returncode == 1
     (line,) = refused.stderr.strip().splitlines()
@@ -90,6 +90,61 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp
     assert refused.returncode == 1
     assert refused.stderr.strip() == f"{tmp_path / 'file'} cannot be used: File exists"
     assert refused.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (("policy", "--map", "none.yaml", "--rule", "F[0,9] x > 1"), "--map: none.yaml cannot be read"),
+        (("run", "case1", "--target", "2.5"), "--target: not a place"),
+    ],
+)
+def test_a_wrong_argument_is_told_before_a_server_is_started(asked, said, tmp_path):
+    refused = command(*asked, "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    assert refused.returncode == 1
+    (line,) = refused.stderr.strip().splitlines()
+    assert line.startswith(said)
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize("asked", [("run", "case1"), ("policy", "--map", "case1", "--rule", "F[0,9] x > 1")])
+def test_a_server_of_its_own_that_does_not_come_up_is_told_without_a_traceback(asked, tmp_path):
+    (tmp_path / "file").touch()
+    failed = command(*asked, "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "file"))
+    assert failed.returncode == 1
+    assert failed.stderr.splitlines() == [
+        "starting the service ...",
+        "the server did not come up:",
+        f"SPECSHIELD_DATA_DIR cannot be used: File exists; got '{tmp_path}/file'; "
+        "expected a folder to write to",
+    ]
+
+
+def test_what_is_told_on_a_terminal_does_not_join_what_was_being_done(tmp_path):
+    outer, inner = os.openpty()
+    data = {**os.environ, "SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
+    asked = (
+        "policy",
+        "--map",
+        "case2",
+        "--rule",
+        "F[0,9] x > 1",
+        "--method",
+        "guess",
+        "--out",
+        str(tmp_path),
+    )
+    with subprocess.Popen(
+        [sys.executable, "-m", "specshield.cli", *asked], env=data, stdout=inner, stderr=inner
+    ):
+        os.close(inner)
+        told = b""
+        with suppress(OSError):  # that is how a terminal ends
+            while piece := os.read(outer, 1024):
+                told += piece
+    os.close(outer)
+    lines = [line.rpartition("\x1b[K")[2].rstrip() for line in told.decode().split("\n") if line]
+    assert [line[:14] for line in lines] == ["map     case2:", "rule    F[0,9]", "unknown method"]
 
 
 def test_no_help_has_a_word_in_brackets_which_would_be_taken_for_markup_and_not_be_shown():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -40,8 +41,9 @@ def policy(
     status = StatusLine()
     places = {} if regions is None else _read(regions, "--regions")
     machine = _read(Path(robot), "--robot") if Path(robot).suffix else robot  # else a preset's name
+    send = _map(map, assets)
     with client_of(url, status, worker=True) as client:
-        world = _map(client, map, assets)
+        world = send(client)
         spec = client.specs.validate(rule, places, map_id=world.id)
         wide, high = world.width * world.resolution, world.height * world.resolution
         size = f"{wide:.1f} x {high:.1f} m at {world.resolution:g} m"
@@ -62,7 +64,8 @@ def policy(
         picture = out / f"{called}.svg"
         picture.write_bytes(client.policies.image(made.id))
     print(f"picture {picture}")
-    print(f"next    specshield run {called}")
+    following = f"specshield run {called}" if url is None else f"a session of policy {called!r} at {url}"
+    print(f"next    {following}")
     raise typer.Exit(1 if made.metrics.get("feasible_start") == 0.0 else 0)  # 1: it can keep it from nowhere
 
 
@@ -73,8 +76,10 @@ def _show(status: StatusLine, found: Policy) -> None:
     status.say(f"{found.status}: {found.progress:4.0%}{left}")
 
 
-def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
-    """A file is sent; anything else is the id or the name of a map that the server has."""
+def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
+    """How the server comes to the map: a file is sent, which is read at once; anything else is the id or the
+    name of one that it has.
+    """
     path = Path(map)
     content = _read(path, "--map") if path.suffix else {}
     if assets is not None and "rooms" not in content:
@@ -82,7 +87,7 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
             "only a ProcTHOR house has furniture", path="--assets", got=str(assets), expected="no --assets"
         )
     if not path.suffix:
-        return client.maps.get(map)
+        return lambda client: client.maps.get(map)
     if path.suffix in (".yaml", ".yml"):
         image = path.parent / Path(str(content.get("image", ""))).name
         if not image.is_file():
@@ -92,12 +97,12 @@ def _map(client: ShieldClient, map: str, assets: Path | None) -> Map:
                 got=str(image),
                 expected="the map's PGM or PNG beside its YAML",
             )
-        return client.maps.upload(path, image)
+        return lambda client: client.maps.upload(path, image)
     if "rooms" in content:
         sizes = {} if assets is None else _read(assets, "--assets")
-        return client.maps.procthor(content, sizes)
+        return lambda client: client.maps.procthor(content, sizes)
     if "info" in content:
-        return client.maps.occupancy_grid(content["info"], content.get("data", []))
+        return lambda client: client.maps.occupancy_grid(content["info"], content.get("data", []))
     raise InputError(
         f"{path} is no map of a known form",
         path="--map",

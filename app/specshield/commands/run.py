@@ -30,6 +30,8 @@ def run_policy(
     from specshield.sim.progress import StatusLine
 
     out.mkdir(parents=True, exist_ok=True)
+    if target is not None:
+        _target(target)  # what is no place is refused before a server is started
     status = StatusLine()
     with client_of(None, status) as client:
         found = client.policies.get(policy)

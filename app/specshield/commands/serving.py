@@ -30,4 +30,5 @@ def client_of(url: str | None, status: StatusLine, worker: bool = False) -> Iter
     data, key = read_settings().data_dir, key or secrets.token_urlsafe()  # the folder may hold keys
     status.say("starting the service ...")
     with own_server(worker, status.say, data, key) as own, ShieldClient(own, key, timeout=PATIENCE) as client:
+        status.clear()
         yield client

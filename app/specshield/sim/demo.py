@@ -47,7 +47,8 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
             with contextlib.suppress(KeyboardInterrupt):
                 signal.pause()
         else:
-            print("The service has ended with the demo. To see the page: make demo ARGS=--open")
+            print("The service has ended with the demo. To see the page: specshield demo --open")
+            print("(in a clone: make demo ARGS=--open)")
     broken = [episode for campaign in campaigns for episode in campaign.broken]
     for episode in broken:
         where = f"{episode.case} from {episode.start}, seed {episode.seed}"

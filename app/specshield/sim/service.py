@@ -16,6 +16,8 @@ from pathlib import Path
 
 import httpx
 
+from specshield.errors import ServerError
+
 
 @contextmanager
 def own_server(
@@ -28,7 +30,7 @@ def own_server(
     address.
 
     worker: whether it makes policies too. say: is told how far the server is while it starts. key: one that
-    it takes beside those that `data` holds. Raises RuntimeError with the server's log where it does not come
+    it takes beside those that `data` holds. Raises ServerError with the server's log where it does not come
     up.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
@@ -89,7 +91,7 @@ def _wait_until_ready(
             return
         say(answer.json()["detail"])
         time.sleep(0.1)
-    raise RuntimeError(f"the server did not come up:\n{log.read_text(errors='replace')[-4000:]}")
+    raise ServerError(f"the server did not come up:\n{log.read_text(errors='replace')[-4000:].strip()}")
 
 
 def _free_port() -> int:
