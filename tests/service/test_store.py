@@ -17,7 +17,7 @@ from specshield.errors import StoreError
 from specshield.service.storage import keeper
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Change, Record, Store, keys
-from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
+from tests.service.world import LOGITS, ROBOT, START, ahead, grid_json, send_policy
 from tests.serving import children, runs, serving, wait_for
 
 
@@ -113,6 +113,21 @@ def test_a_folder_that_cannot_be_used_is_said_to_be(tmp_path):
     (tmp_path / "store").touch()
     with pytest.raises(StoreError, match=f"cannot be used: {tmp_path}/store: File exists"):
         EmbeddedStore(tmp_path).join()
+
+
+def test_any_name_of_a_folder_will_do(tmp_path):
+    """redis-py reads "%", "#" and "?" in a socket's address, and splits what a store says at " " and "="."""
+    folder = tmp_path / "a b=1%20#?é"
+    goal = {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}
+    with (
+        serving(folder, SPECSHIELD_WORKER="true") as server,
+        httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
+    ):
+        map_id = client.post("/v1/maps", json=grid_json()).json()["id"]
+        spec = {"formula": "F[0,6] Goal", "regions": {"Goal": goal}}
+        policy = client.post("/v1/policies", json={"map_id": map_id, "robot": ROBOT, "spec": spec}).json()
+        wait_for(lambda: client.get(f"/v1/policies/{policy['id']}").json()["status"] == "ready")
+        assert store_pid(folder)
 
 
 def test_a_path_too_long_for_a_socket_is_said_to_be(tmp_path):

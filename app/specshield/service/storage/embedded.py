@@ -16,6 +16,7 @@ import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.parse import quote
 
 from specshield.errors import StoreError
 from specshield.service.storage import keeper
@@ -42,7 +43,7 @@ class EmbeddedStore:
 
     @property
     def url(self) -> str:
-        return f"unix://{self.socket}"
+        return f"unix://{quote(str(self.socket))}"
 
     def join(self) -> None:
         """Blocks until the store answers: some 50 ms where it has to be started.

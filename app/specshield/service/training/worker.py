@@ -110,11 +110,14 @@ class _Worker(Worker):
     @reaching()
     def __init__(self, url: str, jobs: Jobs, methods: Sequence[str], others: Sequence[str]) -> None:
         self._training = [queue_of(method) for method in methods]
+        # Not that of `jobs`: rq waits for work longer than any answer of the store may take, and sets the
+        # time limit of these connections, before the first of them is made, to fit.
+        connection = connect_to_jobs(url, socket_timeout=None, socket_connect_timeout=CONNECT)
+        # rq asks for its own address; redis-py cannot read that of a unix socket whose path has " " or "=".
+        connection.set_response_callback("CLIENT INFO", lambda answer, **_: {"addr": "unknown"})
         super().__init__(
             [*self._training, *others],
-            # Not that of `jobs`: rq waits for work longer than any answer of the store may take, and sets the
-            # time limit of these connections, before the first of them is made, to fit.
-            connection=connect_to_jobs(url, socket_timeout=None, socket_connect_timeout=CONNECT),
+            connection=connection,
             serializer=JSONSerializer,
             work_horse_killed_handler=self._killed,
             worker_ttl=60,
