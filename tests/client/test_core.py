@@ -7,7 +7,7 @@ import pytest
 from client_script import SESSION, answer, drive, lost, problem
 
 from specshield import errors
-from specshield.client import calls, core
+from specshield.client import calls, core, events
 from specshield.client.models import Policy, SessionInfo
 from specshield.client.wire import Request, get, post
 
@@ -38,6 +38,14 @@ def test_tries_are_bounded_in_time():
     assert type(error) is errors.TransportTimeout
     assert len(sent) == 3
     assert error.details["seconds"] == pytest.approx(1.95)
+
+
+def test_who_listens_asks_again_for_two_minutes():
+    """As long as a server may take to come back on a busy machine, and never with long pauses."""
+    request = Request("GET", "/v1/sessions/s/events", tries=events.RESUMING, listens=True)
+    error, _, waits = drive(core.deliver(request), *[lost(0.0)] * 65)
+    assert type(error) is errors.TransportTimeout
+    assert waits == [0.05, 0.1, 0.2, 0.4, 0.8, 1.6] + [2.0] * 58  # 119.15 s
 
 
 @pytest.mark.parametrize(

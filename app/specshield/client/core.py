@@ -36,7 +36,9 @@ P = ParamSpec("P")
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 BACKOFF = 0.05  # s before the second try, doubled for each that follows
+LONGEST_WAIT = 2.0  # s before another try
 PATIENCE = 4  # timeouts after which no further try starts
+LISTENING = 120.0  # s after which none does to listen again: longer than a server takes to come back
 
 
 class Wait(NamedTuple):
@@ -95,8 +97,9 @@ def deliver(request: Request) -> Flow[Delivery]:
             wait = _asked_for(outcome)
         else:
             tries += 1
-            wait = BACKOFF * 2 ** (tries - 1)
-        late = seconds + wait > PATIENCE * outcome.timeout or wait >= outcome.left
+            wait = min(BACKOFF * 2 ** (tries - 1), LONGEST_WAIT)
+        patience = max(PATIENCE * outcome.timeout, LISTENING if request.listens else 0.0)
+        late = seconds + wait > patience or wait >= outcome.left
         passing = error is not None and not isinstance(error, TrainingUnavailable)  # it may go in a moment
         if not passing or tries == request.tries or late:
             if isinstance(outcome, Failure):

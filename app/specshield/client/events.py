@@ -20,7 +20,7 @@ from specshield.errors import ServerError
 
 SILENCE = 30.0  # s without a whole line; two of the server's heartbeats
 PAUSE = 1.0  # s before a lost connection is made again; the server asks for as much
-RESUMING = 9  # tries to make it again: 13 s where connections are refused
+RESUMING = 100  # tries to make it again: more than come within LISTENING
 
 
 class Events:

@@ -140,7 +140,7 @@ class Session(SessionState, Generic[D]):
 
         By default those after the last step that this session knows of. Each is what `step` gave, without its
         `timings`. Waits for the next one, as long as the server answers; ends with the session. A connection
-        that is lost is made again, without a gap and without doubles; where that fails for some 13 s, the
+        that is lost is made again, without a gap and without doubles; where that fails for two minutes, the
         error is raised, and `events(decision.t)` goes on later.
         """
         events = self._events(after)
