@@ -247,6 +247,13 @@ def test_what_is_taken_of_signals_is_said() -> None:
     assert "taken for the whole drive: {'battery': 90.0}" in "\n".join(drive.told(shield, judged, 1.0))
 
 
+@pytest.mark.parametrize("named", ["none", "", "inside.mcap"])
+def test_what_is_no_bag_is_said_to_be_none(named: str, tmp_path: Path) -> None:
+    (tmp_path / "inside.mcap").touch()
+    with pytest.raises(InputError, match=r"BAG: this is no bag; got '.*'; expected a rosbag2 folder"):
+        drive.read_drive(tmp_path / named, 0.4)
+
+
 def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer, tmp_path: Path) -> None:
     import os
     import subprocess

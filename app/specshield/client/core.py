@@ -131,8 +131,7 @@ def fetch(request: Request) -> Flow[Reply]:
 
 
 def call(request: Request) -> Flow[dict[str, Any]]:
-    delivery = yield from deliver(request)
-    return json_object(delivery.reply)
+    return json_object((yield from deliver(request)).reply)
 
 
 def erase(request: Request) -> Flow[None]:

@@ -43,6 +43,8 @@ def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floa
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    if not (bag / "metadata.yaml").is_file() and not (bag.suffix == ".bag" and bag.is_file()):
+        raise InputError("this is no bag", path="BAG", got=str(bag), expected="a rosbag2 folder or .bag file")
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
             known = [c for c in reader.connections if c.msgtype in POSES]

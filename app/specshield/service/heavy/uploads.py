@@ -100,8 +100,7 @@ def add_policy(settings: Settings, content_type: str, content: Content, key: Key
     for path, number in _numbers(card, "card"):
         if not math.isfinite(number):
             raise PolicyError("not a finite number", path=path, got=number, expected="a finite number")
-    policies = policies_of(settings)
-    return policies.add_card(describe(card), card, files["weights"], key, name)
+    return policies_of(settings).add_card(describe(card), card, files["weights"], key, name)
 
 
 def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
