@@ -21,6 +21,7 @@ from specshield.errors import (
     InfeasibleSwitch,
     InputError,
     NotFound,
+    PolicyError,
     SessionFinished,
 )
 from specshield.local import LocalShield
@@ -273,6 +274,15 @@ def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -
         pose = decisions[0].next_poses[decisions[0].execute]
     assert statuses == {"pending", "satisfied"}
     assert [item.signals["load"] for item in sessions[0].trajectory()][69:72] == [0.0, 3.0, 3.0]
+
+
+@pytest.mark.parametrize("card", [None, "", "[]", "{}", '{"robot": {}, "spec": []}'])
+def test_a_folder_without_a_policy_is_said_to_have_none(card: str | None, tmp_path: Path) -> None:
+    if card is not None:
+        (tmp_path / "card.json").write_text(card)
+    with pytest.raises(PolicyError, match="folder: no policy can be read there") as refused:
+        LocalShield.load(tmp_path)
+    assert refused.value.got == str(tmp_path)
 
 
 def test_what_is_wrong_is_said() -> None:

@@ -84,6 +84,17 @@ class LocalShield:
         The map is the one `.yaml` in the folder, with its image beside it. Raises PolicyError, MapError.
         """
         folder = Path(folder)
+        try:
+            card = json.loads((folder / "card.json").read_text())
+            robot, spec, formula = card["robot"], card["spec"], card["spec"]["formula"]
+            weights = (folder / "policy.safetensors").read_bytes()
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise PolicyError(
+                f"no policy can be read there: {error}",
+                path="folder",
+                got=str(folder),
+                expected="a folder with card.json, which has a robot and a spec, and policy.safetensors",
+            ) from None
         if world is None:
             found = sorted(folder.glob("*.yaml"))
             if len(found) != 1:
@@ -94,19 +105,9 @@ class LocalShield:
                     expected=f"one .yaml in {folder}, or a `world`",
                 )
             world = found[0]
-        try:
-            card = json.loads((folder / "card.json").read_text())
-            weights = (folder / "policy.safetensors").read_bytes()
-        except (OSError, ValueError) as error:
-            raise PolicyError(
-                f"no policy can be read there: {error}",
-                path="folder",
-                got=str(folder),
-                expected="a folder with card.json and policy.safetensors",
-            ) from None
         grid, rooms = _read_world(world)
-        robot, spec = robot_from_json(card["robot"]), card["spec"]
-        task = make_task(grid, robot, spec["formula"], spec.get("regions"), rooms, spec.get("signals"))
+        named = spec.get("regions"), rooms, spec.get("signals")
+        task = make_task(grid, robot_from_json(robot), formula, *named)
         return LocalShield(make_shield([load_policy(weights, card, task)]), card, weights)
 
     @staticmethod
