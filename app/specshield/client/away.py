@@ -30,8 +30,7 @@ def on_failure_value(value: str) -> OnFailure:
 def is_away(error: SpecshieldError) -> bool:
     """Whether the error says that the service cannot answer now, and nothing of what was asked."""
     status = error.details.get("status")
-    failed = isinstance(status, int) and status >= 500
-    return isinstance(error, TransportError | LimitReached) or failed
+    return isinstance(error, TransportError | LimitReached) or (isinstance(status, int) and status >= 500)
 
 
 @dataclass
