@@ -210,6 +210,7 @@ def test_a_bag_that_cannot_be_a_drive_is_refused_in_words(tmp_path: Path) -> Non
         ("cut", content[:-100], "the bag cannot be read"),  # a page of the table is not whole
         ("text", content.replace(kind, b"\xb9" + kind[1:]), "the bag cannot be read"),
         ("unset", content.replace(struct.pack("<d", 1.0), bytes(8)), "not a unit quaternion"),
+        ("nan", content.replace(struct.pack("<d", 1.0), struct.pack("<d", math.nan)), "not a unit quat"),
     ):
         folder = bag_of(tmp_path / name, [START] * 20, 1.0)
         (folder / f"{name}.db3").write_bytes(other)

@@ -132,7 +132,7 @@ def told(shield: LocalShield, judged: Judged, step_seconds: float) -> Iterator[s
 
 def _planar(pose: Any) -> Pose:
     p, q = pose.position, pose.orientation
-    if abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1.0) > 1e-3:
+    if not abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1.0) <= 1e-3:  # NaN is none either
         raise InputError(
             "the orientation of a pose is not a unit quaternion",
             path="BAG",
