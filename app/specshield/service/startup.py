@@ -4,7 +4,7 @@
 
 The first start of an installation compiles the kernels, in a process for each part, and they stay on the
 disk. Any later start takes them from there. Of several server processes one compiles, the others wait for it.
-What few rules and robots need is compiled once the server is ready, at the lowest priority.
+The kernels that only some rules and robots need are compiled once it is ready, at the lowest priority.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from specshield.cores import cores
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
 
-# The files of these names (`compiled.mark`) say that every kernel of a start is on the disk, and every one
-# that few need.
+# The file `ready` (`compiled.mark`) says that every kernel of a start is on the disk; `complete`, that those
+# are too which only some rules and robots need.
 READY, COMPLETE = "ready", "complete"
 KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 70  # [s] a first start on two quiet cores, which took 34 to 73: `make wheels` prints what it takes
@@ -115,8 +115,8 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
 
 
 async def complete(startup: Startup, at_once: int = 1) -> bool:
-    """Once the server is ready, compiles what few need, in so many processes: a decision that waits for a
-    compiler keeps all others waiting, for up to a minute. False where something was left out.
+    """Once the server is ready, compiles what only some rules and robots need, in `at_once` processes. Their
+    first decision would else compile it, while all others wait. False where something was left out.
     """
     while not startup.ready:
         await asyncio.sleep(CHECK_EVERY)
@@ -124,13 +124,13 @@ async def complete(startup: Startup, at_once: int = 1) -> bool:
         mark = await asyncio.to_thread(compiled.mark, COMPLETE)
         if mark is None or mark.exists():
             return True
-        log.info("compiling what few rules and robots need, beside what is asked")
+        log.info("compiling, in the background, the kernels that only some rules and robots need")
         await _compile(startup, warmup.LATER, mark, at_once)
         if mark.exists():
             return True
-        log.warning("not all that few rules and robots need could be compiled: some will wait for the rest")
+        log.warning("some kernels are not compiled: the first decision that needs one will wait for it")
     except Exception as error:  # no room for a file or another process, say
-        log.warning("what few rules and robots need cannot be compiled: %r", error)
+        log.warning("the other kernels cannot be compiled now: %r", error)
     return False
 
 
@@ -191,7 +191,7 @@ def main() -> None:
     startup = Startup()
     asyncio.run(prepare(startup))
     if startup.ready and not asyncio.run(complete(startup, cores())):
-        sys.exit("what few rules and robots need is not compiled")
+        sys.exit("some kernels are not compiled; the lines above say why")
     sys.exit(startup.failure)
 
 

@@ -2,9 +2,9 @@
 
     python -m specshield.service.warmup PART     # compiles one part, for `startup`; the disk keeps it
 
-The parts have few kernels in common, so that two processes can compile them side by side. What few rules and
-robots need is compiled once the server is ready, so that no decision of theirs waits for it; what only a
-look-ahead session needs, when the first of them is made.
+The parts have few kernels in common, so that two processes can compile them side by side. What only some
+rules and robots need is compiled once the server is ready, so that no decision of theirs waits for it. What a
+look-ahead session needs is compiled when the first of them is made.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _plan(task: Task) -> None:
 
 
 PARTS: dict[str, Callable[[Task], None]] = {"reachability": _propose, "shield and dqn": _decide}
-LATER: dict[str, Callable[[Task], None]] = {"what few need": _decide_rarely, "planner": _plan}
+LATER: dict[str, Callable[[Task], None]] = {"rarer decisions": _decide_rarely, "planner": _plan}
 
 
 def _task(**regions: dict[str, Any]) -> Task:
