@@ -239,8 +239,9 @@ def _check_address(host: str, port: int) -> None:
     try:
         socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:
+        reason = str(error.strerror).partition(" (")[0]  # which Python follows with the address as a tuple
         raise InputError(
-            f"the server cannot listen on {host} at port {port}: {error.strerror}",
+            f"the server cannot listen on {host} at port {port}: {reason}",
             expected="an address of this machine and a free port; --port 0 takes any that is free",
         ) from None
 

@@ -104,6 +104,18 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
         ),
         (
             "serve",
+            {"SPECSHIELD_MODELS_DIR": "{folder}/none"},
+            "SPECSHIELD_MODELS_DIR is not valid: '",
+            "a folder that is there",
+        ),
+        (
+            "worker",
+            {"SPECSHIELD_MAPS_DIR": "{folder}/file"},
+            "SPECSHIELD_MAPS_DIR is not valid: '",
+            "a folder that is there",
+        ),
+        (
+            "serve",
             {"SPECSHIELD_DATA_DIR": "{folder}/" + "x" * 90},
             "data folder's path is too long",
             "87 bytes",
@@ -174,5 +186,5 @@ def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):
         )
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
-    assert line.startswith(f"the server cannot listen on 127.0.0.1 at port {port}: Address already in use")
+    assert line.startswith(f"the server cannot listen on 127.0.0.1 at port {port}: Address already in use;")
     assert "--port 0" in line

@@ -86,6 +86,7 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
 def test_what_one_server_keeps_behind_a_url_another_finds_and_loads_from_its_own_copy(tmp_path):
     def settings(name: str) -> Settings:
         nothing = tmp_path / "nothing"
+        nothing.mkdir(exist_ok=True)
         return Settings(
             data_dir=tmp_path / name,
             data_url=f"memory://{tmp_path.name}",
@@ -110,6 +111,7 @@ def test_what_one_server_keeps_behind_a_url_another_finds_and_loads_from_its_own
 def test_a_copy_that_several_fetch_at_once_is_whole(tmp_path):
     def folders(name: str) -> Path:
         nothing = tmp_path / "nothing"
+        nothing.mkdir(exist_ok=True)
         settings = {"data_url": f"memory://{tmp_path.name}", "maps_dir": nothing, "models_dir": nothing}
         return files.kept(Settings(data_dir=tmp_path / name, **settings), "policies")
 

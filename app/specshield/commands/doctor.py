@@ -61,7 +61,7 @@ def _checks(url: str | None, port: int) -> Iterator[Callable[[], Iterator[Findin
         invalid = Finding("wrong", str(error))
         yield lambda: iter([invalid])
     else:
-        yield from (partial(check, settings) for check in (_disk, _files, _store))
+        yield from (partial(check, settings) for check in (_disk, _store))
     yield partial(_port, port) if url is None else partial(_server, url)
 
 
@@ -144,12 +144,6 @@ def _disk(settings: Settings) -> Iterator[Finding]:
         yield Finding("ok", f"data folder {there.absolute()}, {free >> 30} GiB free")
 
 
-def _files(settings: Settings) -> Iterator[Finding]:
-    for name, folder in (("MAPS", settings.maps_dir), ("MODELS", settings.models_dir)):
-        if not folder.is_dir():
-            yield Finding("wrong", f"there is no folder {folder}", f"mend SPECSHIELD_{name}_DIR, or unset it")
-
-
 def _store(settings: Settings) -> Iterator[Finding]:
     from specshield.service.storage.connect import connect
     from specshield.service.storage.embedded import EmbeddedStore
@@ -184,7 +178,7 @@ def _port(port: int) -> Iterator[Finding]:
     except OSError as error:
         yield Finding(
             "note",
-            f"port {port} is taken: {error.strerror}",
+            f"port {port} cannot be served on: {str(error.strerror).partition(' (')[0]}",
             f"a server may run there already: specshield doctor --url http://127.0.0.1:{port}; "
             "or serve elsewhere, by --port",
         )

@@ -149,6 +149,13 @@ class Settings(BaseSettings):
         600, ge=1, description="Longest run of a method that computes its policies [s]."
     )
 
+    @field_validator("models_dir", "maps_dir")
+    @classmethod
+    def _is_there(cls, folder: Path) -> Path:
+        if not folder.is_dir():
+            raise ValueError("a folder that is there, or the variable not set")
+        return folder
+
     @field_validator("redis_url")
     @classmethod
     def _is_a_store(cls, url: str | None) -> str | None:
