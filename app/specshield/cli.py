@@ -31,6 +31,8 @@ This command needs the server's parts: pip install 'specshield[server]'
 What is installed here is the client, for Python: from specshield.client import ShieldClient"""
 
 NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
+NEEDS_RECORDINGS = "This command needs {}, which is not installed: pip install 'specshield[recordings]'"
+RECORDING_PARTS = ("foxglove", "pyarrow", "rerun", "rosbags")
 
 
 def main() -> None:
@@ -70,14 +72,14 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
             raise
         sys.exit(f"{error.filename} cannot be used: {error.strerror}")
     except ModuleNotFoundError as error:
-        missing = (error.name or "").split(".")[0]
-        if missing == "torch":
-            sys.exit(NEEDS_TORCH)
         from specshield.commands.doctor import SERVER_PARTS
 
-        if missing in SERVER_PARTS:
-            sys.exit(NEEDS_SERVER)
-        raise
+        needs = {"torch": NEEDS_TORCH, **dict.fromkeys(RECORDING_PARTS, NEEDS_RECORDINGS)}
+        needs |= dict.fromkeys(SERVER_PARTS, NEEDS_SERVER)
+        missing = (error.name or "").split(".")[0]
+        if missing not in needs:
+            raise
+        sys.exit(needs[missing].format(missing))
 
 
 def _commands() -> Iterator[Callable[..., None]]:
@@ -225,7 +227,7 @@ def train(
     seed: Annotated[int, typer.Option(help="Decides everything random.", min=0)] = 0,
     updates: Annotated[int | None, typer.Option(help="Updates of the network.", min=1)] = None,
     option: Annotated[list[str] | None, typer.Option(help="A setting, as units=128; repeatable.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write to; by default in models/.")] = None,
+    out: Annotated[Path | None, typer.Option(help="By default a folder of models/ that has none.")] = None,
     resume: Annotated[bool, typer.Option(help="Take up a run that was killed.")] = False,
 ) -> None:
     """Make a policy for a case. Learning shows how far it is and how often the rule is satisfied."""

@@ -19,6 +19,7 @@ from specshield import cli
 from specshield.client import ShieldClient
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
+from specshield.shipped import MODELS
 from tests.serving import serving
 
 
@@ -34,12 +35,12 @@ def command(*arguments, **environment):
 
 def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
     info, data = occupancy(HOUSE)
-    (tmp_path / "flat.json").write_text(json.dumps({"info": info, "data": data}))
+    (tmp_path / "flat").write_text(json.dumps({"info": info, "data": data}))  # a name needs no ending
     (tmp_path / "places.yaml").write_text(yaml.safe_dump(REGIONS))
     (tmp_path / "cart.yaml").write_text(yaml.safe_dump(ROBOT))
     own = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
     assert command("keys", "create", "alice", **own).returncode == 0  # from now on its servers ask for one
-    files = ("--map", tmp_path / "flat.json", "--regions", tmp_path / "places.yaml")
+    files = ("--map", tmp_path / "flat", "--regions", tmp_path / "places.yaml")
     asked = (*files, "--robot", tmp_path / "cart.yaml", "--rule", RULE, "--name", "flat", "--out", tmp_path)
     made = command("policy", *asked, **own)
     assert made.returncode == 0, made.stderr
@@ -53,6 +54,16 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
     refused = command("run", "flat", "--target=-1,-1", "--out", tmp_path, **own)
     said = "--target: no robot can stand there; got '-1,-1'; expected a free place"
     assert refused.stderr.splitlines()[-1] == said
+
+
+def test_a_policy_that_came_with_the_project_is_not_replaced_unasked():
+    refused = command("train", "--case", 2)
+    assert refused.returncode == 1
+    (line,) = refused.stderr.splitlines()
+    assert line == (
+        f"--out: {MODELS / 'case2'} holds a policy already; "
+        f"expected a folder to write to; --out {MODELS / 'case2'} replaces that policy"
+    )
 
 
 def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):

@@ -296,6 +296,13 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
     )
     (line,) = refused.stderr.splitlines()
     assert "nowhere/a.csv cannot be written: No such file or directory" in line
+    (tmp_path / "README.md").write_text("# no record\n")
+    refused = subprocess.run(
+        [sys.executable, "-m", "specshield.cli", "export", "README.md", "--to", "csv"],
+        cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith("the file is no record of a session, or not all of one; expected what GET /v1/")
     bag_of(tmp_path / "bag", [START] * 70, 1.0)
     words = ["check-drive", "bag", "--policy", "case1", "--step-seconds", "1"]
     refused = subprocess.run(

@@ -96,6 +96,10 @@ def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
             timeout=HUNG,
         )  # fmt: skip
 
+    assert keys("list").stderr == "there are no keys\n"
+    for endless in ("inf", "nan"):
+        refused = keys("create", "carol", "--requests", endless)
+        assert (refused.returncode, "--requests" in refused.stderr) == (2, True)
     made = keys("create", "carol", "--requests", "7.5", "--sessions", "3", "--bytes", f"1{400 * '0'}")
     secret = made.stdout.strip()
     assert len(secret) > 40, made.stderr
@@ -107,7 +111,7 @@ def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
         assert "carol" in listed
         assert "7.5 requests a second, 3 sessions, 10,000,000" in listed
         assert secret not in listed
-        assert keys("revoke", "carol").returncode == 0
+        assert keys("revoke", "carol").stdout == "the key carol is revoked\n"
         wait_for(lambda: client.get("/v1/sessions").status_code == 401)
     assert "carol" not in keys("list").stdout
     again = keys("revoke", "carol")

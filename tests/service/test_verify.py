@@ -96,7 +96,9 @@ def test_bytes_left_out_doubled_or_added_are_found(case1, data):
 
 @given(st.binary(max_size=300))
 def test_what_is_no_record_is_refused(content):
-    with pytest.raises(InputError):
+    with pytest.raises(
+        InputError, match=r"no record of a session.*; expected what GET /v1/sessions/\{id\}/rec"
+    ):
         chain.read(content)
 
 

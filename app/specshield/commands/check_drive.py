@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-from specshield.errors import InputError
-
 
 def check_drive(
     bag: Annotated[Path, typer.Argument(help="A rosbag2: its folder.", show_default=False)],
@@ -25,19 +23,12 @@ def check_drive(
 
     The exit status is 1 where the rule is broken, or open and no way was left to keep it; else 0.
     """
-    try:
-        import rosbags  # noqa: F401
-    except ModuleNotFoundError:
-        raise InputError(
-            "reading bags needs rosbags, which is not installed",
-            expected="pip install 'specshield[recordings]'",
-        ) from None
     from specshield.local import LocalShield
     from specshield.recordings import drive
 
-    folder = Path(policy)
+    folder, driven = Path(policy), drive.read_drive(bag, step_seconds, topic)
     shield = LocalShield.load(folder) if (folder / "card.json").is_file() else LocalShield.shipped(policy)
-    judged = drive.check_drive(shield, drive.read_drive(bag, step_seconds, topic))
+    judged = drive.check_drive(shield, driven)
     for line in drive.told(shield, judged, step_seconds):
         typer.echo(line)
     raise typer.Exit(1 if judged.lost is not None and judged.verdict.spec_status != "satisfied" else 0)

@@ -69,11 +69,4 @@ def export(
             got=str(path),
             expected="a file in a folder that is there",
         ) from None
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{to} needs {error.name}, which is not installed",
-            path="--to",
-            got=to,
-            expected="pip install 'specshield[recordings]'",
-        ) from None
     typer.echo(f"{path}: {len(recording.items)} steps")

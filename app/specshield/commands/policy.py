@@ -81,14 +81,15 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
     name of one that it has.
     """
     path = Path(map)
-    content = _read(path, "--map") if path.suffix else {}
+    a_file = path.suffix or path.is_file()
+    content = _read(path, "--map") if a_file else {}
     if assets is not None and "rooms" not in content:
         raise InputError(
             "only a ProcTHOR house has furniture", path="--assets", got=str(assets), expected="no --assets"
         )
-    if not path.suffix:
+    if not a_file:
         return lambda client: client.maps.get(map)
-    if path.suffix in (".yaml", ".yml"):
+    if path.suffix in (".yaml", ".yml") or "image" in content:
         image = path.parent / Path(str(content.get("image", ""))).name
         if not image.is_file():
             raise InputError(

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from specshield.errors import InputError
 from specshield.policy.methods import DEFAULT, METHODS, Run
 from specshield.policy.options import read_options
 from specshield.policy.tensors import replace_file
@@ -26,7 +27,8 @@ def train(
     out: Path | None,
     resume: bool,
 ) -> None:
-    """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`.
+    """Makes pi_phi for a case and writes policy.safetensors and card.json to `out`; by default to a folder of
+    models/, unless that holds a policy.
 
     options: "name=value", of the method's options. A method that saves how far it is does so in
     `out`/checkpoint; `resume` goes on from there after a kill.
@@ -34,7 +36,11 @@ def train(
     began, made_by, loaded = time.monotonic(), METHODS.get(method), load_case(case)
     given = _parse(options) | ({} if updates is None else {"updates": updates})
     chosen = read_options(made_by.options, given)
-    out = out or MODELS / (loaded.name if method == DEFAULT else f"{loaded.name}-{method}")
+    own = MODELS / (loaded.name if method == DEFAULT else f"{loaded.name}-{method}")
+    if out is None and (own / "policy.safetensors").exists():
+        expected = f"a folder to write to; --out {own} replaces that policy"
+        raise InputError(f"{own} holds a policy already", path="--out", expected=expected)
+    out = out or own
     checkpoint, status = out / "checkpoint", StatusLine()
     if not resume:
         shutil.rmtree(checkpoint, ignore_errors=True)

@@ -24,7 +24,7 @@ Name = Annotated[str, typer.Argument(help="Whose key it is: what was made with i
 def create(
     name: Name,
     requests: Annotated[
-        float | None, typer.Option(help="Most requests a second, steps counted apart.", min=0.1)
+        float | None, typer.Option(help="Most requests a second, steps counted apart.", min=0.1, max=1e9)
     ] = None,
     sessions: Annotated[int | None, typer.Option(help="Most sessions kept.", min=0)] = None,
     bytes: Annotated[int | None, typer.Option(help="Most bytes of maps and policies kept.", min=0)] = None,
@@ -36,7 +36,10 @@ def create(
 @app.command("list")
 def show() -> None:
     """The names of the keys, with their limits."""
-    for key in on_keys(lambda keys: keys.listed()):
+    listed = on_keys(lambda keys: keys.listed())
+    if not listed:
+        typer.echo("there are no keys", err=True)
+    for key in listed:
         limits = {"requests a second": key.requests, "sessions": key.sessions, "bytes": key.bytes}
         told = ", ".join(f"{limit:,} {what}" for what, limit in limits.items() if limit is not None)
         print(f"{key.name}  made {key.created_at}  {told or 'no limits'}")
@@ -46,6 +49,7 @@ def show() -> None:
 def revoke(name: Name) -> None:
     """Take a key back: servers refuse it within 2 s. What was made with it stays."""
     on_keys(lambda keys: keys.revoke(name))
+    print(f"the key {name} is revoked")
 
 
 def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = None) -> R:

@@ -20,6 +20,7 @@ from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.rules import added
 
 FORMAT: Literal["specshield-record-1"] = "specshield-record-1"
+WHERE = "what GET /v1/sessions/{id}/record answers, or `save_record` of the SDK writes"
 LARGEST = 256 << 20  # [bytes]; a session of 10,000 steps takes about 7 MB
 MEDIA_TYPE = "application/vnd.specshield.record"
 
@@ -115,8 +116,8 @@ def read(content: bytes) -> Chain:
         file = msgspec.msgpack.decode(content, type=_File)
         lines = file.config.split(b"\n")
         configs = [msgspec.json.decode(line, type=Config) for line in lines]
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise _broken(None, f"the file is not a session's record: {error}", FORMAT) from None
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        raise _broken(None, "the file is no record of a session, or not all of one", WHERE) from None
     if msgspec.msgpack.encode(file) != content:
         raise _broken(None, "the file is not written as a server writes it", "every byte as it was")
     names = _names(configs)
