@@ -30,9 +30,7 @@ NEEDS_SERVER = """\
 This command needs the server's parts: pip install 'specshield[server]'
 What is installed here is the client, for Python: from specshield.client import ShieldClient"""
 
-NEEDS_TORCH = "This command needs torch: pip install 'specshield[train]'"
-NEEDS_RECORDINGS = "This command needs {}, which is not installed: pip install 'specshield[recordings]'"
-RECORDING_PARTS = ("foxglove", "pyarrow", "rerun", "rosbags")
+EXTRAS = {"torch": "train", **dict.fromkeys(("foxglove", "pyarrow", "rerun", "rosbags"), "recordings")}
 
 
 def main() -> None:
@@ -74,12 +72,12 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
     except ModuleNotFoundError as error:
         from specshield.commands.doctor import SERVER_PARTS
 
-        needs = {"torch": NEEDS_TORCH, **dict.fromkeys(RECORDING_PARTS, NEEDS_RECORDINGS)}
-        needs |= dict.fromkeys(SERVER_PARTS, NEEDS_SERVER)
         missing = (error.name or "").split(".")[0]
-        if missing not in needs:
-            raise
-        sys.exit(needs[missing].format(missing))
+        if missing in SERVER_PARTS:
+            sys.exit(NEEDS_SERVER)
+        if missing in EXTRAS:
+            sys.exit(f"This command needs {missing}: pip install 'specshield[{EXTRAS[missing]}]'")
+        raise
 
 
 def _commands() -> Iterator[Callable[..., None]]:

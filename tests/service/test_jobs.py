@@ -12,10 +12,11 @@ from rq.exceptions import DequeueTimeout
 
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs
 from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
-from tests.serving import children, command_line, serving, wait_for
+from tests.serving import children, command_line, free_port, serving, wait_for
 
 pytest.importorskip("torch")
 
@@ -203,6 +204,29 @@ def test_nothing_trains_on_without_its_server(tmp_path):
     with serving(tmp_path) as server:  # no worker this time
         found = httpx.get(f"{server.url}/v1/policies/{policy['id']}", timeout=None).json()
         assert found["status"] == "queued"  # the worker, told to stop, handed it back
+
+
+def test_what_nobody_makes_says_so_and_a_worker_that_dies_as_it_starts_is_not_offered(tmp_path):
+    store = EmbeddedStore(tmp_path)
+    store.join()
+    try:
+        jobs = Jobs(store.url, Settings(data_dir=tmp_path))
+        jobs.start("a" * 64, "planner")
+        waiting = jobs.get("a" * 64)
+        assert (waiting.status, "none is running" in waiting.error) == ("queued", True)
+        jobs.worker_lives(["planner"])
+        assert jobs.get("a" * 64).error is None
+    finally:
+        store.leave()
+    away = Settings(data_dir=tmp_path / "data", REDIS_URL=f"redis://127.0.0.1:{free_port()}")
+    worker = TrainingWorker(away)
+    worker.ensure()
+    assert "planner" in worker.methods  # until its first sign of life nobody knows better
+    wait_for(lambda: not worker.methods)
+    worker.ensure()
+    assert worker._alive
+    assert worker.methods == []
+    worker.stop()
 
 
 def test_a_worker_waits_for_work_longer_than_the_store_may_take_to_answer(tmp_path):

@@ -45,8 +45,8 @@ class Map:
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy pi_phi: `progress` in [0, 1], `eta_s` the estimated time left [s], `error` why it failed,
-    `warnings` what there is to know of one that is ready, such as a rule that no start can keep.
+    """A policy pi_phi: `progress` in [0, 1], `eta_s` the estimated time left [s], `error` why it failed
+    or waits, `warnings` what there is to know of one that is ready, such as a rule that no start can keep.
     """
 
     id: str

@@ -125,33 +125,26 @@ def path(*segments: str) -> str:
 
 def encode(body: Mapping[str, Any]) -> bytes:
     """JSON; arrays become lists. InputError for what JSON cannot hold (NaN, infinity, other objects)."""
+    members, name = list[str](), "body"
     try:
-        return _json(body)
+        for name, value in body.items():
+            members.append(_json({name: value})[1:-1])
     except (TypeError, ValueError, RecursionError) as error:
-        name = next((name for name, value in body.items() if not _is_json(value)), "body")
         raise InputError(
             f"{name}: cannot be sent as JSON: {error}",
             path=name,
             expected="finite numbers, texts, lists and objects of them",
         ) from error
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(value, allow_nan=False, separators=(",", ":"), default=_listed).encode()
-
-
-def _is_json(value: Any) -> bool:
-    try:
-        _json(value)
-    except (TypeError, ValueError, RecursionError):
-        return False
-    return True
+    return f"{{{','.join(members)}}}".encode()
 
 
 def _listed(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is not JSON")
+
+
+_json = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=_listed).encode
 
 
 def content(source: Content, where: str) -> bytes:

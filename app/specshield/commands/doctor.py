@@ -118,7 +118,7 @@ def _kernels() -> Iterator[Finding]:
     else:
         yield Finding(
             "note",
-            f"the first start will compile the kernels, for about {TAKES} s on two cores",
+            f"the next start compiles the kernels that are missing; all of them take {TAKES} s on two cores",
             "python -m specshield.service.startup does so now",
         )
 

@@ -73,7 +73,7 @@ def _show(status: StatusLine, found: Policy) -> None:
     from specshield.sim.progress import duration
 
     left = "" if found.eta_s is None else f", about {duration(found.eta_s)} left"
-    status.say(f"{found.status}: {found.progress:4.0%}{left}")
+    status.say(f"{found.status}: {found.error or f'{found.progress:4.0%}{left}'}")
 
 
 def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:

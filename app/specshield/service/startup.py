@@ -43,14 +43,14 @@ log = logging.getLogger("specshield")
 class Startup:
     """How far a server has come.
 
-    failure: why it will not be ready. before: the kernels on the disk when compiling began; None where none
-    has to be compiled. parts: those compiled since. stopping: whether it has been told to stop.
+    failure: why it will not be ready. compiling: whether kernels may be missing on the disk. parts: those
+    that were gone through since. stopping: whether it has been told to stop.
     """
 
     ready: bool = False
     stopping: bool = False
     failure: str | None = None
-    before: int | None = None
+    compiling: bool = False
     parts: list[str] = field(default_factory=list)
 
     def problem(self) -> SpecshieldError | None:
@@ -62,19 +62,20 @@ class Startup:
         if self.failure is not None:
             return ServerError(self.failure)
         expected = "a server that is ready: ask again, or wait until /readyz answers 200"
-        if self.before is None:
+        if not self.compiling:
             return Starting("the server is starting", expected=expected)
         return Starting(
-            f"the server is starting: it has compiled {self.compiled()} of about {KERNELS} kernels, which "
-            f"takes about {TAKES} s at the first start of an installation",
+            f"the server is starting: {on_disk()} of about {KERNELS} kernels are compiled; all of them, at "
+            f"the first start of an installation, take about {TAKES} s",
             expected=expected,
-            kernels={"compiled": self.compiled(), "expected": KERNELS},
+            kernels={"compiled": on_disk(), "expected": KERNELS},
             parts={part: "done" if part in self.parts else "compiling" for part in warmup.PARTS},
         )
 
-    def compiled(self) -> int:
-        """The kernels that were compiled since the start."""
-        return min(max(compiled.on_disk() - (self.before or 0), 0), KERNELS)
+
+def on_disk() -> int:
+    """Of the kernels that a start needs, as many as there are: by this start, or by one before it."""
+    return min(compiled.on_disk(), KERNELS)
 
 
 async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
@@ -87,8 +88,8 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
     try:
         mark = compiled.mark(READY)
         if mark is not None and not mark.exists():
-            startup.before = compiled.on_disk()
-            telling = asyncio.create_task(_tell(startup))
+            startup.compiling = True
+            telling = asyncio.create_task(_tell())
             try:
                 await _compile(startup, warmup.PARTS, mark, cores())
             finally:
@@ -160,15 +161,15 @@ async def _compile_part(part: str, startup: Startup, free: asyncio.Semaphore) ->
     return done
 
 
-async def _tell(startup: Startup) -> None:
+async def _tell() -> None:
     log.info(
-        "compiling the kernels: the first start of an installation takes about %d s on two cores, and longer "
-        "where others use them too",
+        "compiling the kernels that are not on the disk: all of them, at the first start of an installation, "
+        "take about %d s on two cores, and longer where others use them too",
         TAKES,
     )
     while True:
         await asyncio.sleep(TELL_EVERY)
-        log.info("compiled %d of about %d kernels", startup.compiled(), KERNELS)
+        log.info("%d of about %d kernels are compiled", on_disk(), KERNELS)
 
 
 @asynccontextmanager

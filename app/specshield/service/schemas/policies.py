@@ -68,7 +68,7 @@ class PolicyResponse(Answer):
     status: Literal["queued", "training", "ready", "failed"] = Field(description="Sessions need `ready`.")
     progress: float = Field(description="0 to 1.")
     eta_s: float | None = Field(description="Estimate of the time left [s]; null where there is none.")
-    error: str | None = Field(description="Why it failed.")
+    error: str | None = Field(description="Why it failed, or is not begun.")
     metrics: dict[str, JsonValue] = Field(description="What was measured, such as the rate of satisfaction.")
     warnings: list[str] = Field(
         description="What there is to know of a policy that is ready, such as a rule that no start can keep."

@@ -33,7 +33,9 @@ class TrainingWorker:
 
     @property
     def methods(self) -> list[str]:
-        """Those that the worker makes policies by; none where it is another server's, or has died."""
+        """Those that the worker makes policies by. None where it is another server's, or follows one that has
+        died: its signs of life say whether it came up.
+        """
         return self._methods if self._alive else []
 
     @property
@@ -48,6 +50,7 @@ class TrainingWorker:
         lock = os.open(self._settings.data_dir / "worker.lock", os.O_RDWR | os.O_CREAT, 0o600)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._methods = available() if self._process is None else []
             # It ends when this process does: its standard input is a pipe from here.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "worker", "--until-eof"],
@@ -56,7 +59,6 @@ class TrainingWorker:
                 pass_fds=[lock],
                 start_new_session=True,
             )
-            self._methods = available()
         except BlockingIOError:
             pass
         finally:

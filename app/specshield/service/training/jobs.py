@@ -32,7 +32,9 @@ return 1
 
 @dataclass(frozen=True)
 class Training:
-    """How a run stands. status: queued, training or failed. eta_s: estimate of the time left [s]."""
+    """How a run stands. status: queued, training or failed. eta_s: estimate of the time left [s]. error: why
+    it failed, or waits.
+    """
 
     status: str
     progress: float = 0.0
@@ -64,7 +66,7 @@ class Jobs:
         attempt = secrets.token_hex(8)
         state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
         with reaching():
-            self.redis.hset(_key(id), mapping=state)
+            self.redis.hset(_key(id), mapping={**state, "method": method})
             self._enqueue(id, attempt, method)
         logs.tell("policy queued", policy_id=id, method=method)
 
@@ -89,7 +91,9 @@ class Jobs:
             error = "the store knows nothing of its training any more; ask for it again"
         if status == "training" and not alive:
             status = "failed"
-            error = "its worker is gone; ask for it again, and the training goes on from its last checkpoint"
+            error = "its worker is gone; ask for it again: what learns goes on from its last checkpoint"
+        if status == "queued" and "method" in state and not self.worker_there(state["method"]):
+            error = "it waits for a worker that makes such policies: none is running"
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 

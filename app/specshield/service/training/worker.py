@@ -149,10 +149,8 @@ class _Worker(Worker):
         how = f"by signal {os.WTERMSIG(status)}" if killed else f"with status {status}"
         if killed and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
-        reason = (
-            f"the training process ended {how}; ask for it again, and it goes on from its last checkpoint"
-        )
-        _end(self._jobs, job, reason)
+        reason = f"the process that made it ended {how}"
+        _end(self._jobs, job, f"{reason}; ask for it again: what learns goes on from its last checkpoint")
 
 
 def train(id: str, attempt: str) -> None:
