@@ -31,6 +31,8 @@ demo: .venv/.server
 run: .venv/.server
 	$(BIN)/specshield serve
 
+# One thread for each process: with two for each of three, numpy's and torch's spend their time in waiting for each other.
+test: export OMP_NUM_THREADS = 1
 test: .venv/.dev
 	$(BIN)/python -m specshield.service.startup  # or each of three processes would compile what a server needs
 	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder  # each module's tests stay in one process; three keep two cores busy
