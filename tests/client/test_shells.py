@@ -123,7 +123,7 @@ def test_a_host_that_no_name_can_be_is_a_transport_error(use):
 
 
 @pytest.mark.parametrize(
-    "url", ["127.0.0.1:8000", "localhost", "http://", "ftp://robot", "http://a:b", "", None]
+    "url", ["127.0.0.1:8000", "localhost", "http://", "ftp://robot", "http://a:b", "http://a:99999", "", None]
 )
 def test_an_address_that_is_none_is_refused_at_once(use, url):
     with pytest.raises(errors.InputError) as caught:

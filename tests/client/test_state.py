@@ -45,9 +45,9 @@ def decided(t, action, status="pending", **members):
     return answer(body)
 
 
-def step(state, x, *outcomes, logits=LOGITS, main_task_done=None, signals=None, witnesses=False):
+def step(state, x, *outcomes, logits=LOGITS, **more):
     """(decision or error, the bodies sent)"""
-    flow = state._step((x, 0, 0), logits, main_task_done=main_task_done, signals=signals, witnesses=witnesses)
+    flow = state._step((x, 0, 0), logits, **more)
     result, sent, _ = drive(flow, *outcomes)
     return result, [json.loads(request.body) for request in sent]
 
@@ -159,7 +159,9 @@ def test_a_failed_step_changes_nothing_and_recorded_poses_follow_with_the_next()
     assert sent_poses(body) == (3, [1, 2, 3])
 
 
-@pytest.mark.parametrize("bad", [{"logits": [float("nan")]}, {"signals": {"soc": float("inf")}}])
+@pytest.mark.parametrize(
+    "bad", [{"logits": [float("nan")]}, {"signals": {"soc": float("inf")}}, {"explain": "yes"}]
+)
 def test_bad_input_is_refused_before_anything_is_sent(bad):
     state = session()
     error, bodies = step(state, 0, **bad)

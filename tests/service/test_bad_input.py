@@ -148,7 +148,8 @@ def test_parts_that_are_missing_or_too_many(client, unchanged):
     files = {"metadata": ("map.yaml", YAML)}
     problem(client.post("/v1/maps", files=files), 422, "invalid-map", "image")
     files["image"] = ("i", PGM)
-    problem(client.post("/v1/maps", files={**files, "more": ("m", b"x")}), 422, "invalid-map", "more")
+    more = problem(client.post("/v1/maps", files={**files, "more": ("m", b"x")}), 422, "invalid-map", "more")
+    assert more["got"] == "x"
     twice = [("metadata", ("m", YAML)), ("metadata", ("m", YAML))]
     problem(client.post("/v1/maps", files=twice), 422, "invalid-input", "body")
     problem(client.post("/v1/maps", files=files, data={"format": "procthor"}), 422, "invalid-input", "format")

@@ -117,11 +117,13 @@ def test_a_stream_answers_in_order_in_the_form_it_was_asked(server, client, begi
 def test_a_handshake_is_refused_over_http(server):
     for url, status in (
         (stream_of(server, {"id": "nothing"}), 404),
-        (stream_of(server, {"id": "no:id"}), 403),
+        (stream_of(server, {"id": "no:id"}), 404),
+        (f"{stream_of(server, {'id': 'any'})}s", 404),
     ):
         with pytest.raises(InvalidStatus) as refused:
             connect(url)
         assert refused.value.response.status_code == status
+        assert json.loads(refused.value.response.body)["type"] == "not-found"
     assert "handshake" not in server.log.read_text()  # a caller's mistake is no error of the server's
 
 

@@ -45,14 +45,21 @@ def paced(most: int) -> int:
     return max(min(most, LEAST), int(min(left(httpcore.ReadTimeout) / PARSING, most)))
 
 
-class Stream(httpcore.NetworkStream):
-    """One connection; `inner` is httpcore's own, plain or TLS."""
+class _Around:
+    """inner: httpcore's own connection, plain or TLS."""
 
-    def __init__(self, inner: httpcore.NetworkStream) -> None:
+    def __init__(self, inner: Any) -> None:
         self._inner = inner
 
+    def get_extra_info(self, info: str) -> Any:
+        return self._inner.get_extra_info(info)
+
+
+class Stream(_Around, httpcore.NetworkStream):
+    """One connection."""
+
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
-        return self._inner.read(paced(max_bytes), left(httpcore.ReadTimeout, timeout))
+        return bytes(self._inner.read(paced(max_bytes), left(httpcore.ReadTimeout, timeout)))
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
         """Piece by piece, as the other side takes them."""
@@ -77,9 +84,6 @@ class Stream(httpcore.NetworkStream):
             raise httpcore.UnsupportedProtocol("https through a proxy that is itself reached by https")
         limit = left(httpcore.ConnectTimeout, timeout)
         return Stream(self._inner.start_tls(ssl_context, server_hostname, limit))
-
-    def get_extra_info(self, info: str) -> Any:
-        return self._inner.get_extra_info(info)
 
 
 class Network(httpcore.NetworkBackend):
@@ -139,14 +143,11 @@ def in_thread(function: Callable[[], T], by: float) -> Future[T]:
     return given
 
 
-class AsyncStream(httpcore.AsyncNetworkStream):
+class AsyncStream(_Around, httpcore.AsyncNetworkStream):
     """One connection for asyncio, where a try is cancelled; only the size of what is read is bounded here."""
 
-    def __init__(self, inner: httpcore.AsyncNetworkStream) -> None:
-        self._inner = inner
-
     async def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
-        return await self._inner.read(paced(max_bytes), timeout)
+        return bytes(await self._inner.read(paced(max_bytes), timeout))
 
     async def write(self, buffer: bytes, timeout: float | None = None) -> None:
         await self._inner.write(buffer, timeout)
@@ -158,9 +159,6 @@ class AsyncStream(httpcore.AsyncNetworkStream):
         self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
     ) -> AsyncStream:
         return AsyncStream(await self._inner.start_tls(ssl_context, server_hostname, timeout))
-
-    def get_extra_info(self, info: str) -> Any:
-        return self._inner.get_extra_info(info)
 
 
 class AsyncNetwork(httpcore.AnyIOBackend):

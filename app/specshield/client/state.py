@@ -31,6 +31,7 @@ from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
 from specshield.errors import (
     HistoryConflict,
     HistoryGap,
+    InputError,
     NotFound,
     SessionFinished,
     SpecshieldError,
@@ -125,6 +126,10 @@ class SessionState:
         robot that stands asks again at its own pace.
         """
         yield Within(None if deadline is None else wire.seconds_value(deadline, "deadline"))
+        flags = {"main_task_done": main_task_done, "witnesses": witnesses, "explain": explain}
+        for name, flag in flags.items():
+            if flag not in (True, False, None):
+                raise InputError(f"{name} is no yes or no", path=name, got=flag, expected="True or False")
         x_t = wire.pose_values(pose)
         body: dict[str, Any] = {
             "logits": None if logits is None else wire.logit_values(logits),

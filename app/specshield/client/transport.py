@@ -26,12 +26,12 @@ def address(base_url: str) -> httpx.URL:
         url = httpx.URL(base_url)
     except (httpx.InvalidURL, TypeError):  # TypeError: it is no text
         url = httpx.URL("")
-    if url.scheme not in ("http", "https") or not url.host:
+    if url.scheme not in ("http", "https") or not url.host or (url.port or 0) > 65535:
         raise InputError(
             "this is not the address of a server",
             path="base_url",
             got=base_url,
-            expected="http://host:port or https://host:port",
+            expected="http://host:port or https://host:port, with a port of at most 65535",
         )
     return url
 

@@ -16,6 +16,7 @@ from specshield.errors import NotFound, SpecshieldError, Stopping
 from specshield.service import metrics, problems
 from specshield.service.access.rates import Rates
 from specshield.service.access.site import check_site
+from specshield.service.routes.stream import PATH
 from specshield.service.watch import logs
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
@@ -93,7 +94,8 @@ class Guard:
     async def _check(self, scope: Scope, headers: dict[bytes, bytes]) -> None:
         check_site(scope, headers, self._allowed)
         path, server = scope["path"], scope["app"].state.server
-        if path.endswith("\n"):  # a route's pattern would take it: `$` stands before a last newline too
+        # A route's pattern would take a newline: `$` stands before a last one too.
+        if path.endswith("\n") or (scope["type"] == "websocket" and PATH.fullmatch(path) is None):
             raise NotFound(f"there is no {path!r} here", got=path, expected="a path listed at /docs")
         if guarded(path):
             key = await server.keys.check(headers.get(b"authorization", b""))

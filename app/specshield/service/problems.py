@@ -95,6 +95,8 @@ def plain(value: Any, room: int = 400) -> Any:
     """`value` as finite JSON of bounded size; what is neither is shown as text."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
+    if isinstance(value, bytes):
+        value = value.decode(errors="replace")
     if isinstance(value, str):
         return value if len(value) <= room + 1 else value[:room] + "…"
     try:

@@ -33,9 +33,7 @@ class TrainingWorker:
 
     @property
     def methods(self) -> list[str]:
-        """Those that the worker makes policies by. None where it is another server's, or follows one that has
-        died: its signs of life say whether it came up.
-        """
+        """Those of this server's own worker; once one has died, signs of life tell of the next one's."""
         return self._methods if self._alive else []
 
     @property

@@ -32,9 +32,7 @@ return 1
 
 @dataclass(frozen=True)
 class Training:
-    """How a run stands. status: queued, training or failed. eta_s: estimate of the time left [s]. error: why
-    it failed, or waits.
-    """
+    """status: queued, training or failed. eta_s: estimated time left [s]. error: why it fails or waits."""
 
     status: str
     progress: float = 0.0
