@@ -290,12 +290,13 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
         client.policies.delete(made.id)
         client.maps.delete(room.id)
     assert run("export", gone.id, "--to", "mcap", "--url", server.url) == f"{gone.id}.mcap: 1 steps\n"
-    words = ["export", "record", "--to", "csv", "--out", "nowhere/a.csv"]
-    refused = subprocess.run(
-        [sys.executable, "-m", "specshield.cli", *words], cwd=tmp_path, capture_output=True, text=True
-    )
-    (line,) = refused.stderr.splitlines()
-    assert "nowhere/a.csv cannot be written: No such file or directory" in line
+    for to in ("csv", "rrd"):
+        words = ["export", "record", "--to", to, "--out", f"nowhere/a.{to}"]
+        refused = subprocess.run(
+            [sys.executable, "-m", "specshield.cli", *words], cwd=tmp_path, capture_output=True, text=True
+        )
+        (line,) = refused.stderr.splitlines()
+        assert f"nowhere/a.{to} cannot be written: No such file or directory" in line
     (tmp_path / "README.md").write_text("# no record\n")
     refused = subprocess.run(
         [sys.executable, "-m", "specshield.cli", "export", "README.md", "--to", "csv"],
