@@ -33,7 +33,7 @@ class TrainingWorker:
 
     @property
     def methods(self) -> list[str]:
-        """Those of this server's own worker; once one has died, signs of life tell of the next one's."""
+        """What this server's worker offers. Once one has died, the store says what the next one offers."""
         return self._methods if self._alive else []
 
     @property

@@ -32,9 +32,9 @@ return 1
 
 @dataclass(frozen=True)
 class Training:
-    """status: queued, training or failed. eta_s: estimated time left [s]. error: why it fails or waits."""
+    """How a run stands. eta_s: estimate of the time left [s]. error: why it failed, or what it waits for."""
 
-    status: str
+    status: str  # queued, training or failed
     progress: float = 0.0
     eta_s: float | None = None
     error: str | None = None
