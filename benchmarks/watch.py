@@ -31,15 +31,13 @@ def main() -> None:
 
 
 def measure() -> None:
+    from evaluation.shipped import shipped
     from specshield.service import metrics
-    from specshield.shield.decision import Carry, Decision
+    from specshield.shield.episode import decide, make_shield
+    from specshield.sim.cases import load_case
 
-    decision = Decision(
-        t=7, mode="shaped", distribution=np.ones(1), j_values=(1,), robustness=(0.1,), action=0,
-        action_name="m", completion_action=0, spec_status="pending", feasible_mass=0.5, kl=0.1, reason=None,
-        finished=False, next_poses=np.zeros((1, 3)), residual=(0.0, 0.0), in_collision=False, witness=(0,),
-        witnesses=(), warnings=(), carry=Carry(7, np.zeros((1, 3)), (None,), None),
-    )  # fmt: skip
+    shield = make_shield([shipped(load_case("case1"), "reachability")])
+    decision = decide(shield, [[4.5, 5.0, 0.0]], np.zeros(20))._replace(residual=(0.0, 0.0))
     timing = {"rollout": 0.0003, "store": 0.0004}
     route = "/v1/sessions/{session_id}/steps"
     print(f"  metrics.decided   {cpu(lambda: metrics.decided(decision, 0, timing)):5.1f}")

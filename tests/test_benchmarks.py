@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -99,3 +102,9 @@ def test_two_processes_decide_and_time_the_same_states_of_an_episode():
     assert found["first"].count(True) == 1
     assert len(found["seconds"][0]) == len(found["seconds"][1]) == len(found["near"]) > 60
     assert 0.0 < np.min(found["seconds"]) <= np.max(found["seconds"]) < np.inf
+
+
+def test_what_metrics_and_log_cost_a_step_is_measured_on_a_decision():
+    command = [sys.executable, "-m", "benchmarks.watch"]
+    printed = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True).stdout
+    assert len(re.findall(r"^  metrics\.decided +\d+\.\d$", printed, re.MULTILINE)) == 2
