@@ -452,6 +452,11 @@ def test_bodies_over_the_limit(client, unchanged, chunked):
     assert problem(response, 413, "body-too-large")["limit"] == 1 << 20
 
 
+def test_a_card_over_the_limit(client, unchanged):
+    response = client.post("/v1/policies", files=policy_files() | {"card": b" " * (2 << 20)})
+    assert problem(response, 413, "body-too-large", "card")["limit"] == 1 << 20
+
+
 def test_a_map_of_the_largest_size_is_taken(client):
     size = 4000
     image = b"P5\n%d %d\n255\n" % (size, size) + np.full(size * size, 254, np.uint8).tobytes()

@@ -61,7 +61,7 @@ def test_a_head_that_is_too_large_is_refused(small: RunningServer) -> None:
     with _connect(small) as connection:
         connection.sendall(b"GET /livez HTTP/1.1\r\nX-Large: " + b"a" * 20_000 + b"\r\n\r\n")
         status, problem = _answer(connection)
-    assert (status, problem["type"]) == (431, "headers-too-large")
+    assert (status, problem["type"], problem["limit"]) == (431, "headers-too-large", 4096)
 
 
 def test_a_head_that_never_ends_is_refused_while_it_comes(small: RunningServer) -> None:

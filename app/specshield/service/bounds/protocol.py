@@ -133,7 +133,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def _refuse_head(self) -> None:
         expected = f"at most {self._most} bytes"
-        self._refuse(HeadersTooLarge("the request's head is too large", expected=expected))
+        self._refuse(HeadersTooLarge("the request's head is too large", expected=expected, limit=self._most))
 
     def _stop_waiting(self) -> None:
         self.waiting.pop(self, None)

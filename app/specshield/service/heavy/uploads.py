@@ -93,9 +93,9 @@ def add_policy(settings: Settings, content_type: str, content: Content, key: Key
     if files.keys() != PARTS.keys():
         expected = " and ".join(PARTS)
         raise InputError("these are not a policy's parts", path="body", got=sorted(files), expected=expected)
-    if len(files["card"]) > settings.max_body_bytes:
-        expected = f"at most {settings.max_body_bytes} bytes"
-        raise BodyTooLarge("the card is too large", path="card", got=len(files["card"]), expected=expected)
+    if (got := len(files["card"])) > (limit := settings.max_body_bytes):
+        expected = f"at most {limit} bytes"
+        raise BodyTooLarge("the card is too large", path="card", got=got, expected=expected, limit=limit)
     card = parse(CARD, files["card"], "card").model_dump(exclude_unset=True)
     for path, number in _numbers(card, "card"):
         if not math.isfinite(number):
