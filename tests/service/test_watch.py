@@ -139,6 +139,16 @@ def test_lines_for_people_say_the_same_and_stay_one_line_each(tmp_path):
         assert "decided" not in text  # only at debug
 
 
+def test_lines_of_the_processes_that_read_uploads_are_of_the_same_form(tmp_path):
+    settings = {"SPECSHIELD_LOG_FORMAT": "json", "SPECSHIELD_MAX_HORIZON": "100"}  # theirs: more
+    with serving(tmp_path, **settings) as server:
+        body = {"map_id": "case1", "spec": {"formula": "F[0,60] Kitchen"}}
+        assert httpx.post(f"{server.url}/v1/policies", json=body, timeout=None).status_code == 503
+        lines = [json.loads(line) for line in server.log.read_text().splitlines()]
+    left_out = [line["message"] for line in lines if "case2 is left out" in line["message"]]
+    assert len(left_out) == 2  # by the server, and by the process that read the request
+
+
 def metrics_named(expression: str) -> set[str]:
     return set(re.findall(r"\bspecshield_\w+", expression))
 

@@ -13,6 +13,7 @@ import contextlib
 import ctypes
 import gc
 import importlib
+import logging.config
 import os
 import pickle
 import resource
@@ -20,16 +21,19 @@ import signal
 import socket
 import struct
 import sys
-import traceback
 from typing import Any
 
 from specshield.errors import SpecshieldError
+from specshield.service.settings import Settings
+from specshield.service.watch import logs
 
 LIMITS = struct.Struct("<QB")  # most memory [bytes], niceness
 LENGTH = struct.Struct("<Q")
 
 
 def template(control: socket.socket) -> None:
+    settings = Settings()
+    logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
     importlib.import_module("specshield.service.heavy.uploads")
     gc.collect()
     gc.freeze()  # the forks leave these pages as they are, and share them
@@ -42,8 +46,7 @@ def template(control: socket.socket) -> None:
         if os.fork() == 0:
             control.close()
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-            memory, nice = LIMITS.unpack(message)
-            _limit(memory, nice)
+            _limit(*LIMITS.unpack(message))
             with contextlib.suppress(ConnectionError), socket.socket(fileno=descriptors[0]) as calls:
                 serve(calls)  # until the server closes the socket, which it does where a caller is gone
             os._exit(0)
@@ -66,10 +69,7 @@ def serve(calls: socket.socket) -> None:
     """
     stream = calls.makefile("rwb")
     write(stream, (os.getpid(), resident()))
-    while True:
-        head = stream.read(LENGTH.size)
-        if len(head) < LENGTH.size:
-            return
+    while len(head := stream.read(LENGTH.size)) == LENGTH.size:
         size = LENGTH.unpack(head)[0]
         call = stream.read(size)
         if len(call) < size:  # the server was killed while it wrote
@@ -87,7 +87,7 @@ def _call(call: bytes) -> tuple[Any, BaseException | None]:
     except MemoryError:
         return None, MemoryError()
     except BaseException as error:
-        traceback.print_exc()
+        logs.log.exception("a process for uploads and pictures failed")
         return None, RuntimeError(f"{type(error).__name__}; the server's log says more")
 
 
