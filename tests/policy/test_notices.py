@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from specshield.policy.notices import notices
+from specshield.policy.reachability.policy import Settings
 from specshield.reasons.relaxation import way
 from specshield.robot import robot_from_json
 from specshield.shield.decision import make_shield
@@ -37,8 +38,12 @@ def test_a_policy_that_serves_its_rule_is_not_warned_of():
 
 
 def test_a_policy_that_misses_what_a_search_finds_is_said_to():
-    (said,) = notices(Policy("F[0,40] Dock"))
-    assert "it hardly sees some predicate" in said
+    policy = Policy("F[0,40] Dock")
+    (said,) = notices(policy)
+    assert said.endswith("of these: another method may find more")  # nothing of a pitch that it has not
+    policy.settings = Settings()
+    (said,) = notices(policy)
+    assert "it hardly sees some predicate of the formula; a smaller options.pitch or another method" in said
 
 
 def test_a_contradiction_is_said_to_be_one():

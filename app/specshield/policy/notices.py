@@ -36,10 +36,11 @@ def notices(policy: Proposer) -> tuple[str, ...]:
     missed = sum(way(shield, pose[None], {}) is not None for pose in refused[:MOST_SEARCHED])
     if missed:
         tried = min(len(refused), MOST_SEARCHED)
+        finer = "it hardly sees some predicate of the formula; a smaller options.pitch or "
+        coarse = hasattr(getattr(policy, "settings", None), "pitch")  # of a lattice, as not all methods have
         return (
             f"the policy found no future from {len(refused)} of {STARTS} random starts, and a search found "
-            f"one from {missed} of {tried} of these: it hardly sees some predicate of the formula; a smaller "
-            "options.pitch, or another method, may find more",
+            f"one from {missed} of {tried} of these: {finer * coarse}another method may find more",
         )
     if len(refused) == STARTS:
         return (f"no future that satisfies the formula was found from any of {STARTS} random starts",)
