@@ -76,6 +76,20 @@ def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
     assert "flat.json is no map of a known form" in line
 
 
+@pytest.mark.parametrize(
+    ("content", "ending"),
+    [
+        ({"info": {}, "data": []}, "---\n"),  # as `ros2 topic echo` writes it
+        ({"rooms": []}, ""),
+    ],
+)
+def test_a_house_or_a_grid_may_be_yaml(content, ending, tmp_path):
+    (tmp_path / "flat.yaml").write_text(yaml.safe_dump(content) + ending)
+    asked = ("--map", tmp_path / "flat.yaml", "--rule", "F[0,9] x > 1", "--out", tmp_path)
+    refused = command("policy", *asked, "--url", "http://127.0.0.1:9")
+    assert "Connection refused" in refused.stderr  # by then the file was read
+
+
 def test_sizes_of_furniture_for_what_is_no_house_are_refused(tmp_path):
     refused = command(
         "policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--assets", tmp_path / "sizes.json",

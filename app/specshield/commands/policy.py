@@ -20,13 +20,13 @@ LARGEST = 64 << 20  # [bytes] of a file; a server's own limit for a map
 
 
 def policy(
-    map: Annotated[str, typer.Option(help="A map's YAML, a house's JSON, or the name of one on the server.")],
+    map: Annotated[str, typer.Option(help="A map's file, a house's, or the name of one on the server.")],
     rule: Annotated[
         str, typer.Option(help="What has to be kept, as 'F[0,60] Kitchen and G[0,60] not Hall'.")
     ],
     regions: Annotated[Path | None, typer.Option(help="Places of your own by name, JSON or YAML.")] = None,
     robot: Annotated[str, typer.Option(help="A preset, or your robot's JSON or YAML.")] = "stretch",
-    assets: Annotated[Path | None, typer.Option(help="Sizes of a house's furniture, JSON.")] = None,
+    assets: Annotated[Path | None, typer.Option(help="Sizes of a house's furniture, JSON or YAML.")] = None,
     method: Annotated[str, typer.Option(help="How the policy is made.")] = "reachability",
     name: Annotated[str | None, typer.Option(help="What to call the policy.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
@@ -89,26 +89,25 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
         )
     if not a_file:
         return lambda client: client.maps.get(map)
-    if path.suffix in (".yaml", ".yml") or "image" in content:
-        image = path.parent / Path(str(content.get("image", ""))).name
-        if not image.is_file():
-            raise InputError(
-                f"{path} names the image {content.get('image')!r}, which is not beside it",
-                path="--map",
-                got=str(image),
-                expected="the map's PGM or PNG beside its YAML",
-            )
-        return lambda client: client.maps.upload(path, image)
     if "rooms" in content:
         sizes = {} if assets is None else _read(assets, "--assets")
         return lambda client: client.maps.procthor(content, sizes)
     if "info" in content:
         return lambda client: client.maps.occupancy_grid(content["info"], content.get("data", []))
+    if "image" in content:
+        image = path.parent / Path(str(content["image"])).name
+        if not image.is_file():
+            raise InputError(
+                f"{path} names the image {content['image']!r}, which is not beside it",
+                path="--map",
+                expected="the map's PGM or PNG beside its YAML",
+            )
+        return lambda client: client.maps.upload(path, image)
     raise InputError(
         f"{path} is no map of a known form",
         path="--map",
         got=sorted(content)[:8],
-        expected="a ROS map's YAML beside its image, a ProcTHOR house, or a nav_msgs/OccupancyGrid as JSON",
+        expected="a ROS map's YAML beside its image, a ProcTHOR house, or a nav_msgs/OccupancyGrid",
     )
 
 
@@ -126,7 +125,8 @@ def _read(path: Path, option: str) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise InputError(f"{path} cannot be read: {reason}", path=option, got=str(path)) from None
     try:
-        value = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        # The first document: `ros2 topic echo` ends a message with `---`.
+        value = json.loads(text) if path.suffix == ".json" else next(yaml.safe_load_all(text), None)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
     if not isinstance(value, dict):
