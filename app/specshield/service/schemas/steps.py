@@ -31,7 +31,7 @@ class StepRequest(Strict):
         max_length=256,
         description="Logits, one an action; null is minus infinity. Not needed after the main task.",
     )
-    main_task_done: bool = Field(False, description="The main task is over; stays true once it is.")
+    main_task_done: bool = Field(False, description="The main task is over: true at every step from then on.")
     signals: dict[str, float] | None = Field(
         None,
         max_length=64,
