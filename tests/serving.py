@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import json
 import os
 import random
+import select
 import signal
 import socket
 import subprocess
@@ -14,17 +16,63 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import httpx
 import psutil
 
 
+class Forked:
+    """`specshield` with these arguments, forked from this process's template; it can do what a Popen can."""
+
+    def __init__(self, arguments: list[str], environment: dict[str, str], output: Path) -> None:
+        self._told, theirs = socket.socketpair()
+        with theirs:
+            socket.send_fds(_template(), [b"."], [theirs.fileno()])
+        command = {"arguments": arguments, "environment": environment, "output": str(output)}
+        self._told.sendall(json.dumps(command).encode() + b"\n")
+        self._lines = self._told.makefile()
+        self.pid = int(self._lines.readline())
+        self.returncode: int | None = None
+
+    def poll(self) -> int | None:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return self.wait(0)
+        return None
+
+    def wait(self, timeout: float | None = None) -> int:
+        if self.returncode is None:
+            if not select.select([self._told], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired("specshield", timeout or 0)
+            self.returncode = int(self._lines.readline())
+            self._lines.close()
+            self._told.close()
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+@cache
+def _template() -> socket.socket:
+    """Begun with this process's first server. It ends with this process, which closes the socket."""
+    control, theirs = socket.socketpair()
+    with theirs:
+        program = [sys.executable, "-m", "tests.template"]
+        subprocess.Popen(program, cwd=Path(__file__).parents[1], stdin=theirs.fileno())
+    return control
+
+
 @dataclass
 class RunningServer:
     url: str
     data_dir: Path
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes] | Forked
     log: Path
 
     def kill(self) -> None:
@@ -56,6 +104,10 @@ def free_port() -> int:
     raise OSError("no port from 20000 to 31999 is free")
 
 
+# A server with one of these has an interpreter of its own, since the template has looked at them already.
+READ_AT_IMPORT = {"NUMBA_CACHE_DIR", "REDIS_URL", "SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR"}
+
+
 @contextmanager
 def serving(
     data_dir: Path, *options: str, ready: bool = True, port: int = 0, **environment: str
@@ -65,20 +117,22 @@ def serving(
     kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
     data_dir.mkdir(parents=True, exist_ok=True)
     log = data_dir / "server.log"
-    with open(log, "ab") as output:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "specshield.cli", "serve", "--port", str(port), *options],
-            env={
-                **kept,
-                "SPECSHIELD_DATA_DIR": str(data_dir),
-                "SPECSHIELD_WORKER": "false",
-                "TMPDIR": str(data_dir),  # what a killed server leaves goes with the test
-                **environment,
-            },
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-        )
+    arguments = ["serve", "--port", str(port), *options]
+    settings = {
+        **kept,
+        "SPECSHIELD_DATA_DIR": str(data_dir),
+        "SPECSHIELD_WORKER": "false",
+        "TMPDIR": str(data_dir),  # what a killed server leaves goes with the test
+        **environment,
+    }
+    if READ_AT_IMPORT & environment.keys():
+        program = [sys.executable, "-m", "specshield.cli", *arguments]
+        with open(log, "ab") as output:
+            process = subprocess.Popen(
+                program, env=settings, stdin=subprocess.DEVNULL, stdout=output, stderr=output
+            )
+    else:
+        process = Forked(arguments, settings, log)
     server = RunningServer(f"http://127.0.0.1:{port}", data_dir, process, log)
     try:
         if ready:

@@ -1,0 +1,82 @@
+"""A process that has imported what a server needs, and has its kernels: servers of tests are forked from it.
+
+    python -m tests.template     # standard input is a socket from `tests.serving`
+
+A fork takes 10 ms, where a new interpreter needs two seconds of a processor until it serves. What a fork runs
+is the command line, `specshield.cli.main`, with arguments, environment and files of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import importlib
+import json
+import os
+import signal
+import socket
+import sys
+import tempfile
+
+from specshield import cli
+from specshield.service.startup import Startup, prepare
+
+IMPORTED = (
+    "uvicorn.protocols.http.httptools_impl",
+    "specshield.service.app",
+    "specshield.service.bounds.protocol",
+)
+
+
+def main(control: socket.socket) -> None:
+    """Forks for each socket that is sent, until the test's process has ended."""
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    for name in IMPORTED:
+        importlib.import_module(name)
+    asyncio.run(prepare(Startup()))
+    gc.freeze()
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the keepers
+    while True:
+        sent, descriptors, _, _ = socket.recv_fds(control, 1, 1)
+        if not sent:
+            break
+        if os.fork() == 0:
+            control.close()
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            _keep(socket.socket(fileno=descriptors[0]))
+            break
+        os.close(descriptors[0])
+
+
+def _keep(told: socket.socket) -> None:
+    """Runs the command that is asked for in a fork, says its process id, and at its end how it ended."""
+    with told.makefile() as asked:
+        command = json.loads(asked.readline())
+    pid = os.fork()
+    if pid == 0:
+        told.close()
+        _run(**command)
+        return
+    with contextlib.suppress(BrokenPipeError):  # nobody asks any more
+        told.sendall(f"{pid}\n".encode())
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        told.sendall(f"{code}\n".encode())
+    os._exit(0)
+
+
+def _run(arguments: list[str], environment: dict[str, str], output: str) -> None:
+    """Returns, or raises, to the end of this process, as the console script does."""
+    descriptor = os.open(output, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    os.close(descriptor)
+    os.environ.clear()
+    os.environ.update(environment)
+    tempfile.tempdir = None  # TMPDIR is another one now
+    sys.argv = ["specshield", *arguments]
+    cli.main()
+
+
+if __name__ == "__main__":
+    main(socket.socket(fileno=os.dup(0)))
