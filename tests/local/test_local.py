@@ -20,11 +20,14 @@ from specshield.errors import (
     InfeasibleStart,
     InfeasibleSwitch,
     InputError,
+    MapError,
     NotFound,
     PolicyError,
     SessionFinished,
 )
 from specshield.local import LocalShield
+from specshield.local.shield import read_map_files
+from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
 from tests.service.world import grid_json, policy_files, send_policy
 from tests.serving import RunningServer
@@ -276,6 +279,23 @@ def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -
         pose = decisions[0].next_poses[decisions[0].execute]
     assert statuses == {"pending", "satisfied"}
     assert [item.signals["load"] for item in sessions[0].trajectory()][69:72] == [0.0, 3.0, 3.0]
+
+
+def test_a_map_has_the_image_that_its_yaml_names(tmp_path: Path) -> None:
+    """As `specshield policy` has it. An image of the YAML's own name may be an older one."""
+    newer, older = OccupancyGrid(np.eye(30, dtype=bool), 0.25), OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    metadata, image = dump_map(newer, "newer.pgm")
+    (tmp_path / "floor.yaml").write_text(metadata)
+    (tmp_path / "newer.pgm").write_bytes(image)
+    assert read_map_files(tmp_path / "floor.yaml") == (newer, {})
+    (tmp_path / "floor.pgm").write_bytes(dump_map(older)[1])
+    assert LocalShield.make(tmp_path / "floor.yaml", "F[0,9] x > 1", check=False).task.grid == newer
+    (tmp_path / "newer.pgm").unlink()
+    assert read_map_files(tmp_path / "floor.yaml") == (older, {})
+    (tmp_path / "floor.pgm").unlink()
+    for nothing in (tmp_path / "floor.yaml", tmp_path, tmp_path / "none.yaml"):
+        with pytest.raises(MapError, match="no map can be read there"):
+            LocalShield.make(nothing, "F[0,9] x > 1")
 
 
 @pytest.mark.parametrize("card", [None, "", "[]", "{}", '{"robot": {}, "spec": []}'])

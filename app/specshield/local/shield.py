@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -31,7 +30,7 @@ from specshield.shield.signals import any_signal
 from specshield.shipped import MAPS, MODELS
 from specshield.task import Task, make_task, parse_regions
 from specshield.world.formats import read_map
-from specshield.world.map_server import dump_map, load_map
+from specshield.world.map_server import dump_map, load_map, read_yaml
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Region
 
@@ -210,22 +209,28 @@ class LocalShield:
 
 
 def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
-    """A map and its named areas, those of `<name>.regions.json` beside a `.yaml` included."""
+    """A map and its named areas."""
     if isinstance(world, OccupancyGrid):
         return world, {}
     if isinstance(world, Mapping):
         members = dict(world)
         return read_map(members.pop("format", None), members)
-    path = Path(world if isinstance(world, str | os.PathLike) else str(world))
-    images = [image for kind in (".pgm", ".png") if (image := path.with_suffix(kind)).is_file()]
-    if not path.is_file() or not images:
-        raise MapError(
-            "no map can be read there",
-            path="world",
-            got=str(world),
-            expected="a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it",
-        )
+    return read_map_files(Path(str(world)))
+
+
+def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
+    """The map of a `.yaml`, and the areas that `<name>.regions.json` beside it names, where that is there.
+
+    The image is the one that the YAML names, else `<name>.pgm` or `<name>.png`, beside it. Raises MapError.
+    """
+    try:
+        text = path.read_text()
+        own = path.parent / Path(str(read_yaml(text).get("image", ""))).name
+        images = own, path.with_suffix(".pgm"), path.with_suffix(".png")
+        grid = load_map(text, next(image for image in images if image.is_file()).read_bytes())
+    except (OSError, UnicodeDecodeError, StopIteration):
+        expected = "a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it"
+        raise MapError("no map can be read there", path="world", got=str(path), expected=expected) from None
     named = path.with_suffix(".regions.json")
-    areas = json.loads(named.read_text()) if named.is_file() else {}
-    rooms = parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})
-    return load_map(path.read_text(), images[0].read_bytes()), rooms
+    areas = json.loads(named.read_bytes()) if named.is_file() else {}
+    return grid, parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})

@@ -32,7 +32,7 @@ def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
     Values follow nav2_map_server (map_io.cpp): mode raw ignores negate and the thresholds, trinary averages
     alpha with the colours, and scale takes transparent pixels for unknown. Raises MapError with the field.
     """
-    document = _read_yaml(yaml_text)
+    document = read_yaml(yaml_text)
     resolution = _scalar(document, "resolution", 1e-4, 100.0)
     origin = checks.items(checks.member(document, "origin", ""), "origin", 3, 3)
     x, y, yaw = (_number(v, f"origin[{i}]") for i, v in enumerate(origin))
@@ -91,7 +91,7 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-def _read_yaml(text: str) -> dict[str, Any]:
+def read_yaml(text: str) -> dict[str, Any]:
     if len(text) > MAX_YAML:
         raise MapError(
             "the YAML is too long", path="metadata", got=len(text), expected=f"at most {MAX_YAML} characters"

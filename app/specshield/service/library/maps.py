@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import logging
 import secrets
 from collections.abc import Iterator, Mapping
@@ -20,6 +19,7 @@ from typing import Any
 from PIL import Image
 
 from specshield.errors import InUse, MapError, NotFound, SpecshieldError
+from specshield.local.shield import read_map_files
 from specshield.service.access.keys import Key
 from specshield.service.library import files
 from specshield.service.library.claims import Claimed, Claims, missing
@@ -209,15 +209,9 @@ def _shipped(folder: Path) -> Iterator[Map]:
     """The maps of a folder: <name>.yaml, its image, and <name>.regions.json where areas have names."""
     for path in sorted(folder.glob("*.yaml")):
         try:
-            image = next(
-                path.with_suffix(kind) for kind in (".pgm", ".png") if path.with_suffix(kind).is_file()
-            )
-            grid = load_map(path.read_text(), image.read_bytes())
-            named = path.with_suffix(".regions.json")
-            areas = json.loads(named.read_bytes()) if named.is_file() else {}
-            rooms = parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})
-        except (SpecshieldError, StopIteration, ValueError) as error:
-            log.warning("map %s is left out: %s", path, error or "no image beside it")
+            grid, rooms = read_map_files(path)
+        except (SpecshieldError, ValueError) as error:
+            log.warning("map %s is left out: %s", path, error)
             continue
         yield Map(_id(grid, rooms), grid, rooms, path.stem)
 
