@@ -267,6 +267,7 @@ def test_a_policy_made_on_the_spot_is_the_same_from_its_folder(tmp_path: Path) -
         OccupancyGrid(occupied, 0.25), "F[0,60] Dock and G[0,90] load < 5", regions,
         signals={"load": 0.0}, robot=ROBOT,
     )  # fmt: skip
+    assert len(repr(made)) < 100  # what a notebook shows
     made.save(tmp_path / "policy")
     again = LocalShield.load(tmp_path / "policy")
     sessions = [each.session(initial_pose=(1.0, 1.0, 0.0)) for each in (made, again)]

@@ -43,7 +43,7 @@ log = logging.getLogger("specshield")
 World = OccupancyGrid | Path | str | Mapping[str, Any]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)  # in full it has millions of letters
 class LocalShield:
     """A task and the policy that proposes futures for it. `session` begins an episode.
 
