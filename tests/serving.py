@@ -105,7 +105,13 @@ def free_port() -> int:
 
 
 # A server with one of these has an interpreter of its own, since the template has looked at them already.
-READ_AT_IMPORT = {"NUMBA_CACHE_DIR", "PYTHONPATH", "REDIS_URL", "SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR"}
+READ_AT_IMPORT = {
+    "NUMBA_CACHE_DIR",
+    "PYTHONPATH",
+    "REDIS_URL",
+    "SPECSHIELD_MAPS_DIR",
+    "SPECSHIELD_MODELS_DIR",
+}
 
 
 @contextmanager

@@ -207,6 +207,29 @@ def test_a_server_switches_the_same_without_a_pose_where_rules_read_signals(
             pose = decision.next_poses[decision.execute]
 
 
+def test_what_a_rule_led_to_counts_for_it_after_a_switch(server: RunningServer, tmp_path: Path) -> None:
+    """The pose that decides the rule that was left comes after the switch, with the step of the next rule."""
+    kept = {"formula": "F[0,2] x > 1.1", "regions": {}}
+    there, here = _both(server, tmp_path, kept, READS)
+    pose = (1.0, 1.5, 0.0)
+    with ShieldClient(server.url, timeout=60.0) as sdk:
+        remote = sdk.sessions.create(policy_id=there[0], initial_pose=pose)
+        local = here[0].session(initial_pose=pose)
+        pose = local.step(pose, [9.0, None, None, None, None], main_task_done=True).next_poses[0]
+        remote.step((1.0, 1.5, 0.0), [9.0, None, None, None, None], main_task_done=True)
+        for info in (remote.switch(there[1], clock="restart"), local.switch(here[1], clock="restart")):
+            assert [rule["spec_status"] for rule in info.rules] == ["pending", "pending"]
+            assert info.main_task_done
+        for session in (remote, local):
+            session.step(pose, signals={"battery": 8.0})
+        assert [rule["spec_status"] for rule in local.info.rules] == ["satisfied", "pending"]
+        again = sdk.sessions.get(remote.id).info.rules
+        assert [rule["spec_status"] for rule in again] == ["satisfied", "pending"]
+        assert [(each.t, each.rule, each.signals) for each in local.trajectory()] == [
+            (each.t, each.rule, each.signals) for each in remote.trajectory()
+        ]
+
+
 def test_after_a_step_without_a_decision_a_switch_needs_the_pose(
     server: RunningServer, tmp_path: Path
 ) -> None:

@@ -58,6 +58,13 @@ class Rule:
             return "pending", (-math.inf, math.inf)
         return episode.close(self.shield, self.since(poses), self.signals(held, len(poses)))
 
-    def told(self, status: SpecStatus) -> dict[str, Any]:
-        """As the contract shows it."""
-        return rule_told(self.policy.about(), self.begins, self.origin, self.clock, status)
+
+def told(
+    rules: Sequence[Rule], poses: Sequence[Pose], held: Mapping[str, Sequence[float]]
+) -> tuple[dict[str, Any], ...]:
+    """As the contract shows them, each with the verdict on the states up to the last one that it led to."""
+    seen = [*(poses[: rule.begins + 1] for rule in rules[1:]), poses]
+    return tuple(
+        rule_told(rule.policy.about(), rule.begins, rule.origin, rule.clock, rule.verdict(known, held)[0])
+        for rule, known in zip(rules, seen, strict=True)
+    )

@@ -25,7 +25,7 @@ from specshield.client.models import (
 )
 from specshield.client.wire import Logits, Numbers, Points
 from specshield.errors import HistoryConflict, HistoryGap, InputError, SessionFinished
-from specshield.local.rule import Rule
+from specshield.local.rule import Rule, told
 from specshield.reasons import refusal
 from specshield.reasons.explanation import explanations
 from specshield.robot.dynamics import wrap
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from specshield.local.shield import LocalShield
 
 OWN = ("execute", "timings", "source", "action_names")  # what the SDK adds to the answer of the contract
-ASKED = ("witnesses", "explanations", "any_signal")  # what an answer has where there is something to say
+ASKED = ("witnesses", "explanations", "any_signal", "detail")  # told where there is something to say
 
 
 class LocalSession:
@@ -132,9 +132,8 @@ class LocalSession:
             explanations if explain else None,
         )
         answer = _answer(made._replace(t=self.t), self.info, over, witnesses, explain)
-        self._poses.append(x_t)
-        self._signals, self._carry, self._decisions[self.t] = held, made.carry, answer
-        self.t += 1
+        self._carry, self._decisions[self.t] = made.carry, answer
+        self._arrived(x_t, held)
         self.spec_status = answer.spec_status
         ends = main_task_done is None and answer.action in self.info.terminal_actions
         self.main_task_done = over or ends
@@ -144,9 +143,7 @@ class LocalSession:
 
     def record(self, pose: Numbers) -> None:
         """Note x_t of a step that goes without a decision, and move on to t + 1."""
-        self._poses.append(self._at(pose))
-        self._signals = self._held({}, len(self._poses))
-        self.t += 1
+        self._arrived(self._at(pose), self._held({}))
 
     def switch(
         self, policy: LocalShield, *, clock: Literal["keep", "restart"] = "keep", pose: Numbers | None = None
@@ -174,21 +171,23 @@ class LocalSession:
         way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
         carry = handover.carried_over(self._carry, same_map, same_robot, later, way)
         known = self._poses if given is None and self.t > 0 else [*self._poses, x_t]
-        ended, (status, _) = old.told(old.verdict(known, held)[0]), rule.verdict(known, held)
+        rules = [*self._rules, rule]
+        have = told(rules, known, held)
         info = replace(
             self.info,
             **policy.about(),
             next_t=self.t,
             feasible=True,
-            spec_status=status,
-            rules=(*self.info.rules[:-1], ended, rule.told(status)),
+            spec_status=have[-1]["spec_status"],
+            main_task_done=self.main_task_done,
+            rules=have,
             any_signal=any_signal(rule.shield, seen, signals),
         )
-        self._rules.append(rule)
+        self._rules = rules
         self._carry, self._first = carry, first
         self._given = {} if given is None else {self.t: given}
         self._signals = {name: values[: self.t] for name, values in held.items()}
-        self.info, self.spec_status, self.finished = info, status, False
+        self.info, self.spec_status, self.finished = info, info.spec_status, False
         return info
 
     def events(self, after: int | None = None) -> Iterator[Decision]:
@@ -206,29 +205,33 @@ class LocalSession:
         if not self.closed and pose is not None:
             self.record(pose)
         poses = self._poses or [self._initial]
-        status, bounds = self._rule.verdict(poses, self._held({}, len(poses)))
+        self.spec_status, bounds = self._rule.verdict(poses, self._held({}, len(poses)))
         self.closed = self.finished = self._over = True
-        self.spec_status = status
         low, high = map(handover.finite, bounds)
-        return Verdict(status, (low, high))
+        return Verdict(self.spec_status, (low, high))
 
     def trajectory(self) -> tuple[TrajectoryItem, ...]:
         """The states x_0..x_t, and the answers by the contract's names."""
         held = self._held({}, len(self._poses))
         return tuple(
-            TrajectoryItem(t, pose, {name: values[t] for name, values in held.items()}, self._told(t), rule)
+            TrajectoryItem(t, pose, {name: held[name][t] for name in reads}, self._told(t), rule)
             for t, pose in enumerate(self._poses)
             for rule in [max(i for i, each in enumerate(self._rules) if each.begins <= t)]
+            for reads in [sorted(self._rules[rule].shield.task.signals)]
         )
+
+    def _arrived(self, x_t: Pose, held: dict[str, list[float]]) -> None:
+        """Move on to t + 1. x_t is the last state of a rule that was left, where its action led there."""
+        self._poses.append(x_t)
+        self._signals = held
+        if 0 < self.t == self._rules[-1].begins:
+            self.info = replace(self.info, rules=told(self._rules, self._poses, held))
+        self.t += 1
 
     def _check(self, over: bool) -> None:
         if self._over:
-            raise SessionFinished(
-                "the session is over: no further step is decided",
-                path="t",
-                got=self.t,
-                expected="a new session",
-            )
+            ended = "the session is over: no further step is decided"
+            raise SessionFinished(ended, path="t", got=self.t, expected="a new session")
         handover.check_main_task(self.main_task_done, over)
 
     def _foreseen(self) -> Pose:
@@ -271,11 +274,11 @@ class LocalSession:
         decision = self._decisions.get(t)
         if decision is None:
             return None
-        told = {each.name: getattr(decision, each.name) for each in fields(decision) if each.name not in OWN}
-        told["residual"] = None if decision.residual is None else dict(vars(decision.residual))
+        answer = {name: value for name, value in _told(decision).items() if name not in OWN}
+        answer["residual"] = None if decision.residual is None else dict(vars(decision.residual))
         if decision.explanations is not None:
-            told["explanations"] = [_told(why) for why in decision.explanations]
-        return {name: value for name, value in told.items() if value is not None or name not in ASKED}
+            answer["explanations"] = [why and _told(why) for why in decision.explanations]
+        return answer
 
 
 def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool, explain: bool) -> Decision:
@@ -294,8 +297,6 @@ def _answer(made: core.Decision, info: SessionInfo, over: bool, witnesses: bool,
     return Decision(**values, execute=execute, action_names=info.actions)
 
 
-def _told(why: Explanation | None) -> dict[str, Any] | None:
-    """As the service tells it: without a detail where there is none."""
-    if why is None:
-        return None
-    return {name: value for name, value in vars(why).items() if name != "detail" or value is not None}
+def _told(made: Decision | Explanation) -> dict[str, Any]:
+    """As the service tells it: without what there is nothing to say of."""
+    return {name: value for name, value in vars(made).items() if value is not None or name not in ASKED}

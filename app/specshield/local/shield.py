@@ -15,7 +15,7 @@ import numpy as np
 from specshield.client.models import SessionInfo
 from specshield.client.wire import pose_values
 from specshield.errors import MapError, NotFound, PolicyError
-from specshield.local.rule import Rule
+from specshield.local.rule import Rule, told
 from specshield.local.session import LocalSession
 from specshield.local.settings import read_settings
 from specshield.lookahead.preferences import PROJECTION, prepare
@@ -24,7 +24,6 @@ from specshield.policy.notices import notices
 from specshield.policy.options import read_options
 from specshield.reasons import refusal
 from specshield.robot import Robot, robot_from_json
-from specshield.shield import episode
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
 from specshield.shield.signals import any_signal
 from specshield.shipped import MAPS, MODELS
@@ -64,12 +63,8 @@ class LocalShield:
         folder = MODELS / name
         names = sorted(card.parent.name for card in MODELS.glob("*/card.json"))
         if name not in names:
-            raise NotFound(
-                "no such policy came with specshield",
-                path="name",
-                got=name,
-                expected=f"one of {', '.join(names)}",
-            )
+            expected = f"one of {', '.join(names)}"
+            raise NotFound("no such policy came with specshield", path="name", got=name, expected=expected)
         wanted = json.loads((folder / "card.json").read_text())["map_id"]
         for path in sorted(MAPS.glob("*.yaml")):
             if wanted in (path.stem, _read_world(path)[0].content_hash):
@@ -168,18 +163,19 @@ class LocalShield:
             check_preferring(config)
         shield = self.configured(config, shaping)
         feasible, way = refusal.begin(shield, pose, allowed)
-        status, _ = episode.close(shield, [pose])
+        held = {name: [value] for name, value in shield.task.signals.items()}
+        rules = told([Rule(self, shield)], [pose], held)
         info = SessionInfo(
             id=id,
             **self.about(),
             next_t=0,
             feasible=feasible,
-            spec_status=status,
+            spec_status=rules[0]["spec_status"],
             main_task_done=False,
             finished=False,
             expires_at="",
             margin=shield.config.margin,
-            rules=(Rule(self, shield).told(status),),
+            rules=rules,
             any_signal=any_signal(shield, np.array([pose], np.float64)),
         )
         return LocalSession(self, shield, shaping, info, pose, way)
