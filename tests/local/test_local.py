@@ -230,6 +230,15 @@ def test_what_a_rule_led_to_counts_for_it_after_a_switch(server: RunningServer, 
         ]
 
 
+@pytest.mark.parametrize("flag", ["main_task_done", "witnesses", "explain"])
+def test_a_flag_that_is_no_yes_or_no_is_refused_as_the_sdk_does(flag: str) -> None:
+    session = LocalShield.shipped("case1").session(initial_pose=START)
+    asked: dict[str, Any] = {flag: "no"}
+    with pytest.raises(InputError) as caught:
+        session.step(START, [0.0] * 20, **asked)
+    assert (caught.value.path, session.t) == (flag, 0)
+
+
 def test_after_a_step_without_a_decision_a_switch_needs_the_pose(
     server: RunningServer, tmp_path: Path
 ) -> None:

@@ -31,7 +31,6 @@ from specshield.client.wire import TRIES, Logits, Numbers, Points, Reply
 from specshield.errors import (
     HistoryConflict,
     HistoryGap,
-    InputError,
     NotFound,
     SessionFinished,
     SpecshieldError,
@@ -126,10 +125,7 @@ class SessionState:
         robot that stands asks again at its own pace.
         """
         yield Within(None if deadline is None else wire.seconds_value(deadline, "deadline"))
-        flags = {"main_task_done": main_task_done, "witnesses": witnesses, "explain": explain}
-        for name, flag in flags.items():
-            if flag not in (True, False, None):
-                raise InputError(f"{name} is no yes or no", path=name, got=flag, expected="True or False")
+        wire.check_flags(main_task_done=main_task_done, witnesses=witnesses, explain=explain)
         x_t = wire.pose_values(pose)
         body: dict[str, Any] = {
             "logits": None if logits is None else wire.logit_values(logits),
@@ -214,8 +210,7 @@ class SessionState:
         for item in (yield from self._trajectory()) if self.t else ():
             self._continuation.branches = ()
             if item.decision is not None and item.rule == max(0, len(self.info.rules) - 1):
-                over = self.info.main_task_done
-                decision = decision_of(item.decision, self.info, over, {})
+                decision = decision_of(item.decision, self.info, self.info.main_task_done, {})
                 self._continuation.learn(decision, item.pose)
 
     def _switch(

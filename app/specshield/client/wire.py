@@ -190,12 +190,8 @@ def logit_values(logits: Logits) -> list[float | None]:
     values = _floats(logits, LogitsError, "logits", "one number an action")
     for i, value in enumerate(values):
         if math.isnan(value) or value == math.inf:
-            raise LogitsError(
-                f"logit {i} is {value}",
-                path=f"logits[{i}]",
-                got=str(value),
-                expected="a finite number, -inf or None",
-            )
+            where, expected = f"logits[{i}]", "a finite number, -inf or None"
+            raise LogitsError(f"logit {i} is {value}", path=where, got=str(value), expected=expected)
     return [None if value == -math.inf else value for value in values]
 
 
@@ -211,6 +207,12 @@ def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
                 "a signal is a finite number", path=f"signals.{name}", got=str(value), expected="finite"
             )
     return values
+
+
+def check_flags(**flags: object) -> None:
+    for name, flag in flags.items():
+        if flag not in (True, False, None):
+            raise InputError(f"{name} is no yes or no", path=name, got=flag, expected="True or False")
 
 
 def seconds_value(seconds: object, name: str) -> float:

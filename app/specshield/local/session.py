@@ -113,6 +113,7 @@ class LocalSession:
         The arguments are those of the SDK's `Session.step`, so that one loop serves both; `deadline` does
         nothing here. Raises what that raises where the caller is wrong.
         """
+        wire.check_flags(main_task_done=main_task_done, witnesses=witnesses, explain=explain)
         over = self.main_task_done if main_task_done is None else main_task_done
         self._check(over)
         sent = {} if signals is None else wire.signal_values(signals)
