@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,11 +27,13 @@ import psutil
 class Forked:
     """`specshield` with these arguments, forked from this process's template; it can do what a Popen can."""
 
-    def __init__(self, arguments: list[str], environment: dict[str, str], output: Path) -> None:
+    def __init__(self, arguments: list[str], environment: dict[str, str], **files: Path) -> None:
+        """files: `stdout` and `stderr`, and the folder `cwd` to work in."""
         self._told, theirs = socket.socketpair()
         with theirs:
             socket.send_fds(_template(), [b"."], [theirs.fileno()])
-        command = {"arguments": arguments, "environment": environment, "output": str(output)}
+        named = {name: str(path.absolute()) for name, path in files.items()}
+        command = {"arguments": arguments, "environment": environment, **named}
         self._told.sendall(json.dumps(command).encode() + b"\n")
         self._lines = self._told.makefile()
         self.pid = int(self._lines.readline())
@@ -138,7 +141,7 @@ def serving(
                 program, env=settings, stdin=subprocess.DEVNULL, stdout=output, stderr=output
             )
     else:
-        process = Forked(arguments, settings, log)
+        process = Forked(arguments, settings, stdout=log, stderr=log, cwd=Path.cwd())
     server = RunningServer(f"http://127.0.0.1:{port}", data_dir, process, log)
     try:
         if ready:
@@ -151,6 +154,17 @@ def serving(
         except subprocess.TimeoutExpired:
             server.kill()
             raise AssertionError("the server did not stop when it was told to") from None
+
+
+def run_specshield(
+    *arguments: object, cwd: Path | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """`specshield`, to its end. environment: variables beside this process's own."""
+    with tempfile.TemporaryDirectory() as folder:
+        out, err = Path(folder, "stdout"), Path(folder, "stderr")
+        words, given = [str(each) for each in arguments], {**os.environ, **environment}
+        code = Forked(words, given, stdout=out, stderr=err, cwd=cwd or Path.cwd()).wait(HUNG)
+        return subprocess.CompletedProcess(words, code, out.read_text(), err.read_text())
 
 
 def wait_ready(server: RunningServer) -> None:

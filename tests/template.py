@@ -1,4 +1,4 @@
-"""A process that has imported what a server needs, and has its kernels: servers of tests are forked from it.
+"""A process that has imported what a server needs, and has its kernels: tests fork `specshield` from it.
 
     python -m tests.template     # standard input is a socket from `tests.serving`
 
@@ -65,16 +65,19 @@ def _keep(told: socket.socket) -> None:
     os._exit(0)
 
 
-def _run(arguments: list[str], environment: dict[str, str], output: str) -> None:
+def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr: str, cwd: str) -> None:
     """Returns, or raises, to the end of this process, as the console script does."""
-    descriptor = os.open(output, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
-    os.dup2(descriptor, 1)
-    os.dup2(descriptor, 2)
-    os.close(descriptor)
+    for stream, path in ((1, stdout), (2, stderr)):
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        os.dup2(file, stream)
+        os.close(file)
+    os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)
     tempfile.tempdir = None  # TMPDIR is another one now
     sys.argv = ["specshield", *arguments]
+    main_module = sys.modules["__main__"]
+    main_module.__spec__ = main_module.__package__ = None  # as of the console script: of no package
     cli.main()
 
 

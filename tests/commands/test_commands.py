@@ -20,17 +20,7 @@ from specshield.client import ShieldClient
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from specshield.shipped import MODELS
-from tests.serving import serving
-
-
-def command(*arguments, **environment):
-    """The finished process of `specshield`, with these environment variables beside this process's own."""
-    return subprocess.run(
-        [sys.executable, "-m", "specshield.cli", *map(str, arguments)],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-    )
+from tests.serving import run_specshield, serving
 
 
 def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
@@ -39,25 +29,27 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
     (tmp_path / "places.yaml").write_text(yaml.safe_dump(REGIONS))
     (tmp_path / "cart.yaml").write_text(yaml.safe_dump(ROBOT))
     own = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
-    assert command("keys", "create", "alice", **own).returncode == 0  # from now on its servers ask for one
+    assert (
+        run_specshield("keys", "create", "alice", **own).returncode == 0
+    )  # from now on its servers ask for one
     files = ("--map", tmp_path / "flat", "--regions", tmp_path / "places.yaml")
     asked = (*files, "--robot", tmp_path / "cart.yaml", "--rule", RULE, "--name", "flat", "--out", tmp_path)
-    made = command("policy", *asked, **own)
+    made = run_specshield("policy", *asked, **own)
     assert made.returncode == 0, made.stderr
     assert "specshield run flat" in made.stdout
     assert (tmp_path / "flat.svg").read_text().startswith("<svg")
 
-    driven = command("run", "flat", "--seed", 3, "--out", tmp_path, **own)
+    driven = run_specshield("run", "flat", "--seed", 3, "--out", tmp_path, **own)
     assert driven.returncode == 0, driven.stderr
     assert "shielded rule satisfied" in driven.stdout
     assert (tmp_path / "flat-run.png").stat().st_size > 5000
-    refused = command("run", "flat", "--target=-1,-1", "--out", tmp_path, **own)
+    refused = run_specshield("run", "flat", "--target=-1,-1", "--out", tmp_path, **own)
     said = "--target: no robot can stand there; got '-1,-1'; expected a free place"
     assert refused.stderr.splitlines()[-1] == said
 
 
 def test_a_policy_that_came_with_the_project_is_not_replaced_unasked():
-    refused = command("train", "--case", 2)
+    refused = run_specshield("train", "--case", 2)
     assert refused.returncode == 1
     (line,) = refused.stderr.splitlines()
     assert line == (
@@ -68,7 +60,7 @@ def test_a_policy_that_came_with_the_project_is_not_replaced_unasked():
 
 def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
     (tmp_path / "flat.json").write_text('{"rooms?": []}')
-    refused = command(
+    refused = run_specshield(
         "policy", "--map", tmp_path / "flat.json", "--rule", "F[0,9] x > 1", "--out", tmp_path
     )  # fmt: skip
     assert refused.returncode == 1
@@ -86,12 +78,12 @@ def test_a_file_that_is_no_map_is_told_in_one_line(tmp_path):
 def test_a_house_or_a_grid_may_be_yaml(content, ending, tmp_path):
     (tmp_path / "flat.yaml").write_text(yaml.safe_dump(content) + ending)
     asked = ("--map", tmp_path / "flat.yaml", "--rule", "F[0,9] x > 1", "--out", tmp_path)
-    refused = command("policy", *asked, "--url", "http://127.0.0.1:9")
+    refused = run_specshield("policy", *asked, "--url", "http://127.0.0.1:9")
     assert "Connection refused" in refused.stderr  # by then the file was read
 
 
 def test_sizes_of_furniture_for_what_is_no_house_are_refused(tmp_path):
-    refused = command(
+    refused = run_specshield(
         "policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--assets", tmp_path / "sizes.json",
         "--url", "http://127.0.0.1:9", "--out", tmp_path,
     )  # fmt: skip
@@ -102,7 +94,9 @@ def test_sizes_of_furniture_for_what_is_no_house_are_refused(tmp_path):
 
 def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_path):
     (tmp_path / "file").touch()
-    refused = command("policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--out", tmp_path / "file" / "in")
+    refused = run_specshield(
+        "policy", "--map", "case1", "--rule", "F[0,9] x > 1", "--out", tmp_path / "file" / "in"
+    )
     assert refused.returncode == 1
     (line,) = refused.stderr.strip().splitlines()
     assert line.startswith("--out cannot be used: Not a directory")
@@ -111,7 +105,7 @@ def test_a_picture_that_cannot_be_written_is_told_before_the_policy_is_made(tmp_
 @pytest.mark.parametrize("asked", [("run", "case1"), ("demo", "--runs", 1), ("train", "--case", 1)])
 def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp_path):
     (tmp_path / "file").touch()
-    refused = command(*asked, "--out", tmp_path / "file", SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    refused = run_specshield(*asked, "--out", tmp_path / "file", SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert refused.returncode == 1
     assert refused.stderr.strip() == f"{tmp_path / 'file'} cannot be used: File exists"
     assert refused.stdout == ""
@@ -125,7 +119,7 @@ def test_a_folder_that_cannot_be_made_is_told_before_the_work_is_done(asked, tmp
     ],
 )
 def test_a_wrong_argument_is_told_before_a_server_is_started(asked, said, tmp_path):
-    refused = command(*asked, "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    refused = run_specshield(*asked, "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert refused.returncode == 1
     (line,) = refused.stderr.strip().splitlines()
     assert line.startswith(said)
@@ -135,7 +129,7 @@ def test_a_wrong_argument_is_told_before_a_server_is_started(asked, said, tmp_pa
 @pytest.mark.parametrize("asked", [("run", "case1"), ("policy", "--map", "case1", "--rule", "F[0,9] x > 1")])
 def test_a_server_of_its_own_that_does_not_come_up_is_told_without_a_traceback(asked, tmp_path):
     (tmp_path / "file").touch()
-    failed = command(*asked, "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "file"))
+    failed = run_specshield(*asked, "--out", tmp_path, SPECSHIELD_DATA_DIR=str(tmp_path / "file"))
     assert failed.returncode == 1
     assert failed.stderr.splitlines() == [
         "starting the service ...",
@@ -181,16 +175,16 @@ def test_no_help_has_a_word_in_brackets_which_would_be_taken_for_markup_and_not_
 
 
 def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
-    sound = command("doctor", SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
+    sound = run_specshield("doctor", SPECSHIELD_DATA_DIR=str(tmp_path / "data"))
     assert sound.returncode == 0, sound.stdout
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        ill = command(
+        ill = run_specshield(
             "doctor", "--port", port, REDIS_URL="redis://127.0.0.1:1/0", SPECSHIELD_DATA_DIR=str(tmp_path)
         )
     with HTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as other:
         Thread(target=other.serve_forever, daemon=True).start()
-        lost = command("doctor", "--url", f"http://127.0.0.1:{other.server_port}/")
+        lost = run_specshield("doctor", "--url", f"http://127.0.0.1:{other.server_port}/")
         other.shutdown()
     assert re.search(r"^wrong +what answers at \S+ is no specshield server", lost.stdout, re.M), lost.stderr
     assert ill.returncode == 1
@@ -203,7 +197,7 @@ def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):
     data = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data")}
 
     def wrong(**environment):
-        told = command("doctor", **data, **environment)
+        told = run_specshield("doctor", **data, **environment)
         assert (told.returncode, told.stderr) == (1, ""), told.stderr
         (line,) = [line for line in told.stdout.splitlines() if line.startswith("wrong")]
         assert told.stdout.splitlines()[-1] == "1 of these keep specshield from working"
@@ -217,7 +211,7 @@ def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):
     assert "files at 'nowhere://bucket/prefix' cannot be used" in wrong(**unread)
     assert (
         "files at 'nowhere://bucket/prefix' cannot be used"
-        in command("serve", "--port", 0, **data, **unread).stderr
+        in run_specshield("serve", "--port", 0, **data, **unread).stderr
     )
     store = EmbeddedStore(tmp_path / "store")
     store.join()
@@ -225,7 +219,9 @@ def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):
         check_files(store.url, str(tmp_path / "files"), 5.0)
         elsewhere = {"REDIS_URL": store.url, "SPECSHIELD_DATA_URL": str(tmp_path / "elsewhere")}
         assert "keep their maps and policies elsewhere" in wrong(**elsewhere)
-        there = command("doctor", **data, **{**elsewhere, "SPECSHIELD_DATA_URL": str(tmp_path / "files")})
+        there = run_specshield(
+            "doctor", **data, **{**elsewhere, "SPECSHIELD_DATA_URL": str(tmp_path / "files")}
+        )
         assert there.stdout.splitlines()[-1] == "all is well", there.stdout
     finally:
         store.leave()
@@ -240,9 +236,9 @@ def test_a_session_is_watched_a_line_a_decision(tmp_path):
             decision = session.step(pose, [0.0] * 20)
             pose = decision.next_poses[decision.execute]
         session.close(pose)
-        watched = command("watch", session.id, "--url", server.url, **key)
+        watched = run_specshield("watch", session.id, "--url", server.url, **key)
         asked = ("--map", "nowhere", "--rule", "x > 1", "--out", tmp_path, "--url", server.url)
-        assert "there is no map 'nowhere'" in command("policy", *asked, **key).stderr
+        assert "there is no map 'nowhere'" in run_specshield("policy", *asked, **key).stderr
     assert watched.returncode == 0, watched.stderr
     lines = [line for line in watched.stdout.splitlines() if re.match(r" +\d+ (prior|shaped)", line)]
     assert [int(line.split()[0]) for line in lines] == [0, 1, 2]

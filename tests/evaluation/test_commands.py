@@ -8,13 +8,11 @@ from importlib.metadata import entry_points
 import pytest
 
 from evaluation import commands, jobs
-
-SPECSHIELD = (sys.executable, "-m", "specshield.cli")
-ALONE = (sys.executable, "-m", "evaluation")
+from tests.serving import run_specshield
 
 
-def specshield(*arguments, code=0, program=SPECSHIELD):
-    done = subprocess.run([*program, *arguments], capture_output=True, text=True)
+def specshield(*arguments, code=0):
+    done = run_specshield(*arguments)
     assert done.returncode == code, done.stderr
     return done
 
@@ -29,8 +27,13 @@ def test_the_entry_points_name_what_there_is():
 
 
 def test_it_runs_without_being_installed_too():
-    assert "evaluate" in specshield("--help", program=ALONE).stdout
-    assert "one of case1, case2" in specshield("evaluate", "--case", "9", program=ALONE, code=1).stderr
+    told, refused = (
+        subprocess.run([sys.executable, "-m", "evaluation", *words], capture_output=True, text=True)
+        for words in (["--help"], ["evaluate", "--case", "9"])
+    )
+    assert "evaluate" in told.stdout
+    assert refused.returncode == 1
+    assert "one of case1, case2" in refused.stderr
 
 
 def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path):

@@ -18,7 +18,7 @@ from specshield.recordings.recording import Recording
 from specshield.recordings.tables import write_csv, write_parquet
 from specshield.robot.dynamics import make_body, step
 from specshield.world.occupancy import OccupancyGrid
-from tests.serving import RunningServer
+from tests.serving import RunningServer, run_specshield
 
 START = (4.5, 5.0, 0.0)
 
@@ -256,10 +256,6 @@ def test_what_is_no_bag_is_said_to_be_none(named: str, tmp_path: Path) -> None:
 
 
 def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer, tmp_path: Path) -> None:
-    import os
-    import subprocess
-    import sys
-
     from specshield.client import ShieldClient
 
     with ShieldClient(server.url, timeout=30.0) as client:
@@ -268,10 +264,9 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
         session.save_record(tmp_path / "record")
 
     def run(*words: str) -> str:
-        command = [sys.executable, "-m", "specshield.cli", *words]
-        return subprocess.run(
-            command, cwd=tmp_path, capture_output=True, text=True, check=True, env=dict(os.environ)
-        ).stdout
+        done = run_specshield(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     assert (
         run("export", session.id, "--to", "csv", "--url", server.url, "--out", "a.csv") == "a.csv: 1 steps\n"
@@ -292,23 +287,15 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
     assert run("export", gone.id, "--to", "mcap", "--url", server.url) == f"{gone.id}.mcap: 1 steps\n"
     for to in ("csv", "rrd"):
         words = ["export", "record", "--to", to, "--out", f"nowhere/a.{to}"]
-        refused = subprocess.run(
-            [sys.executable, "-m", "specshield.cli", *words], cwd=tmp_path, capture_output=True, text=True
-        )
+        refused = run_specshield(*words, cwd=tmp_path)
         (line,) = refused.stderr.splitlines()
         assert f"nowhere/a.{to} cannot be written: No such file or directory" in line
     (tmp_path / "README.md").write_text("# no record\n")
-    refused = subprocess.run(
-        [sys.executable, "-m", "specshield.cli", "export", "README.md", "--to", "csv"],
-        cwd=tmp_path, capture_output=True, text=True,
-    )  # fmt: skip
+    refused = run_specshield("export", "README.md", "--to", "csv", cwd=tmp_path)
     (line,) = refused.stderr.splitlines()
     assert line.startswith("the file is no record of a session, or not all of one; expected what GET /v1/")
     bag_of(tmp_path / "bag", [START] * 70, 1.0)
     words = ["check-drive", "bag", "--policy", "case1", "--step-seconds", "1"]
-    refused = subprocess.run(
-        [sys.executable, "-m", "specshield.cli", *words],
-        cwd=tmp_path, capture_output=True, text=True,
-    )  # fmt: skip
+    refused = run_specshield(*words, cwd=tmp_path)
     assert refused.returncode == 1
     assert "the rule is broken" in refused.stdout

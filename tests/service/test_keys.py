@@ -1,8 +1,6 @@
 """API keys with names: what each may, what each owns, and what it may use."""
 
 import asyncio
-import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -17,11 +15,10 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Store
 from tests.service.test_bad_input import problem
 from tests.service.world import START, grid_json, send_policy
-from tests.serving import HUNG, serving, wait_for
+from tests.serving import run_specshield, serving, wait_for
 
 POSE = [4.5, 5.0, 0.0]  # from which case 1 can be satisfied
 UNTOLD = 12.0  # [s] in which a stream that is open tells nothing, if nothing is decided: less than HEARTBEAT
-BARE = {"PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path)}
 
 
 @pytest.fixture(scope="module")
@@ -88,13 +85,7 @@ def test_a_command_acts_as_the_owner_of_the_key_that_it_starts_a_server_with(key
 
 def test_keys_made_listed_and_revoked_by_the_command_line(keyed):
     def keys(*arguments):
-        return subprocess.run(
-            [sys.executable, "-m", "specshield.cli", "keys", *arguments],
-            env={**BARE, "SPECSHIELD_DATA_DIR": str(keyed.data_dir)},
-            capture_output=True,
-            text=True,
-            timeout=HUNG,
-        )  # fmt: skip
+        return run_specshield("keys", *arguments, SPECSHIELD_DATA_DIR=str(keyed.data_dir))
 
     assert keys("list").stderr == "there are no keys\n"
     for endless in ("inf", "nan"):

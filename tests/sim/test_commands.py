@@ -11,13 +11,13 @@ import pytest
 
 from specshield.policy.methods import load_policy
 from specshield.sim.cases import load_case
-from tests.serving import HUNG, children, runs, wait_for
+from tests.serving import HUNG, children, run_specshield, runs, wait_for
 
 SPECSHIELD = (sys.executable, "-m", "specshield.cli")
 
 
 def specshield(*arguments, code=0):
-    done = subprocess.run([*SPECSHIELD, *arguments], capture_output=True, text=True)
+    done = run_specshield(*arguments)
     assert done.returncode == code, done.stderr
     return done
 
