@@ -20,6 +20,7 @@ from websockets.sync.client import connect
 
 from specshield.client import ShieldClient
 from specshield.errors import InputError
+from specshield.service.leaving import Streams
 from specshield.service.routes.messages import read_step
 from specshield.service.schemas.steps import StepRequest
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
@@ -239,6 +240,29 @@ def test_a_server_that_stops_says_so_to_its_streams(tmp_path):
             with pytest.raises(ConnectionClosed) as closed:
                 stream.recv()
             assert closed.value.rcvd.code == 1001
+
+
+def test_streams_are_told_before_the_server_cuts_their_connections():
+    """uvicorn cuts them in the next turn of its loop that comes after the signal, with a code of its own."""
+    order = []
+
+    async def scene():
+        async def say_why():
+            order.append("told")
+
+        streams = Streams()
+        streams.open.add(lambda: order.append(asyncio.get_running_loop().create_task(say_why())))
+        streams.close_at_stop()
+        signal.raise_signal(signal.SIGTERM)
+        while "cut" not in order:
+            await asyncio.sleep(0)
+
+    before = signal.signal(signal.SIGTERM, lambda signum, frame: order.append("cut"))
+    try:
+        asyncio.run(scene())
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert order[1:] == ["told", "cut"]
 
 
 SCALARS = (
