@@ -58,12 +58,8 @@ class Registry(Generic[E]):
         that adds it is broken; the log then holds the cause.
         """
         if name not in self._points:
-            raise InputError(
-                f"unknown {self.word}",
-                path=self._field,
-                got=name,
-                expected=f"one of {', '.join(self.names())}",
-            )
+            expected = f"one of {', '.join(self.names())}"
+            raise InputError(f"unknown {self.word}", path=self._field, got=name, expected=expected)
         if name not in self._loaded:
             self._loaded[name] = self._load(self._points[name])
         return self._loaded[name]

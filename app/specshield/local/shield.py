@@ -19,6 +19,7 @@ from specshield.local.rule import Rule, told
 from specshield.local.session import LocalSession
 from specshield.local.settings import read_settings
 from specshield.lookahead.preferences import PROJECTION, prepare
+from specshield.map_files import read_map_files
 from specshield.policy.methods import DEFAULT, METHODS, Run, load_policy
 from specshield.policy.notices import notices
 from specshield.policy.options import read_options
@@ -27,9 +28,9 @@ from specshield.robot import Robot, robot_from_json
 from specshield.shield.decision import Config, Shield, check_preferring, make_shield
 from specshield.shield.signals import any_signal
 from specshield.shipped import MAPS, MODELS
-from specshield.task import Task, make_task, parse_regions
+from specshield.task import Task, make_task
 from specshield.world.formats import read_map
-from specshield.world.map_server import dump_map, load_map, read_yaml
+from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Region
 
@@ -212,21 +213,3 @@ def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
         members = dict(world)
         return read_map(members.pop("format", None), members)
     return read_map_files(Path(str(world)))
-
-
-def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
-    """The map of a `.yaml`, and the areas that `<name>.regions.json` beside it names, where that is there.
-
-    The image is the one that the YAML names, else `<name>.pgm` or `<name>.png`, beside it. Raises MapError.
-    """
-    try:
-        text = path.read_text()
-        own = path.parent / Path(str(read_yaml(text).get("image", ""))).name
-        images = own, path.with_suffix(".pgm"), path.with_suffix(".png")
-        grid = load_map(text, next(image for image in images if image.is_file()).read_bytes())
-    except (OSError, UnicodeDecodeError, StopIteration):
-        expected = "a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it"
-        raise MapError("no map can be read there", path="world", got=str(path), expected=expected) from None
-    named = path.with_suffix(".regions.json")
-    areas = json.loads(named.read_bytes()) if named.is_file() else {}
-    return grid, parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})

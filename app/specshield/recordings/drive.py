@@ -133,11 +133,7 @@ def told(shield: LocalShield, judged: Judged, step_seconds: float) -> Iterator[s
 def _planar(pose: Any) -> Pose:
     p, q = pose.position, pose.orientation
     if not abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1.0) <= 1e-3:  # NaN is none either
-        raise InputError(
-            "the orientation of a pose is not a unit quaternion",
-            path="BAG",
-            got=[q.x, q.y, q.z, q.w],
-            expected="x, y, z, w with a length of 1",
-        )
+        told, got = "the orientation of a pose is not a unit quaternion", [q.x, q.y, q.z, q.w]
+        raise InputError(told, path="BAG", got=got, expected="x, y, z, w with a length of 1")
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
     return p.x, p.y, yaw

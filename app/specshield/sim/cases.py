@@ -74,12 +74,8 @@ def load_case(name: str, folder: Path = MAPS) -> Case:
     asked, others = case_name(name), variants(folder)
     name, names = others.get(asked, asked), [*case_names(folder), *others]
     if name not in names:
-        raise NotFound(
-            f"there is no case {name!r} in {folder}",
-            path="case",
-            got=name,
-            expected=f"one of {', '.join(names)}" if names else "a folder with case1.regions.json",
-        )
+        expected = f"one of {', '.join(names)}" if names else "a folder with case1.regions.json"
+        raise NotFound(f"there is no case {name!r} in {folder}", path="case", got=name, expected=expected)
     grid = load_map((folder / f"{name}.yaml").read_text(), (folder / f"{name}.pgm").read_bytes())
     beside = json.loads((folder / f"{name}.regions.json").read_text())
     rooms = {room: region_from_json(spec, f"rooms.{room}") for room, spec in beside["rooms"].items()}

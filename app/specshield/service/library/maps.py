@@ -19,7 +19,7 @@ from typing import Any
 from PIL import Image
 
 from specshield.errors import InUse, MapError, NotFound, SpecshieldError
-from specshield.local.shield import read_map_files
+from specshield.map_files import read_map_files
 from specshield.service.access.keys import Key
 from specshield.service.library import files
 from specshield.service.library.claims import Claimed, Claims, missing

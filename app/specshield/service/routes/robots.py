@@ -29,10 +29,6 @@ async def list_all() -> Any:
 async def read(name: RobotName) -> Any:
     """Its footprint, and what each action does: metres along the heading, then radians counter-clockwise."""
     if name not in PRESETS:
-        raise NotFound(
-            f"there is no robot {name!r}",
-            path="name",
-            got=name,
-            expected=f"one of {', '.join(sorted(PRESETS))}",
-        )
+        expected = f"one of {', '.join(sorted(PRESETS))}"
+        raise NotFound(f"there is no robot {name!r}", path="name", got=name, expected=expected)
     return describe(PRESETS[name])
