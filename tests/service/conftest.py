@@ -8,7 +8,15 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.browsing import Browse, chromium
 from tests.service.world import LOGITS, START, grid_json, send_policy
+
+
+@pytest.fixture(scope="module")
+def browse() -> Iterator[Browse]:
+    """`browse()` opens a page in a browser that the tests of a module share: to start one takes 2 s."""
+    with chromium() as browse:
+        yield browse
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 
 from specshield.stl.formula import BODY_WORDS, KEYWORDS
 from specshield.task import POSE_NAMES
-from tests.browsing import browsing, needs_chromium
+from tests.browsing import needs_chromium
 from tests.houses import HOUSES, needs_houses
 from tests.service.world import ahead, grid_json
 from tests.serving import serving
@@ -75,11 +75,11 @@ def draw(page, floor, shape, start, end, name):
     field.press("Enter")
 
 
-def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
+def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path, browse):
     """Upload, draw, write, make, begin, push, drop, see: as somebody does it who has nothing but the page."""
     (tmp_path / "house.json").write_text(json.dumps(house()))
     (tmp_path / "sizes.json").write_text(json.dumps(SIZES))
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(own.url)
         page.get_by_text("No robot is here yet").wait_for()
         look(page, "empty")
@@ -151,12 +151,12 @@ def test_from_a_house_to_why_an_action_is_forbidden(own, tmp_path):
     assert len(complaints) - len(unasked) <= 2
 
 
-def test_a_map_far_from_its_frames_origin_is_drawn_on_as_any(own):
+def test_a_map_far_from_its_frames_origin_is_drawn_on_as_any(own, browse):
     """As maps in UTM are. What a browser keeps of a number in an SVG would be half a metre off there."""
     sent = grid_json()
     sent["info"]["origin"]["position"] |= {"x": 448251.25, "y": 5411932.75}
     id = httpx.post(f"{own.url}/v1/maps", json=sent, timeout=None).json()["id"]
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(f"{own.url}/#/maps/{id}")
         page.locator(".walls image").wait_for(state="attached")
         box = page.locator("svg.floor").get_attribute("viewBox")
@@ -174,11 +174,11 @@ def small(own):
     return f"{own.url}/#/maps/{id}"
 
 
-def test_a_region_takes_any_name_but_a_word_of_the_rules_and_what_is_edited_is_kept_at_once(small):
+def test_a_region_takes_any_name_but_a_word_of_the_rules_and_what_is_edited_is_kept_at_once(small, browse):
     """A region called F would, named anew, have taken the operator F of the rule with it."""
     fit = ["constructor", "toString", "__proto__", "true", "Dock_2"]
     unfit = ["Küche", "Region 1", "1abc", "", "a" * 65, *KEYWORDS, *BODY_WORDS, *POSE_NAMES]
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(small)
         page.locator(".walls image").wait_for(state="attached")
         draw(page, Floor(page), "Circle", (1.0, 1.0), (1.5, 1.0), "Dock")
@@ -221,8 +221,8 @@ def test_a_region_takes_any_name_but_a_word_of_the_rules_and_what_is_edited_is_k
     assert complaints == []
 
 
-def test_regions_are_made_with_a_keyboard_alone(small):
-    with browsing() as (page, complaints):
+def test_regions_are_made_with_a_keyboard_alone(small, browse):
+    with browse() as (page, complaints):
         page.goto(small)
         page.locator(".walls image").wait_for(state="attached")
         rows = page.locator("ul.regions li")
@@ -283,8 +283,8 @@ def test_regions_are_made_with_a_keyboard_alone(small):
     assert complaints == []
 
 
-def test_two_fingers_draw_nothing_and_zoom_one_draws(small):
-    with browsing(has_touch=True) as (page, complaints):
+def test_two_fingers_draw_nothing_and_zoom_one_draws(small, browse):
+    with browse(has_touch=True) as (page, complaints):
         page.goto(small)
         page.locator(".walls image").wait_for(state="attached")
         fingers = page.context.new_cdp_session(page)
@@ -317,13 +317,13 @@ def test_two_fingers_draw_nothing_and_zoom_one_draws(small):
 
 
 @pytest.mark.parametrize(("width", "height"), [(200, 1), (1, 160)])
-def test_a_long_and_narrow_floor_is_drawn_on_once_it_is_near(own, width, height):
+def test_a_long_and_narrow_floor_is_drawn_on_once_it_is_near(own, width, height, browse):
     sent = grid_json()
     sent["info"] |= {"resolution": 0.5, "width": width, "height": height}
     sent["data"] = [0] * (width * height)
     id = httpx.post(f"{own.url}/v1/maps", json=sent, timeout=None).json()["id"]
     middle = (width / 4, height / 4)
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(f"{own.url}/#/maps/{id}")
         page.locator(".walls image").wait_for(state="attached")
         look(page, "narrow")
@@ -342,8 +342,8 @@ def test_a_long_and_narrow_floor_is_drawn_on_once_it_is_near(own, width, height)
     assert complaints == []
 
 
-def test_a_file_that_holds_no_map_is_named(own, tmp_path):
-    with browsing() as (page, complaints):
+def test_a_file_that_holds_no_map_is_named(own, tmp_path, browse):
+    with browse() as (page, complaints):
         page.goto(f"{own.url}/#/maps")
         for text, said in {"null": "null", "[1]": "a list", "3": "a number"}.items():
             (tmp_path / "map.json").write_text(text)
@@ -353,11 +353,11 @@ def test_a_file_that_holds_no_map_is_named(own, tmp_path):
 
 
 @needs_houses
-def test_a_real_house(own):
+def test_a_real_house(own, browse):
     """A ProcTHOR house with its rooms and a place that is drawn: it is seen why the robot may not go straight
     on at first; pushed, and with an obstacle, it keeps the rule to its end.
     """
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(f"{own.url}/#/maps")
         page.get_by_label("Name").fill("real-house")
         page.locator("#files").set_input_files([HOUSES / "house_0.json", HOUSES / "asset-sizes.json"])
@@ -391,14 +391,14 @@ def test_a_real_house(own):
     assert complaints == []
 
 
-def test_a_floor_with_robots_that_are_over(server, client, begin, step):
+def test_a_floor_with_robots_that_are_over(server, client, begin, step, browse):
     """Walls, ways and steps are there; what is seen follows the wheel, the mouse and the keys."""
     sessions = [begin(), begin()]
     for session in sessions:
         for t, pose in enumerate(ahead(3)):
             assert step(session, t, [pose]).status_code == 200
         client.post(f"/v1/sessions/{session['id']}/close", json={})
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(f"{server.url}/#/floor?sessions={','.join(session['id'] for session in sessions)}")
         page.locator(".walls image").wait_for(state="attached")
         page.get_by_text("3 / 3").wait_for()
@@ -427,9 +427,9 @@ def test_a_floor_with_robots_that_are_over(server, client, begin, step):
     assert complaints == []
 
 
-def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step):
+def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step, browse):
     session = begin()
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(f"{server.url}/#/sessions/{session['id']}")
         page.get_by_text("live").wait_for()
         for t, pose in enumerate(ahead(3)):
@@ -441,8 +441,8 @@ def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step):
     assert complaints == []
 
 
-def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path):
-    with serving(tmp_path, SPECSHIELD_API_KEY="a-secret-key") as running, browsing() as (page, _):
+def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path, browse):
+    with serving(tmp_path, SPECSHIELD_API_KEY="a-secret-key") as running, browse() as (page, _):
         page.goto(running.url)
         field = page.get_by_label("API key")
         field.wait_for()

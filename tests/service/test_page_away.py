@@ -6,7 +6,7 @@ import json
 
 import httpx
 
-from tests.browsing import browsing, needs_chromium
+from tests.browsing import needs_chromium
 from tests.service.world import START, policy_files
 from tests.serving import HUNG, free_port, serving, wait_for
 
@@ -27,12 +27,12 @@ def stand(url, id, t=0):
     assert response.status_code == 200, response.text
 
 
-def test_what_watches_a_fleet_lasts_through_a_restart(tmp_path):
+def test_what_watches_a_fleet_lasts_through_a_restart(tmp_path, browse):
     """The lists, a session, a floor, and a view that was asked for meanwhile, say that the server is away,
     and go on when it is back, where the keyboard was. Then the session is erased.
     """
     port, fleet = free_port(), [f"robot-of-the-warehouse-north-{n:04}" for n in range(1, 4)]
-    with browsing() as (robots, complaints):
+    with browse() as (robots, complaints):
         with serving(tmp_path, port=port) as first:
             for id in fleet[:2]:
                 stand(first.url, id)
@@ -74,8 +74,8 @@ def test_what_watches_a_fleet_lasts_through_a_restart(tmp_path):
     assert [text for text in complaints if "ERR_" not in text and "503" not in text] == []
 
 
-def test_a_view_that_cannot_be_read_is_told_and_the_page_does_not_begin_anew_for_ever(server):
-    with browsing() as (page, _):
+def test_a_view_that_cannot_be_read_is_told_and_the_page_does_not_begin_anew_for_ever(server, browse):
+    with browse() as (page, _):
         page.route("**/views/maps.js", lambda route: route.abort())
         page.goto(f"{server.url}/#/maps")
         page.get_by_role("heading", name="This cannot be shown").wait_for()
@@ -84,7 +84,7 @@ def test_a_view_that_cannot_be_read_is_told_and_the_page_does_not_begin_anew_for
         page.get_by_role("heading", name="Maps").wait_for()
 
 
-def test_a_trial_lasts_through_lost_answers_and_is_closed_when_it_is_left(server, client, policy):
+def test_a_trial_lasts_through_lost_answers_and_is_closed_when_it_is_left(server, client, policy, browse):
     """A double click before the map is there begins one session. A step whose answer is lost is sent again as
     it was, with the obstacle that it tells of.
     """
@@ -93,7 +93,7 @@ def test_a_trial_lasts_through_lost_answers_and_is_closed_when_it_is_left(server
         return [each["id"] for each in client.get("/v1/sessions").json()["items"] if not each["finished"]]
 
     before = set(under_way())
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         held, free = [], []
         page.route("**/image.png", lambda route: route.continue_() if free else held.append(route))
         page.goto(f"{server.url}/#/try/{policy['id']}")
@@ -152,12 +152,12 @@ def test_a_trial_lasts_through_lost_answers_and_is_closed_when_it_is_left(server
     assert [text for text in complaints if "ERR_" not in text and refused not in text] == []
 
 
-def test_what_cannot_be_shown_is_said_under_a_heading_and_a_title_of_its_own(server, client, policy):
+def test_what_cannot_be_shown_is_said_under_a_heading_and_a_title_of_its_own(server, client, policy, browse):
     files = policy_files(seed=7)
     warning = "no start that was drawn can keep the rule"
     files["card"] = json.dumps({**json.loads(files["card"]), "warnings": [warning]}).encode()
     sent = client.post("/v1/policies", files={name: (name, content) for name, content in files.items()})
-    with browsing() as (page, complaints):
+    with browse() as (page, complaints):
         page.goto(f"{server.url}/#/policies/{sent.json()['id']}")
         page.get_by_label("State").get_by_text(warning).wait_for()
         for path, heading in [

@@ -16,8 +16,8 @@ from specshield.sim.model import GoalSeeker
 from specshield.sim.robot import SimulatedRobot
 from tests.oracles.judge import margin
 
-EPISODES = {  # 212 of them; learned policies take longer to ask
-    ("case1", "dqn"): 64, ("case2", "dqn"): 20, ("case1", "reachability"): 64, ("case2", "reachability"): 64,
+EPISODES = {  # 132 of them; learned policies take longer to ask
+    ("case1", "dqn"): 32, ("case2", "dqn"): 20, ("case1", "reachability"): 40, ("case2", "reachability"): 40,
 }  # fmt: skip
 
 
