@@ -10,6 +10,7 @@ from contextlib import ExitStack, suppress
 
 import httpx
 import msgpack
+import psutil
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -20,11 +21,11 @@ from websockets.sync.client import connect
 
 from specshield.client import ShieldClient
 from specshield.errors import InputError
-from specshield.service.leaving import Streams
+from specshield.local import LocalShield
 from specshield.service.routes.messages import read_step
 from specshield.service.schemas.steps import StepRequest
-from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import serving
+from tests.service.world import LOGITS, ROBOT, START, ahead, grid_json, send_policy
+from tests.serving import command_line, serving, wait_for
 
 PACKED = {"Content-Type": "application/msgpack", "Accept": "application/msgpack"}
 
@@ -242,27 +243,38 @@ def test_a_server_that_stops_says_so_to_its_streams(tmp_path):
             assert closed.value.rcvd.code == 1001
 
 
-def test_streams_are_told_before_the_server_cuts_their_connections():
-    """uvicorn cuts them in the next turn of its loop that comes after the signal, with a code of its own."""
-    order = []
+def test_a_server_that_stops_ends_a_stream_after_the_step_that_it_is_deciding(tmp_path):
+    """A planner decides, and its process stands still until the server has closed its port."""
+    made = LocalShield.make(grid_json(), "F[0,20] x > 1.5", robot=ROBOT, method="planner", check=False)
+    files = {"weights": ("w", made.weights), "card": ("c", json.dumps(dict(made.card)).encode())}
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
+        client.post("/v1/maps", json=grid_json())
+        asked = {"policy_id": client.post("/v1/policies", files=files).json()["id"], "initial_pose": START}
+        session = client.post("/v1/sessions", json=asked).json()
+        with connect(stream_of(server, session)) as stream:
+            stream.send(json.dumps(body(0)))
+            assert json.loads(stream.recv())["t"] == 0
+            below = psutil.Process(server.process.pid).children(recursive=True)
+            planners = [each for each in below if "heavy.child" in command_line(each.pid)]
+            assert planners
+            for each in planners:
+                each.suspend()
+            stream.send(json.dumps(body(1)))
+            for _ in range(3):
+                client.get("/livez")  # the server has read what was sent before
+            server.process.send_signal(signal.SIGTERM)
+            wait_for(lambda: is_free(client.base_url.port))
+            for each in planners:
+                each.resume()
+            assert json.loads(stream.recv())["t"] == 1
+            with pytest.raises(ConnectionClosed) as closed:
+                stream.recv()
+            assert closed.value.rcvd.code == 1001
 
-    async def scene():
-        async def say_why():
-            order.append("told")
 
-        streams = Streams()
-        streams.open.add(lambda: order.append(asyncio.get_running_loop().create_task(say_why())))
-        streams.close_at_stop()
-        signal.raise_signal(signal.SIGTERM)
-        while "cut" not in order:
-            await asyncio.sleep(0)
-
-    before = signal.signal(signal.SIGTERM, lambda signum, frame: order.append("cut"))
-    try:
-        asyncio.run(scene())
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert order[1:] == ["told", "cut"]
+def is_free(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) != 0
 
 
 SCALARS = (

@@ -36,8 +36,8 @@ class Streams:
 
             def told(signum: int, frame: Any, stop: Any = stop) -> None:
                 loop.call_soon_threadsafe(self.close)
-                if callable(stop):  # two turns later: by then the streams have been told why
-                    loop.call_soon_threadsafe(loop.call_soon, stop, signum, frame)
+                if callable(stop):
+                    stop(signum, frame)
 
             signal.signal(name, told)  # uvicorn puts its caller's handlers back at the end
 

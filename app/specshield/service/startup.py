@@ -32,6 +32,7 @@ READY, COMPLETE = "ready", "complete"
 KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 70  # [s] a first start on two quiet cores, which took 34 to 73: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
+LAST = 19  # the niceness of what is compiled in the background: after all that others do
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
 # [objects] more than there were, at which a collection looks for cycles among them. With Python's 700 it took
 # 18 us of a step and found none, with this 4 (gc.callbacks under `benchmarks.step_cost --robots 16`).
@@ -115,8 +116,8 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         )
 
 
-async def complete(startup: Startup, at_once: int = 1) -> bool:
-    """Once the server is ready, compiles what only some rules and robots need, in `at_once` processes. Their
+async def complete(startup: Startup, at_once: int = 1, nice: int = LAST) -> bool:
+    """Once the server is ready, compiles what only some rules and robots need, so many parts at once. Their
     first decision would else compile it, while all others wait. False where something was left out.
     """
     while not startup.ready:
@@ -126,7 +127,7 @@ async def complete(startup: Startup, at_once: int = 1) -> bool:
         if mark is None or mark.exists():
             return True
         log.info("compiling, in the background, the kernels that only some rules and robots need")
-        await _compile(startup, warmup.LATER, mark, at_once)
+        await _compile(startup, warmup.LATER, mark, at_once, nice)
         if mark.exists():
             return True
         log.warning("some kernels are not compiled: the first decision that needs one will wait for it")
@@ -135,22 +136,21 @@ async def complete(startup: Startup, at_once: int = 1) -> bool:
     return False
 
 
-async def _compile(startup: Startup, parts: Iterable[str], mark: Path, at_once: int) -> None:
+async def _compile(startup: Startup, parts: Iterable[str], mark: Path, at_once: int, nice: int = 0) -> None:
     """Compiles these parts, a process each, so many at once, and makes the mark once all are on the disk."""
     free = asyncio.Semaphore(at_once)
     async with _one_at_a_time(mark.with_suffix(".lock")):
         if mark.exists():  # another process has done it meanwhile
             return
-        if all(await asyncio.gather(*(_compile_part(part, startup, free) for part in parts))):
+        if all(await asyncio.gather(*(_compile_part(part, startup, free, nice) for part in parts))):
             mark.touch()
 
 
-async def _compile_part(part: str, startup: Startup, free: asyncio.Semaphore) -> bool:
+async def _compile_part(part: str, startup: Startup, free: asyncio.Semaphore, nice: int) -> bool:
     """Whether the process that compiles this part came to its end."""
     async with free:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "specshield.service.warmup", part, stdin=asyncio.subprocess.PIPE
-        )
+        program = sys.executable, "-m", "specshield.service.warmup", part, str(nice)
+        process = await asyncio.create_subprocess_exec(*program, stdin=asyncio.subprocess.PIPE)
         try:
             done = await process.wait() == 0
         finally:
@@ -191,7 +191,7 @@ def main() -> None:
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     startup = Startup()
     asyncio.run(prepare(startup))
-    if startup.ready and not asyncio.run(complete(startup, cores())):
+    if startup.ready and not asyncio.run(complete(startup, cores(), 0)):
         sys.exit("some kernels are not compiled; the lines above say why")
     sys.exit(startup.failure)
 

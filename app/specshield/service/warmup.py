@@ -1,6 +1,6 @@
 """Compiles what a decision needs, on a world of a few cells, before the server says it is ready.
 
-    python -m specshield.service.warmup PART     # compiles one part, for `startup`; the disk keeps it
+    python -m specshield.service.warmup PART NICENESS    # compiles one part, for `startup`; the disk keeps it
 
 The parts have few kernels in common, so that two processes can compile them side by side. What only some
 rules and robots need is compiled once the server is ready, so that no decision of theirs waits for it. What a
@@ -170,6 +170,6 @@ def _keep_all() -> None:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     at_end_of_input(lambda: os._exit(1))  # the server is gone
-    os.nice(19 if sys.argv[1] in LATER else 0)
+    os.nice(int(sys.argv[2]))
     _keep_all()
     warm_up(sys.argv[1])

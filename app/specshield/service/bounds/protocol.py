@@ -170,6 +170,11 @@ class BoundedStream(WebSocketsSansIOProtocol):
         if self.queue.empty():
             self.loop.call_soon(self.data_received)
 
+    def shutdown(self) -> None:
+        """An open stream ends itself, after the step that is being decided: `leaving.Streams`."""
+        if self.close_sent or not self.handshake_complete:
+            super().shutdown()
+
     async def receive(self) -> Any:
         waiting = BoundedProtocol.waiting
         idle = self.loop.call_later(_settings().keep_alive_timeout, waiting.setdefault, self)

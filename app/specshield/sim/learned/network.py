@@ -93,13 +93,10 @@ SHAPES = _shapes()
 
 def check(weights: Mapping[str, NDArray[np.generic]]) -> dict[str, Singles]:
     """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
-    if sorted(weights) != sorted(SHAPES):
-        raise PolicyError(
-            "not the tensors of a foundation model",
-            path="weights",
-            got=sorted(weights),
-            expected=str(sorted(SHAPES)),
-        )
+    got, expected = sorted(weights), sorted(SHAPES)
+    if got != expected:
+        told = "not the tensors of a foundation model"
+        raise PolicyError(told, path="weights", got=got, expected=str(expected))
     for name, shape in SHAPES.items():
         array = weights[name]
         if array.dtype != np.float32 or array.shape != shape or not np.isfinite(array).all():
