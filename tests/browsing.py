@@ -36,15 +36,12 @@ def chromium() -> Iterator[Browse]:
             page.set_default_timeout(1e3 * HUNG)
             page.on("console", lambda message: message.type == "error" and complaints.append(message.text))
             page.on("pageerror", lambda error: complaints.append(str(error)))
-            yield page, complaints
-            page.close()
+            try:
+                yield page, complaints
+            finally:
+                page.close()
 
-        yield browse
-        browser.close()
-
-
-@contextmanager
-def browsing(**options: Any) -> Iterator[Any]:
-    """A page in a browser of its own."""
-    with chromium() as browse, browse(**options) as found:
-        yield found
+        try:
+            yield browse
+        finally:
+            browser.close()

@@ -25,7 +25,7 @@ import psutil
 
 
 class Forked:
-    """`specshield` with these arguments, forked from this process's template; it can do what a Popen can."""
+    """`specshield` with these arguments, forked from the template. It has of a Popen what tests use."""
 
     def __init__(self, arguments: list[str], environment: dict[str, str], **files: Path) -> None:
         """files: `stdout` and `stderr`, and the folder `cwd` to work in."""
@@ -36,7 +36,7 @@ class Forked:
         command = {"arguments": arguments, "environment": environment, **named}
         self._told.sendall(json.dumps(command).encode() + b"\n")
         self._lines = self._told.makefile()
-        self.pid = int(self._lines.readline())
+        self.pid = self._told_number()
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
@@ -48,17 +48,28 @@ class Forked:
         if self.returncode is None:
             if not select.select([self._told], [], [], timeout)[0]:
                 raise subprocess.TimeoutExpired("specshield", timeout or 0)
-            self.returncode = int(self._lines.readline())
+            self.returncode = self._told_number()
             self._lines.close()
             self._told.close()
         return self.returncode
 
     def send_signal(self, number: int) -> None:
         if self.poll() is None:
-            os.kill(self.pid, number)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.kill(self.pid, number)
 
     def kill(self) -> None:
         self.send_signal(signal.SIGKILL)
+
+    def _told_number(self) -> int:
+        line = self._lines.readline()
+        assert line, "the process that tests are forked from has ended; its output says why"
+        return int(line)
+
+
+def _environment() -> dict[str, str]:
+    """This process's, without what would join a server to the developer's own."""
+    return {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
 
 
 @cache
@@ -67,7 +78,7 @@ def _template() -> socket.socket:
     control, theirs = socket.socketpair()
     with theirs:
         program = [sys.executable, "-m", "tests.template"]
-        subprocess.Popen(program, cwd=Path(__file__).parents[1], stdin=theirs.fileno())
+        subprocess.Popen(program, cwd=Path(__file__).parents[1], stdin=theirs.fileno(), env=_environment())
     return control
 
 
@@ -107,7 +118,7 @@ def free_port() -> int:
     raise OSError("no port from 20000 to 31999 is free")
 
 
-# A server with one of these has an interpreter of its own, since the template has looked at them already.
+# A server with one of these has an interpreter of its own, since the template read them when it began.
 READ_AT_IMPORT = {
     "NUMBA_CACHE_DIR",
     "PYTHONPATH",
@@ -123,12 +134,11 @@ def serving(
 ) -> Iterator[RunningServer]:
     """`specshield serve`. port: 0 is a free one. environment: settings, as in SPECSHIELD_SESSION_TTL="1"."""
     port = port or free_port()
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
     data_dir.mkdir(parents=True, exist_ok=True)
     log = data_dir / "server.log"
     arguments = ["serve", "--port", str(port), *options]
     settings = {
-        **kept,
+        **_environment(),
         "SPECSHIELD_DATA_DIR": str(data_dir),
         "SPECSHIELD_WORKER": "false",
         "TMPDIR": str(data_dir),  # what a killed server leaves goes with the test
@@ -159,11 +169,15 @@ def serving(
 def run_specshield(
     *arguments: object, cwd: Path | None = None, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    """`specshield`, to its end. environment: variables beside this process's own."""
+    """`specshield`, forked, to its end. environment: settings beside this process's variables."""
     with tempfile.TemporaryDirectory() as folder:
         out, err = Path(folder, "stdout"), Path(folder, "stderr")
-        words, given = [str(each) for each in arguments], {**os.environ, **environment}
-        code = Forked(words, given, stdout=out, stderr=err, cwd=cwd or Path.cwd()).wait(HUNG)
+        words, given = [str(each) for each in arguments], {**_environment(), **environment}
+        process = Forked(words, given, stdout=out, stderr=err, cwd=cwd or Path.cwd())
+        try:
+            code = process.wait(HUNG)
+        finally:
+            process.kill()
         return subprocess.CompletedProcess(words, code, out.read_text(), err.read_text())
 
 

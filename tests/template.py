@@ -37,6 +37,7 @@ def main(control: socket.socket) -> None:
     asyncio.run(prepare(Startup()))
     gc.freeze()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the keepers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the commands
     while True:
         sent, descriptors, _, _ = socket.recv_fds(control, 1, 1)
         if not sent:
@@ -50,7 +51,7 @@ def main(control: socket.socket) -> None:
 
 
 def _keep(told: socket.socket) -> None:
-    """Runs the command that is asked for in a fork, says its process id, and at its end how it ended."""
+    """Forks the command that the test asks for. Tells it the process id, and at the end the exit status."""
     with told.makefile() as asked:
         command = json.loads(asked.readline())
     pid = os.fork()
@@ -66,7 +67,8 @@ def _keep(told: socket.socket) -> None:
 
 
 def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr: str, cwd: str) -> None:
-    """Returns, or raises, to the end of this process, as the console script does."""
+    """Its return, or what it raises, ends this process, as with the console script."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     for stream, path in ((1, stdout), (2, stderr)):
         file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         os.dup2(file, stream)
@@ -77,7 +79,7 @@ def _run(arguments: list[str], environment: dict[str, str], stdout: str, stderr:
     tempfile.tempdir = None  # TMPDIR is another one now
     sys.argv = ["specshield", *arguments]
     main_module = sys.modules["__main__"]
-    main_module.__spec__ = main_module.__package__ = None  # as of the console script: of no package
+    main_module.__spec__ = main_module.__package__ = None  # which `python -m` has set
     cli.main()
 
 

@@ -15,16 +15,21 @@ from specshield.world.regions import Region
 def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
     """The map of a `.yaml`, and the areas that `<name>.regions.json` beside it names, where that is there.
 
-    The image is the one that the YAML names, else `<name>.pgm` or `<name>.png`, beside it. Raises MapError.
+    The image is the PGM or PNG that the YAML names, else `<name>.pgm` or `<name>.png`, beside it. Raises
+    MapError, and ValueError where the areas are no JSON.
     """
     try:
         text = path.read_text()
-        own = path.parent / Path(str(read_yaml(text).get("image", ""))).name
-        images = own, path.with_suffix(".pgm"), path.with_suffix(".png")
-        grid = load_map(text, next(image for image in images if image.is_file()).read_bytes())
-    except (OSError, UnicodeDecodeError, StopIteration):
+    except (OSError, UnicodeDecodeError):
         expected = "a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it"
         raise MapError("no map can be read there", path="world", got=str(path), expected=expected) from None
+    own = path.parent / Path(str(read_yaml(text).get("image", ""))).name
+    images = own, path.with_suffix(".pgm"), path.with_suffix(".png")
+    found = [each for each in images if each.suffix.lower() in (".pgm", ".png") and each.is_file()]
+    if not found:
+        expected = "the PGM or PNG that the YAML names, or one called like the YAML"
+        raise MapError("its image is not beside it", path="image", got=str(path), expected=expected)
+    grid = load_map(text, found[0].read_bytes())
     named = path.with_suffix(".regions.json")
     areas = json.loads(named.read_bytes()) if named.is_file() else {}
     return grid, parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})

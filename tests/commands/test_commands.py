@@ -139,6 +139,26 @@ def test_a_server_of_its_own_that_does_not_come_up_is_told_without_a_traceback(a
     ]
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        ("policy", "--map", "none.yaml", "--rule", "F[0,9] x > 1"),
+        ("run", "none", "--target", "1"),
+        ("watch", "none", "--url", "http://127.0.0.1:9"),
+        ("export", "none", "--to", "csv"),
+        ("check-drive", "none", "--policy", "case1", "--step-seconds", "1"),
+        ("verify", "none"),
+    ],
+)
+def test_a_command_imports_what_it_needs(asked, tmp_path):
+    """In an interpreter of its own: what other tests fork has imported everything."""
+    done = subprocess.run(
+        [sys.executable, "-m", "specshield.cli", *asked], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
 def test_what_is_told_on_a_terminal_does_not_join_what_was_being_done(tmp_path):
     outer, inner = os.openpty()
     data = {**os.environ, "SPECSHIELD_DATA_DIR": str(tmp_path / "data")}

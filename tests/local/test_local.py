@@ -145,6 +145,7 @@ def test_a_model_that_ends_is_asked_again_under_another_rule(server: RunningServ
         assert local.finished
         taken = remote.switch(there[1]), local.switch(here[1])
         assert {(each.spec_status, each.finished) for each in (*taken, local)} == {("pending", False)}
+        assert [each.main_task_done for each in taken] == [False, False]  # no step has said so
         pose = begins
         while not local.finished:
             decision = local.step(pose)
@@ -223,6 +224,7 @@ def test_what_a_rule_led_to_counts_for_it_after_a_switch(server: RunningServer, 
         for session in (remote, local):
             session.step(pose, signals={"battery": 8.0})
         assert [rule["spec_status"] for rule in local.info.rules] == ["satisfied", "pending"]
+        assert local.info.spec_status == "pending"
         again = sdk.sessions.get(remote.id).info.rules
         assert [rule["spec_status"] for rule in again] == ["satisfied", "pending"]
         assert [(each.t, each.rule, each.signals) for each in local.trajectory()] == [
@@ -326,7 +328,12 @@ def test_a_map_has_the_image_that_its_yaml_names(tmp_path: Path) -> None:
     (tmp_path / "newer.pgm").unlink()
     assert read_map_files(tmp_path / "floor.yaml") == (older, {})
     (tmp_path / "floor.pgm").unlink()
-    for nothing in (tmp_path / "floor.yaml", tmp_path, tmp_path / "none.yaml"):
+    (tmp_path / "newer.bmp").touch()  # of a kind that is not read
+    for named in ("newer.pgm", "newer.bmp"):
+        (tmp_path / "floor.yaml").write_text(metadata.replace("newer.pgm", named))
+        with pytest.raises(MapError, match="its image is not beside it"):
+            read_map_files(tmp_path / "floor.yaml")
+    for nothing in (tmp_path, tmp_path / "none.yaml"):
         with pytest.raises(MapError, match="no map can be read there"):
             LocalShield.make(nothing, "F[0,9] x > 1")
 

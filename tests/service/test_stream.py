@@ -6,6 +6,7 @@ import signal
 import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 
 import httpx
@@ -25,7 +26,7 @@ from specshield.local import LocalShield
 from specshield.service.routes.messages import read_step
 from specshield.service.schemas.steps import StepRequest
 from tests.service.world import LOGITS, ROBOT, START, ahead, grid_json, send_policy
-from tests.serving import command_line, serving, wait_for
+from tests.serving import HUNG, command_line, serving, wait_for
 
 PACKED = {"Content-Type": "application/msgpack", "Accept": "application/msgpack"}
 
@@ -244,7 +245,9 @@ def test_a_server_that_stops_says_so_to_its_streams(tmp_path):
 
 
 def test_a_server_that_stops_ends_a_stream_after_the_step_that_it_is_deciding(tmp_path):
-    """A planner decides, and its process stands still until the server has closed its port."""
+    """A planner decides, and its process stands still until the server has closed its port. The server gives
+    it 10 s from then on, of which nothing here takes one.
+    """
     made = LocalShield.make(grid_json(), "F[0,20] x > 1.5", robot=ROBOT, method="planner", check=False)
     files = {"weights": ("w", made.weights), "card": ("c", json.dumps(dict(made.card)).encode())}
     with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
@@ -263,13 +266,36 @@ def test_a_server_that_stops_ends_a_stream_after_the_step_that_it_is_deciding(tm
             for _ in range(3):
                 client.get("/livez")  # the server has read what was sent before
             server.process.send_signal(signal.SIGTERM)
-            wait_for(lambda: is_free(client.base_url.port))
-            for each in planners:
-                each.resume()
+            try:
+                wait_for(lambda: is_free(client.base_url.port))
+            finally:
+                for each in planners:
+                    each.resume()
             assert json.loads(stream.recv())["t"] == 1
             with pytest.raises(ConnectionClosed) as closed:
                 stream.recv()
             assert closed.value.rcvd.code == 1001
+
+
+def test_a_stream_that_is_being_opened_when_the_server_stops_ends_too(tmp_path):
+    """The store stands still while the session is looked for. uvicorn may refuse it before it is open."""
+    with serving(tmp_path) as server, httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
+        client.post("/v1/maps", json=grid_json())
+        asked = {"policy_id": send_policy(client)["id"], "initial_pose": START}
+        session = client.post("/v1/sessions", json=asked).json()
+        below = psutil.Process(server.process.pid).children(recursive=True)
+        (store,) = (each for each in below if "valkey-server" in each.name())
+        store.suspend()
+        with ThreadPoolExecutor(1) as beside:
+            opened = beside.submit(connect, stream_of(server, session), open_timeout=HUNG)
+            for _ in range(3):
+                client.get("/livez")
+            server.process.send_signal(signal.SIGTERM)
+            store.resume()
+            with suppress(InvalidStatus), opened.result() as stream:
+                with pytest.raises(ConnectionClosed) as closed:
+                    stream.recv()
+                assert closed.value.rcvd.code == 1001
 
 
 def is_free(port):

@@ -139,8 +139,8 @@ def test_lines_for_people_say_the_same_and_stay_one_line_each(tmp_path):
         assert "decided" not in text  # only at debug
 
 
-def test_lines_of_the_processes_that_read_uploads_are_of_the_same_form(tmp_path):
-    settings = {"SPECSHIELD_LOG_FORMAT": "json", "SPECSHIELD_MAX_HORIZON": "100"}  # theirs: more
+def test_lines_of_the_processes_for_heavy_work_are_of_the_same_form(tmp_path):
+    settings = {"SPECSHIELD_LOG_FORMAT": "json", "SPECSHIELD_MAX_HORIZON": "100"}  # case2 asks for more
     with serving(tmp_path, **settings) as server:
         body = {"map_id": "case1", "spec": {"formula": "F[0,60] Kitchen"}}
         assert httpx.post(f"{server.url}/v1/policies", json=body, timeout=None).status_code == 503

@@ -20,7 +20,9 @@ LARGEST = 64 << 20  # [bytes] of a file; a server's own limit for a map
 
 
 def policy(
-    map: Annotated[str, typer.Option(help="A map's file, a house's, or the name of one on the server.")],
+    map: Annotated[
+        str, typer.Option(help="A map's file, a grid's or a house's; else a map's name on the server.")
+    ],
     rule: Annotated[
         str, typer.Option(help="What has to be kept, as 'F[0,60] Kitchen and G[0,60] not Hall'.")
     ],
@@ -89,11 +91,6 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
         )
     if not a_file:
         return lambda client: client.maps.get(map)
-    if "rooms" in content:
-        sizes = {} if assets is None else _read(assets, "--assets")
-        return lambda client: client.maps.procthor(content, sizes)
-    if "info" in content:
-        return lambda client: client.maps.occupancy_grid(content["info"], content.get("data", []))
     if "image" in content:
         image = path.parent / Path(str(content["image"])).name
         if not image.is_file():
@@ -103,6 +100,11 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
                 expected="the map's PGM or PNG beside its YAML",
             )
         return lambda client: client.maps.upload(path, image)
+    if "rooms" in content:
+        sizes = {} if assets is None else _read(assets, "--assets")
+        return lambda client: client.maps.procthor(content, sizes)
+    if "info" in content:
+        return lambda client: client.maps.occupancy_grid(content["info"], content.get("data", []))
     raise InputError(
         f"{path} is no map of a known form",
         path="--map",
@@ -125,8 +127,10 @@ def _read(path: Path, option: str) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise InputError(f"{path} cannot be read: {reason}", path=option, got=str(path)) from None
     try:
-        # The first document: `ros2 topic echo` ends a message with `---`.
-        value = json.loads(text) if path.suffix == ".json" else next(yaml.safe_load_all(text), None)
+        # `ros2 topic echo` ends a message with `---`. Without the parser in C, a large grid takes a minute.
+        text = text if path.suffix == ".json" else text.rstrip().removesuffix("\n---")
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        value = json.loads(text) if path.suffix == ".json" else yaml.load(text, loader)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
     if not isinstance(value, dict):

@@ -63,6 +63,7 @@ class LocalSession:
         self.t = 0
         self.spec_status: SpecStatus = info.spec_status
         self.finished = self.main_task_done = self.closed = False
+        self._told_done = False  # whether the last step said that the main task is done
         self._over = False  # whether a server would refuse what follows: it is not told of a drawn `end`
         self._shaping, self._initial = shaping, initial_pose
         self._rules = [Rule(policy, shield)]
@@ -137,7 +138,7 @@ class LocalSession:
         self._arrived(x_t, held)
         self.spec_status = answer.spec_status
         ends = main_task_done is None and answer.action in self.info.terminal_actions
-        self.main_task_done = over or ends
+        self.main_task_done, self._told_done = over or ends, over
         self._over = answer.finished
         self.finished = answer.finished or (ends and answer.spec_status != "pending")
         return answer
@@ -180,7 +181,7 @@ class LocalSession:
             next_t=self.t,
             feasible=True,
             spec_status=have[-1]["spec_status"],
-            main_task_done=self.main_task_done,
+            main_task_done=self._told_done,
             rules=have,
             any_signal=any_signal(rule.shield, seen, signals),
         )
@@ -226,7 +227,8 @@ class LocalSession:
         self._poses.append(x_t)
         self._signals = held
         if 0 < self.t == self._rules[-1].begins:
-            self.info = replace(self.info, rules=told(self._rules, self._poses, held))
+            have = told(self._rules, self._poses, held)
+            self.info = replace(self.info, rules=have, spec_status=have[-1]["spec_status"])
         self.t += 1
 
     def _check(self, over: bool) -> None:

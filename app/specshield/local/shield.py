@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -212,4 +213,4 @@ def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
     if isinstance(world, Mapping):
         members = dict(world)
         return read_map(members.pop("format", None), members)
-    return read_map_files(Path(str(world)))
+    return read_map_files(Path(world if isinstance(world, os.PathLike) else str(world)))

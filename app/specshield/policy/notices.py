@@ -37,7 +37,7 @@ def notices(policy: Proposer) -> tuple[str, ...]:
     if missed:
         tried = min(len(refused), MOST_SEARCHED)
         finer = "it hardly sees some predicate of the formula; a smaller options.pitch or "
-        coarse = hasattr(getattr(policy, "settings", None), "pitch")  # of a lattice, as not all methods have
+        coarse = hasattr(getattr(policy, "settings", None), "pitch")  # a network has no lattice
         return (
             f"the policy found no future from {len(refused)} of {STARTS} random starts, and a search found "
             f"one from {missed} of {tried} of these: {finer * coarse}another method may find more",

@@ -22,9 +22,10 @@ class Streams:
     """What ends each stream of this process that is open, after the message that is being answered."""
 
     def __init__(self) -> None:
-        self.open = set[Callable[[], None]]()
+        self.open, self.closed = set[Callable[[], None]](), False
 
     def close(self) -> None:
+        self.closed = True
         for stop in list(self.open):
             stop()
 

@@ -117,7 +117,7 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
 
 
 async def complete(startup: Startup, at_once: int = 1, nice: int = LAST) -> bool:
-    """Once the server is ready, compiles what only some rules and robots need, so many parts at once. Their
+    """Once the server is ready, compiles what only some rules and robots need, in `at_once` processes. Their
     first decision would else compile it, while all others wait. False where something was left out.
     """
     while not startup.ready:

@@ -92,7 +92,8 @@ def free_poses(task: Task, body: Body, n: int, random: np.random.Generator) -> F
     """
     xmin, ymin, xmax, ymax = task.grid.bounds
     kept = np.empty((0, 3))
-    # A pose is less than a cell from the middle of its cell. To draw in vain takes 20 s for a radius of 5 m.
+    # No point of a cell is farther from an obstacle than its middle's clearance plus a cell, so a wider robot
+    # fits nowhere. To find that by drawing takes 20 s for a radius of 5 m.
     fits = body.clearance.max() + body.resolution > body.radius
     for _ in range(1000 if fits else 0):
         draw = random.random((2 * n + 64, 3))

@@ -134,12 +134,8 @@ class Keys:
         secret = f"ss_{secrets.token_urlsafe(32)}"
         record = json.dumps(asdict(Key(name, digest_of(secret.encode()), now(), **limits)))
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
-            raise InputError(
-                "there is a key of this name",
-                path="name",
-                got=name,
-                expected="another; or revoke that one first",
-            )
+            expected = "another; or revoke that one first"
+            raise InputError("there is a key of this name", path="name", got=name, expected=expected)
         await _reached(self._store.hincrby(KEYS, "", 1))
         return secret
 

@@ -43,12 +43,10 @@ def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[st
             expected="the address that the server listens on, or a name in SPECSHIELD_ALLOWED_HOSTS",
         )
     if _from_elsewhere(scope.get("method", ""), headers, host, allowed):
-        raise CrossSite(
-            "a page of another origin may not use this server",
-            path="Origin",
-            got=headers.get(b"origin", b"").decode("latin-1") or None,
-            expected="a program, or a page that comes from this server",
-        )
+        told = "a page of another origin may not use this server"
+        expected = "a program, or a page that comes from this server"
+        origin = headers.get(b"origin", b"").decode("latin-1") or None
+        raise CrossSite(told, path="Origin", got=origin, expected=expected)
     if scope.get("method") in WITH_BODY and scope["path"].startswith("/v1/") and _has_body(headers):
         _check_type(scope["path"], headers.get(b"content-type", b"").decode("latin-1"))
 
@@ -110,9 +108,6 @@ def _check_type(path: str, declared: str) -> None:
     elif path.endswith("/steps"):
         taken.append("application/msgpack")
     if kind not in taken and not JSON.fullmatch(kind):
-        raise UnsupportedMediaType(
-            "the body is not declared as a type that is taken here",
-            path="Content-Type",
-            got=declared,
-            expected=f"the header Content-Type: {' or '.join(taken)}",
-        )
+        told, expected = "the body is not declared as a type that is taken here", " or ".join(taken)
+        expected = f"the header Content-Type: {expected}"
+        raise UnsupportedMediaType(told, path="Content-Type", got=declared, expected=expected)

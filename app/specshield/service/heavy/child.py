@@ -87,7 +87,7 @@ def _call(call: bytes) -> tuple[Any, BaseException | None]:
     except MemoryError:
         return None, MemoryError()
     except BaseException as error:
-        logs.log.exception("a process for uploads and pictures failed")
+        logs.log.exception("a call failed in a process for heavy work")
         return None, RuntimeError(f"{type(error).__name__}; the server's log says more")
 
 

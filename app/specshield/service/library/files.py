@@ -67,12 +67,8 @@ def check_writable(folder: Path, name: str) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise InputError(
-            f"{name} cannot be used: {error.strerror}",
-            path=name,
-            got=str(folder),
-            expected="a folder to write to",
-        ) from error
+        told, expected = f"{name} cannot be used: {error.strerror}", "a folder to write to"
+        raise InputError(told, path=name, got=str(folder), expected=expected) from error
 
 
 def find_json(path: Path) -> Any:

@@ -119,12 +119,8 @@ class Policies(Claimed):
 
     def _load(self, record: Record) -> Proposer:
         if record.card is None:
-            raise PolicyError(
-                f"policy {record.id} is not ready",
-                path="policy_id",
-                got=record.id,
-                expected="a policy whose status is `ready`",
-            )
+            told, expected = f"policy {record.id} is not ready", "a policy whose status is `ready`"
+            raise PolicyError(told, path="policy_id", got=record.id, expected=expected)
         folder = self._models / record.name if record.name else self._folder / record.id
         if record.name is None and not files.there(folder):
             raise missing("policies", record.id)

@@ -59,6 +59,8 @@ class StreamRoute:
         server.streams.open.add(stream.stop)
         try:
             await send({"type": "websocket.accept"})
+            if server.streams.closed:  # the server was told to stop since the handshake
+                stream.stop()
             await stream.serve(receive)
         finally:
             server.streams.open.discard(stream.stop)

@@ -153,12 +153,9 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
     origin = t if wanted.clock == "restart" else rules.origin(old)
     last = origin + task.horizon + 1
     if last > max(most_steps, old["max_steps"]):
-        raise InputError(
-            "the rule ends after the last step that a session can have",
-            path="policy_id",
-            got=f"step {last}",
-            expected=f"at most step {most_steps}",
-        )
+        told = "the rule ends after the last step that a session can have"
+        expected = f"at most step {most_steps}"
+        raise InputError(told, path="policy_id", got=f"step {last}", expected=expected)
     most = max(old["max_steps"], last)
     check_last(t, most)
     signals = task.signals

@@ -64,12 +64,9 @@ def target_of(instruction: str) -> str:
     """The kind of thing that an instruction names. Raises NotFound."""
     named = [kind for kind in KINDS if kind in re.findall(r"\w+", instruction.lower())]
     if len(named) != 1:
-        raise NotFound(
-            f"the learned model does not know what to find: {instruction!r}",
-            path="instruction",
-            got=instruction,
-            expected=f"a sentence with one of {', '.join(KINDS)}",
-        )
+        told = f"the learned model does not know what to find: {instruction!r}"
+        expected = f"a sentence with one of {', '.join(KINDS)}"
+        raise NotFound(told, path="instruction", got=instruction, expected=expected)
     return named[0]
 
 
