@@ -4,7 +4,7 @@
 
 The first start of an installation compiles the kernels, in a process for each part, and they stay on the
 disk. Any later start takes them from there. Of several server processes one compiles, the others wait for it.
-The kernels that only some rules and robots need are compiled once it is ready, at the lowest priority.
+The kernels that only some rules and robots need are compiled once it is ready, at a low priority.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ READY, COMPLETE = "ready", "complete"
 KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
 TAKES = 70  # [s] a first start on two quiet cores, which took 34 to 73: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
-LAST = 19  # the niceness of what is compiled in the background: after all that others do
+LOW = 10  # niceness of what a server compiles in the background: 19 gets nowhere beside 8 busy programs
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
 # [objects] more than there were, at which a collection looks for cycles among them. With Python's 700 it took
 # 18 us of a step and found none, with this 4 (gc.callbacks under `benchmarks.step_cost --robots 16`).
@@ -116,7 +116,7 @@ async def prepare(startup: Startup, check: Callable[[], object] = bool) -> None:
         )
 
 
-async def complete(startup: Startup, at_once: int = 1, nice: int = LAST) -> bool:
+async def complete(startup: Startup, at_once: int = 1, nice: int = LOW) -> bool:
     """Once the server is ready, compiles what only some rules and robots need, in `at_once` processes. Their
     first decision would else compile it, while all others wait. False where something was left out.
     """
