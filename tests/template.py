@@ -2,8 +2,8 @@
 
     python -m tests.template     # standard input is a socket from `tests.serving`
 
-A fork takes 10 ms, where a new interpreter needs two seconds of a processor until it serves. What a fork runs
-is the command line, `specshield.cli.main`, with arguments, environment and files of its own.
+A fork takes 10 ms, where a new interpreter needs a second or two of a processor until it serves. What a fork
+runs is the command line, `specshield.cli.main`, with arguments, environment and files of its own.
 """
 
 from __future__ import annotations

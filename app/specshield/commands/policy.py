@@ -127,10 +127,9 @@ def _read(path: Path, option: str) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "it is no text"
         raise InputError(f"{path} cannot be read: {reason}", path=option, got=str(path)) from None
     try:
-        # `ros2 topic echo` ends a message with `---`. Without the parser in C, a large grid takes a minute.
-        text = text if path.suffix == ".json" else text.rstrip().removesuffix("\n---")
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        value = json.loads(text) if path.suffix == ".json" else yaml.load(text, loader)
+        document = text.rstrip().removesuffix("\n---")  # with which `ros2 topic echo` ends a message
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C is seven times as fast
+        value = json.loads(text) if path.suffix == ".json" else yaml.load(document, loader)
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{path} is neither JSON nor YAML: {str(error)[:200]}", path=option) from None
     if not isinstance(value, dict):

@@ -30,7 +30,7 @@ from specshield.service import warmup
 # are too which only some rules and robots need.
 READY, COMPLETE = "ready", "complete"
 KERNELS = 256  # on the disk once a first start is ready: `find $NUMBA_CACHE_DIR -name "*.nbi" | wc -l`
-TAKES = 70  # [s] a first start on two quiet cores, which took 34 to 73: `make wheels` prints what it takes
+TAKES = 70  # [s] a first start on two quiet cores, which took 29 to 73: `make wheels` prints what it takes
 TELL_EVERY = 5.0  # [s] between two lines of the log
 LOW = 10  # niceness of what a server compiles in the background: 19 gets nowhere beside 8 busy programs
 CHECK_EVERY = 0.25  # [s] between two looks at whether another process has compiled them
