@@ -62,21 +62,28 @@ class Crowd:
             if robot.is_alive():
                 robot.episodes[-1].problem = "still in its episode when the run was given up"
 
-    def fault(self, cause: Callable[[], object], mend: Callable[[], object] = lambda: None) -> float:
+    def fault(
+        self, cause: Callable[[], object], mend: Callable[[], object] = lambda: None, gradual: bool = False
+    ) -> float:
         """One fault: what causes it and what mends it. Returns when every robot had an answer again, with the
-        moment at which it was caused (time.monotonic)."""
+        moment at which it was caused (time.monotonic).
+
+        gradual: robots are still answered while `cause` runs, and that is no answer after the fault.
+        """
         time.sleep(self._drawn.uniform(*PAUSES))
         moment = time.monotonic()
         cause()
+        caused = time.monotonic() if gradual else moment
         mend()
-        times = self.back_since(moment)
+        times = self.back_since(moment, caused)
         self.away.first.append(min(times))
         self.away.all.append(max(times))
         return moment
 
-    def back_since(self, moment: float) -> list[float]:
-        """For each robot, the seconds from then to the first good answer to a request that it sent later. A
-        robot that was not asking at that moment has waited since its next request.
+    def back_since(self, moment: float, caused: float = 0.0) -> list[float]:
+        """For each robot, the seconds from then to the first good answer to a request that it sent later, and
+        not before `caused`. A robot that was not asking at that moment, or was answered before `caused`, has
+        waited since its next request.
         """
         answered, asked = [0.0] * len(self.robots), [math.inf] * len(self.robots)
         looked = [max(0, len(robot.tries) - 50) for robot in self.robots]
@@ -86,10 +93,13 @@ class Crowd:
                 while not answered[i] and looked[i] < len(robot.tries):
                     tried = robot.tries[looked[i]]
                     looked[i] += 1
+                    good = tried.status in (200, 201)
                     if tried.ended > moment:
                         asked[i] = min(asked[i], max(tried.began, moment))
-                    if tried.began >= moment and tried.status in (200, 201):
+                    if good and tried.began >= max(moment, caused):
                         answered[i] = tried.ended - asked[i]
+                    elif good and tried.ended < caused:
+                        asked[i] = math.inf
                 if not robot.is_alive() and not answered[i]:
                     raise RuntimeError(f"{robot.name} gave up: {robot.episodes[-1].problem}")
             return all(answered)

@@ -151,7 +151,7 @@ def sigterm(scene: Scene) -> dict[str, Any]:
     with Service(scene.folder / "data") as service:
         with Crowd([service.url], scene.starts, 8) as crowd:
             for _ in range(scene.n):
-                crowd.fault(stop, service.start)
+                crowd.fault(stop, service.start, gradual=True)
         found = crowd.result(service.url, scene.reference)
     good = (0, 200, 201, 409, 502, 503, 504)
     bad = sum(count for status, count in crowd.statuses().items() if status not in good)
