@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -76,6 +77,18 @@ def test_a_call_that_is_cancelled_is_killed_and_so_are_all_children_at_the_end()
 
     left = run(scenario)
     asyncio.run(_ends(left))
+
+
+def test_a_child_that_was_killed_while_it_had_nothing_to_do_is_replaced() -> None:
+    async def scenario(pool: Pool) -> None:
+        pid: int = await pool.run("os:getpid", seconds=60.0)
+        os.kill(pid, signal.SIGKILL)
+        await _ends(pid)
+        await asyncio.sleep(0.1)  # the event loop hears of it
+        assert await pool.run("math:sqrt", 9.0, seconds=60.0) == 3.0  # and it is not called too expensive
+        assert pool.children == 1
+
+    run(scenario)
 
 
 def test_a_child_whose_caller_is_gone_says_nothing_of_it(capfd: pytest.CaptureFixture[str]) -> None:

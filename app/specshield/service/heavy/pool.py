@@ -152,6 +152,9 @@ class Pool:
 
     async def _child(self, key: Hashable) -> _Child:
         """One that has nothing to do: the last to have worked for this key, else a new one, else any."""
+        for dead in [child for child in self._idle if child.reader.at_eof()]:  # for want of memory, say
+            self._idle.remove(dead)
+            self._let_go(dead)
         found = next((child for child in reversed(self._idle) if child.key == key), None)
         if found is None and self.children >= self.size:
             found = self._idle[0]  # the longest idle; there is one, since this is the caller's turn

@@ -15,7 +15,6 @@ from itertools import islice
 from specshield.errors import SpecshieldError
 from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
-from specshield.service.storage.archive import Entry
 from specshield.service.storage.archiving import ArchivingStore
 
 BATCH = 1000  # ids, or files, that are looked at in one go
@@ -75,12 +74,9 @@ class Mover:
         while batch := await self._store.in_thread(lambda: list(islice(files, BATCH))):
             for entry, size in batch:
                 if entry.expires <= time.time():
-                    await self._remove(entry)
+                    await self._store.in_thread(self._store.archive.remove, entry)
                     continue
                 if kept is not None and (kept.key, kept.beginning) == (entry.key, entry.beginning):
-                    await self._remove(kept)
+                    await self._store.in_thread(self._store.archive.remove, kept)
                 kept, total = entry, total + size
         return total
-
-    async def _remove(self, entry: Entry) -> None:
-        await self._store.in_thread(self._store.archive.remove, entry)
