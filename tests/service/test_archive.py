@@ -150,7 +150,7 @@ def test_two_servers_that_bring_a_session_back_decide_one_step(url, archive):
 
 
 class Held(Archive):
-    """An archive whose next read, or write, waits until it is let go."""
+    """An archive whose next read, write or list waits until it is let go."""
 
     def __init__(self, archive: Archive) -> None:
         super().__init__(archive._objects)
@@ -166,6 +166,12 @@ class Held(Archive):
         self.reached.set()
         self.go.wait()
         return super().put(key, expires, dump)
+
+    def after(self, owner: str, id: str | None) -> Iterator[Entry]:
+        found = list(super().after(owner, id))
+        self.reached.set()
+        self.go.wait()
+        yield from found
 
 
 def test_a_server_that_is_slow_to_bring_a_session_back_comes_too_late(url, archive):
@@ -239,6 +245,23 @@ def test_a_listing_holds_store_and_archive_in_order_and_each_session_once(url, a
         assert {e.key for e, _ in archive.sizes()} == {
             owner + id for owner in ("", "ann@", "ann.b@") for i, id in enumerate(sample) if i % 3
         }
+
+    run(url, archive, story)
+
+
+def test_a_session_that_moves_while_they_are_listed_is_listed(url, archive):
+    """Or a policy could be deleted that it uses."""
+
+    async def story(store):
+        await begin(store, "ann@robot", 1)
+        slow = ArchivingStore(url, 10.0, TTL, Held(archive))
+        listing = asyncio.create_task(slow.everything("ann@", None, 10))
+        await asyncio.to_thread(slow.archive.reached.wait)
+        await move(store, "ann@robot")
+        slow.archive.go.set()
+        page, _ = await listing
+        assert [config for config, _ in page] == [b"config of ann@robot"]
+        await slow.aclose()
 
     run(url, archive, story)
 

@@ -106,13 +106,14 @@ class ArchivingStore(Store):
         """A page of (config, state), from store and archive, and the id to go on after. owner: what comes
         before the id in a key, as in `alice@`.
         """
-        entries = await self.in_thread(lambda: list(islice(self.archive.after(owner, after), limit)))
-        archived = {entry.key: entry for entry in entries}
         async with self._reaching():
             low = f"({owner}{after or ''}" if owner or after else "-"
             high = f"({owner[:-1]}A" if owner else "+"  # A follows @
             running = [id.decode() for id in await self.redis.zrangebylex(INDEX, low, high, 0, limit)]
-            ids = sorted({*running, *archived})[:limit]
+        entries = self.archive.after(owner, after)  # after the store: a session may leave it meanwhile
+        archived = await self.in_thread(lambda: {each.key: each for each in islice(entries, limit)})
+        ids = sorted({*running, *archived})[:limit]
+        async with self._reaching():
             fit, room = await self._that_fit(ids, PAGE_BYTES)
             more, ids = len(ids) == limit or len(fit) < len(ids), fit
             live = await self._of_each(ids, "hmget", "config", "state")
