@@ -4,8 +4,10 @@ import asyncio
 import json
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 
 import pytest
+import redis
 
 from specshield.cores import cores
 from specshield.service.routes.sessions import _each, _listed
@@ -346,6 +348,25 @@ def test_listing_by_pages_finds_each_once(client, begin):
             break
     assert len(found) == len(set(found))
     assert made <= set(found)
+
+
+def test_no_step_waits_for_those_who_begin_while_their_policy_may_be_deleted(
+    client, begin, step, policy, server
+):
+    session = begin()
+    with closing(redis.Redis(unix_socket_path=str(server.data_dir / "store" / "socket"))) as store:
+        mark = f"specshield:{{library}}:mark:policies:{policy['id']}"
+        store.set(mark, "a deletion", px=60_000)
+        with ThreadPoolExecutor() as pool:
+            beginning = [pool.submit(begin) for _ in range(cores() + 1)]
+            time.sleep(0.5)
+            try:
+                began = time.monotonic()
+                assert step(session, 0, [START], occupied=[[4.9, 4.9]]).status_code == 200  # in a thread
+                assert time.monotonic() - began < 3.0  # those wait for 5 s
+            finally:
+                store.delete(mark)
+            assert all(each.result()["next_t"] == 0 for each in beginning)
 
 
 def test_the_draw_is_the_seeds(begin, step):

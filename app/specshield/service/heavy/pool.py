@@ -175,9 +175,7 @@ class Pool:
             self.template.stop()
             if again:  # an old template may have died since the last child
                 return await self._start(again=False)
-            raise ServerError(
-                "a process that this needs does not start; the server's log says more"
-            ) from error
+            raise ServerError("a process for this does not start; the server's log says more") from error
 
     async def _fork(self) -> _Child:
         ours = self.template.fork(self.memory, self.nice)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -57,7 +58,7 @@ class Switches:
             if not isinstance(version, bytes):
                 continue
             try:  # whoever deletes a policy sees this session now, or has marked the policy before
-                await self._run(self._policies.still_there, ids, owner)
+                await asyncio.to_thread(self._policies.still_there, ids, owner)
             except SpecshieldError:
                 await self._store.append(id, version, Change(found.state, found.rows, config=found.config))
                 raise
