@@ -266,6 +266,28 @@ def test_a_session_that_moves_while_they_are_listed_is_listed(url, archive):
     run(url, archive, story)
 
 
+@pytest.mark.parametrize("how", ["left", "erased"])
+def test_a_session_that_another_server_has_back_at_once_stays_on_the_list(url, archive, how):
+    """Or nobody would find it, and no mover move it."""
+
+    async def story(store):
+        version = await begin(store, "robot", 3)
+        other = ArchivingStore(url, 10.0, TTL, archive)
+
+        async def interrupted(keys, args, script=store._leave if how == "left" else store._erase):
+            told = await script(keys=keys, args=args)
+            await (other.append("robot", version, change(3)) if how == "left" else begin(other, "robot", 1))
+            return told
+
+        store._leave = store._erase = interrupted
+        await (move(store, "robot") if how == "left" else store.delete("robot"))
+        assert await in_store(store, "robot")
+        assert await store.count(None) == 1
+        await other.aclose()
+
+    run(url, archive, story)
+
+
 def test_what_has_expired_is_not_read_and_its_file_is_removed(url, archive):
     async def story(store):
         await begin(store, "old", 1)

@@ -97,7 +97,7 @@ class ArchivingStore(Store):
         """Erases all of it. False where there was nothing."""
         async with self._reaching():
             found = await self._erase(keys=_keys(id), args=["", FENCE])
-            await self.redis.zrem(INDEX, id)
+            await self.take_off([id.encode()])
         return bool(await self.in_thread(self.archive.erase, id)) or bool(found)
 
     async def everything(
@@ -178,7 +178,7 @@ class ArchivingStore(Store):
         async with self._reaching():
             left = await self._leave(keys=_keys(id), args=[dump.version, FENCE])
             if left > 0:
-                await self.redis.zrem(INDEX, id)
+                await self.take_off([id.encode()])
         await self.count_bytes(size)
         if left > 0:
             for other in await self.in_thread(self.archive.entries, id):
