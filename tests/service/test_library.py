@@ -3,12 +3,15 @@
 import io
 import json
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 
 import httpx
 import numpy as np
 import pytest
+import redis
 from PIL import Image
 from safetensors.numpy import load, save
 
@@ -26,6 +29,7 @@ from specshield.world.regions import Rectangle
 from tests.service.test_bad_input import YAML, problem
 from tests.service.test_keys import caller, keyed
 from tests.service.world import RESOLUTION, START, cells, grid_json, policy_files, send_policy
+from tests.serving import wait_for
 
 __all__ = ["keyed"]  # a fixture
 
@@ -169,6 +173,22 @@ def claims(keyed):
     settings = Settings(data_dir=keyed.data_dir, store_timeout=30.0)
     jobs = Jobs(f"unix://{keyed.data_dir}/store/socket", settings)
     return Claims(lambda: jobs.redis, settings)
+
+
+def test_what_is_claimed_is_written_although_who_sent_it_has_gone(client, server):
+    """A claim without its files would count for good, and nobody would find it."""
+    id = client.post("/v1/maps", json=grid(77)).json()["id"]
+    assert client.delete(f"/v1/maps/{id}").status_code == 204
+    with closing(redis.Redis(unix_socket_path=f"{server.data_dir}/store/socket")) as store:
+        mark = f"specshield:{{library}}:mark:maps:{id}"
+        store.set(mark, "a deletion", px=60_000)  # so that the claim has to wait
+        with pytest.raises(httpx.ReadTimeout):
+            client.post("/v1/maps", json=grid(77), timeout=1.0)
+        time.sleep(0.5)  # the process that writes it is told to end
+        store.delete(mark)
+    wait_for(lambda: client.get(f"/v1/maps/{id}").status_code == 200)
+    assert (server.data_dir / "maps" / id / "map.json").is_file()
+    assert client.delete(f"/v1/maps/{id}").status_code == 204
 
 
 def test_nobody_begins_to_use_what_is_being_deleted(claims, monkeypatch):

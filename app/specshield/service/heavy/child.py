@@ -46,6 +46,7 @@ def template(control: socket.socket) -> None:
         if os.fork() == 0:
             control.close()
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # whatever the server was started with
             _limit(*LIMITS.unpack(message))
             with contextlib.suppress(ConnectionError), socket.socket(fileno=descriptors[0]) as calls:
                 serve(calls)  # until the server closes the socket, which it does where a caller is gone

@@ -41,15 +41,9 @@ class Heavy:
         Raises ClientGone, and ends the work, when the caller closes its connection.
         """
         module, _, name = function.rpartition(":")
-        work = asyncio.ensure_future(
-            self.tasks.run(
-                f"specshield.service.heavy.{module or 'uploads'}:{name}",
-                self._settings,
-                *arguments,
-                seconds=self._settings.heavy_timeout,
-                owner=str(request.scope["state"].get("owner", "")),
-            )
-        )
+        asked = f"specshield.service.heavy.{module or 'uploads'}:{name}", self._settings, *arguments
+        seconds, owner = self._settings.heavy_timeout, str(request.scope["state"].get("owner", ""))
+        work = asyncio.ensure_future(self.tasks.run(*asked, seconds=seconds, owner=owner))
         gone = asyncio.ensure_future(until_gone(request.receive))
         try:
             await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)

@@ -84,9 +84,10 @@ class _Child:
         return await _read(self.reader)
 
     def kill(self) -> None:
+        """At once, unless it writes what it has claimed: then it ends when it finds its caller gone."""
         if not self.reader.at_eof():  # it is there still, and the process id is its own
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
+                os.kill(self.pid, signal.SIGTERM)
         self.writer.close()
 
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import re
+import signal
 from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -58,7 +60,22 @@ def policies_of(settings: Settings) -> Policies:
 @cache
 def _maps(settings: Settings) -> Maps:
     jobs = Jobs(settings.redis_url or EmbeddedStore(settings.data_dir).url, settings)
-    return Maps(settings, Claims(lambda: jobs.redis, settings))
+    return Maps(settings, _Finishing(lambda: jobs.redis, settings))
+
+
+class _Finishing(Claims):
+    """What is claimed is written, or given back, though `Pool` tells this process to end meanwhile: nobody
+    would find a claim without its files, and it would count for good.
+    """
+
+    @contextmanager
+    def adding(self, *args: Any, **kwargs: Any) -> Iterator[None]:
+        before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        try:
+            with super().adding(*args, **kwargs):
+                yield
+        finally:
+            signal.signal(signal.SIGTERM, before)
 
 
 def add_map(settings: Settings, content_type: str, content: Content, key: Key) -> dict[str, Any]:

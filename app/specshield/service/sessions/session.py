@@ -118,12 +118,8 @@ class Session(NamedTuple):
 
     def over(self, t: int) -> SessionFinished:
         """The error of a step that is asked for after the end."""
-        return SessionFinished(
-            f"session {self.id!r} is over: no further step is decided",
-            path="t",
-            got=t,
-            expected="a step already decided, to read it again",
-        )
+        told = f"session {self.id!r} is over: no further step is decided"
+        return SessionFinished(told, path="t", got=t, expected="a step already decided, to read it again")
 
     def replay(self, step: bytes, request: StepBody) -> StepAnswer:
         """The stored answer. Raises StepConflict where it answered another request."""
@@ -258,16 +254,11 @@ def there(found: F | None, key: str) -> F:
 
 def missing(key: str) -> NotFound:
     id = shown(key)
-    return NotFound(
-        f"there is no session {id!r}; it may have expired",
-        path="id",
-        got=id,
-        expected="an id from /v1/sessions",
-    )
+    told = f"there is no session {id!r}; it may have expired"
+    return NotFound(told, path="id", got=id, expected="an id from /v1/sessions")
 
 
 def contended(key: str) -> Conflict:
     id = shown(key)
-    return Conflict(
-        f"several callers write to session {id!r} at once", path="id", got=id, expected="one caller a session"
-    )
+    told = f"several callers write to session {id!r} at once"
+    return Conflict(told, path="id", got=id, expected="one caller a session")

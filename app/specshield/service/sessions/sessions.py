@@ -94,7 +94,7 @@ class Sessions:
             await asyncio.to_thread(self._policies.still_there, ids, key.name)
             raise
         config, state, rows = begun
-        state = msgspec.structs.replace(state, expires_at=self._expiry())
+        state = msgspec.structs.replace(state, expires_at=time.time() + self._settings.session_ttl)
         stored_as = scoped(key.name, config["id"])
         change = Change(state.packed(), pack(rows))
         await self._store.create(stored_as, files.to_json(config), change, *limits)
@@ -159,7 +159,7 @@ class Sessions:
                     spec_status=status,
                     finished=True,
                     closed=True,
-                    expires_at=self._expiry(),
+                    expires_at=time.time() + self._settings.session_ttl,
                 )
                 change = Change(state.packed(), *session.added(session.state.length))
                 if not isinstance(await self._store.append(id, session.version, change), bytes):
@@ -228,9 +228,6 @@ class Sessions:
 
     async def _run(self, function: Callable[..., R], *args: Any) -> R:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
-
-    def _expiry(self) -> float:
-        return time.time() + self._settings.session_ttl
 
 
 def begin(
