@@ -112,7 +112,10 @@ def test_the_path_of_a_bad_logit_is_the_servers():
     assert caught.value.path == "logits[1]"
 
 
-@pytest.mark.parametrize("bad", [(0, 0), (0, 0, 0, 0), (0, 0, math.nan), (0, 0, None), (0, 0, "north"), None])
+@pytest.mark.parametrize(
+    "bad",
+    [(0, 0), (0, 0, 0, 0), (0, 0, math.nan), (0, 0, None), (0, 0, "north"), None, (0, 0, 1e9), (-1e9, 0, 0)],
+)
 def test_bad_poses_are_refused(bad):
     with pytest.raises(errors.PoseError):
         wire.pose_values(bad)
@@ -124,6 +127,13 @@ def test_poses_of_any_sequence():
         == wire.pose_values([1.5, -2, 0.25])
         == (1.5, -2.0, 0.25)
     )
+
+
+def test_a_point_beyond_what_a_server_takes_is_refused():
+    with pytest.raises(errors.InputError) as caught:
+        wire.point_values([[1, 2], np.array([1e9, 2.0])], "occupied")
+    assert caught.value.path == "occupied[1]"
+    assert wire.point_values(np.array([[1.0, -1e8]]), "free") == [[1.0, -1e8]]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, None, "low"])

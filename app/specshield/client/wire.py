@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import sys
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
@@ -43,6 +44,7 @@ Numbers = Iterable[float] | Array
 Logits = Iterable[float | None] | Array
 Points = Iterable[Numbers] | Array
 TRIES = 5
+FARTHEST = 1e8  # m, rad; beyond it a server takes no pose and no point
 LONGEST = 1e6  # s; a socket takes no timeout of more than 2**31 ms
 Content = bytes | str | os.PathLike[str]
 
@@ -114,12 +116,8 @@ def path(*segments: str) -> str:
     """InputError for an id that would lead elsewhere: an empty one, `.`, `..` or one with a slash."""
     for segment in segments:
         if not isinstance(segment, str) or segment in ("", ".", "..") or "/" in segment:
-            raise InputError(
-                "this cannot be an id or a name",
-                path="id",
-                got=segment,
-                expected="an id or a name that the server gave",
-            )
+            told, expected = "this cannot be an id or a name", "an id or a name that the server gave"
+            raise InputError(told, path="id", got=segment, expected=expected)
     return "/v1/" + "/".join(quote(segment, safe="", errors="replace") for segment in segments)
 
 
@@ -153,35 +151,33 @@ def content(source: Content, where: str) -> bytes:
         try:
             return Path(source).read_bytes()
         except OSError as error:
-            raise InputError(
-                f"{where} cannot be read: {error.strerror}",
-                path=where,
-                got=str(source),
-                expected="a file that can be read",
-            ) from error
+            told, expected = f"{where} cannot be read: {error.strerror}", "a file that can be read"
+            raise InputError(told, path=where, got=str(source), expected=expected) from error
     return source.encode() if isinstance(source, str) else source
 
 
 def pose_values(pose: Numbers, where: str = "pose") -> Pose:
-    """(x, y, theta) in [m], [m], [rad]. PoseError unless these are three finite numbers."""
-    values = _floats(pose, PoseError, where, "three finite numbers x, y, theta")
-    if len(values) != 3 or not all(map(math.isfinite, values)):
-        raise PoseError("a pose is three finite numbers", path=where, got=values, expected="[x, y, theta]")
-    return values[0], values[1], values[2]
+    """(x, y, theta) in [m], [m], [rad]. PoseError unless these are three numbers up to `FARTHEST`."""
+    x, y, theta = _finite(pose, PoseError, where, "a pose is three finite numbers x, y, theta", 3)
+    return x, y, theta
 
 
 def point_values(points: Points, where: str) -> list[list[float]]:
-    """Points (x, y) in metres, map frame. InputError unless each is two finite numbers."""
-    found, listed = [], points.tolist() if isinstance(points, Array) else points
+    """Points (x, y) in metres, map frame. InputError unless each is two numbers up to `FARTHEST`."""
+    listed = points.tolist() if isinstance(points, Array) else points
     if not isinstance(listed, Iterable):
         raise InputError("these are no points", path=where, got=listed, expected="a list of points [x, y]")
-    for i, point in enumerate(listed):
-        values = _floats(point, InputError, f"{where}[{i}]", "two finite numbers x, y")
-        if len(values) != 2 or not all(map(math.isfinite, values)):
-            raise InputError(
-                "a point is two finite numbers", path=f"{where}[{i}]", got=values, expected="[x, y]"
-            )
-        found.append(values)
+    told = "a point is two finite numbers x, y"
+    return [_finite(each, InputError, f"{where}[{i}]", told, 2) for i, each in enumerate(listed)]
+
+
+def _finite(
+    values: Any, error: type[InputError], where: str, told: str, count: int, most: float = FARTHEST
+) -> list[float]:
+    expected = f"{count} number{'s' if count > 1 else ''} from {-most:g} to {most:g}"
+    found = _floats(values, error, where, expected)
+    if len(found) != count or not all(abs(value) <= most for value in found):
+        raise error(told, path=where, got=found, expected=expected)
     return found
 
 
@@ -199,14 +195,11 @@ def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
     """SampleError unless every signal is a finite number."""
     if not isinstance(signals, Mapping):
         raise SampleError("these are no signals", path="signals", got=signals, expected="numbers by name")
-    values = {}
-    for name, value in signals.items():
-        (values[name],) = _floats([value], SampleError, f"signals.{name}", "a finite number")
-        if not math.isfinite(values[name]):
-            raise SampleError(
-                "a signal is a finite number", path=f"signals.{name}", got=str(value), expected="finite"
-            )
-    return values
+    told, most = "a signal is a finite number", sys.float_info.max
+    return {
+        name: _finite([value], SampleError, f"signals.{name}", told, 1, most)[0]
+        for name, value in signals.items()
+    }
 
 
 def check_flags(**flags: object) -> None:
