@@ -10,6 +10,7 @@ import time
 from http import HTTPStatus
 
 import msgpack
+import numpy as np
 import pytest
 from client_script import SESSION
 from test_deadline import decided
@@ -116,6 +117,13 @@ def test_steps_go_over_one_connection_in_messagepack(stepping):
         "main_task_done": False,
         "witnesses": False,
     }
+
+
+def test_a_flag_may_be_one_of_numpy(stepping):
+    server = Server()
+    stepping(server, 1, main_task_done=np.bool_(True), witnesses=1, explain=np.bool_(True))
+    sent = {name: server.messages[0][name] for name in ("main_task_done", "witnesses", "explain")}
+    assert sent == {"main_task_done": True, "witnesses": True, "explain": True}
 
 
 @pytest.mark.parametrize("fault", ["drop", "stale", "text"])

@@ -129,16 +129,15 @@ class SessionState:
         x_t = wire.pose_values(pose)
         body: dict[str, Any] = {
             "logits": None if logits is None else wire.logit_values(logits),
-            "main_task_done": self.main_task_done if main_task_done is None else main_task_done,
-            "witnesses": witnesses,
+            "main_task_done": bool(self.main_task_done if main_task_done is None else main_task_done),
+            "witnesses": bool(witnesses),
+            **({"explain": True} if explain else {}),
         }
         if signals is not None:
             body["signals"] = wire.signal_values(signals)
         for name, points in (("occupied", occupied), ("free", free)):
             if points is not None:
                 body[name] = wire.point_values(points, name)
-        if explain:
-            body["explain"] = True
         own = main_task_done is None
         if self.on_failure == "raise":
             return (yield from self._decided(x_t, body, own, TRIES))

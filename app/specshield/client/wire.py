@@ -205,7 +205,7 @@ def signal_values(signals: Mapping[str, float]) -> dict[str, float]:
 def check_flags(**flags: object) -> None:
     """Raises InputError unless each is True, False or None."""
     for name, flag in flags.items():
-        if flag not in (True, False, None):
+        if (flag.tolist() if isinstance(flag, Array) else flag) not in (True, False, None):
             raise InputError(f"{name} is no yes or no", path=name, got=flag, expected="True or False")
 
 
