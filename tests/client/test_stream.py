@@ -126,6 +126,15 @@ def test_a_flag_may_be_one_of_numpy(stepping):
     assert sent == {"main_task_done": True, "witnesses": True, "explain": True}
 
 
+def test_a_loop_that_is_closed_keeps_no_connection():
+    """Each `asyncio.run` has a loop of its own."""
+    with served(Server()) as url:
+        client = AsyncShieldClient(url, timeout=60.0, stream=True)
+        session = AsyncSession(client._run, INFO, POSE)
+        assert [asyncio.run(session.step(POSE, LOGITS)).t for _ in range(4)] == [0, 1, 2, 3]
+        assert len(client._streams._open) == 1
+
+
 @pytest.mark.parametrize("fault", ["drop", "stale", "text"])
 def test_a_lost_connection_and_a_wrong_answer_are_asked_again_on_a_new_one(stepping, fault):
     server = Server(None, fault, fault)

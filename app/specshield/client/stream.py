@@ -152,7 +152,7 @@ def leave(connection: Any) -> None:
 class AsyncStreams(Streams):
     def __init__(self, http: httpx.AsyncClient) -> None:
         super().__init__(http)
-        self._open: dict[tuple[object, str], AsyncSocket] = {}
+        self._open: dict[tuple[asyncio.AbstractEventLoop, str], AsyncSocket] = {}
 
     async def perform(self, exchange: Exchange, message: bytes) -> Reply | Failure:
         import websockets
@@ -174,6 +174,8 @@ class AsyncStreams(Streams):
         mine, reply = (asyncio.get_running_loop(), exchange.request.path), None
         connection = self._open.pop(mine, None)
         if connection is None:
+            for other in [kept for kept in list(self._open) if kept[0].is_closed()]:
+                self._open.pop(other, None)  # each asyncio.run has a loop of its own
             options = self._options(exchange.seconds)
             connection = await connect(self._address(exchange.request), **options).__aenter__()
         try:
