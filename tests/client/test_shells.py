@@ -64,6 +64,13 @@ def failing(*failures, then=SPEC):
     return handler, seen
 
 
+def test_a_session_may_begin_at_a_pose_that_can_be_gone_through_once(use):
+    handler, _ = failing(then=SESSION)
+    pose = iter([1, 2, 0.5])
+    session = use(handler, lambda client: client.sessions.create(policy_id="p", initial_pose=pose))
+    assert session._poses == {0: (1.0, 2.0, 0.5)}
+
+
 @pytest.mark.parametrize(
     "fault",
     [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, TypeVar, cast
 
-from specshield.client import calls
+from specshield.client import calls, wire
 from specshield.client.core import Flow, P, T, looks_like
 from specshield.client.models import Map, Policy, SessionInfo
 
@@ -99,16 +99,18 @@ def listing(cls: type[T], resource: str) -> Listing[T]:
 def opening(flow: Callable[..., Flow[SessionInfo]]) -> Any:
     """The method that makes this call and gives the session that it tells of."""
 
-    def opened(client: Any, told: Flow[SessionInfo], given: dict[str, Any]) -> Flow[Any]:
-        info = yield from told
+    def opened(client: Any, args: Any, given: dict[str, Any]) -> Flow[Any]:
         pose, on_failure = given.get("initial_pose"), given.get("on_failure", "raise")
+        if pose is not None:  # it may be one that can be gone through once
+            given["initial_pose"] = pose = wire.pose_values(pose, "initial_pose")
+        info = yield from flow(*args, **given)
         begun = client._session(client._run, info, pose, on_failure)
         yield from begun._recall()
         return begun
 
     @looks_like(flow)
     def method(self: Any, /, *args: Any, **kwargs: Any) -> Any:
-        return self._run(opened(self._client, flow(*args, **kwargs), kwargs))
+        return self._run(opened(self._client, args, kwargs))
 
     return method
 
