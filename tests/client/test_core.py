@@ -105,7 +105,15 @@ def test_a_session_is_created_under_an_id_of_our_own():
     )
 
 
-@pytest.mark.parametrize("ids", [{}, {"policy_id": "p", "policy_ids": ["q"]}, {"policy_ids": "case1"}])
+@pytest.mark.parametrize("uncertainty", [None, ["learned"], 0.1])
+def test_what_is_no_uncertainty_is_left_for_the_server_to_refuse(uncertainty):
+    _, (request,), _ = drive(create(uncertainty=uncertainty), problem(422, "validation"))
+    assert json.loads(request.body)["uncertainty"] == uncertainty
+
+
+@pytest.mark.parametrize(
+    "ids", [{}, {"policy_id": "p", "policy_ids": ["q"]}, {"policy_ids": "case1"}, {"policy_ids": 5}]
+)
 def test_exactly_one_way_to_name_policies(ids):
     error, sent, _ = drive(create(**{"policy_id": None, "policy_ids": None, **ids}))
     assert type(error) is errors.InputError

@@ -7,7 +7,7 @@ from __future__ import annotations
 import logging
 import os
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 from specshield.client import wire
@@ -261,7 +261,7 @@ def create_session(
         "evaluation": evaluation,
         "shaping": shaping,
         "allow_infeasible": allow_infeasible,
-        "uncertainty": uncertainty if isinstance(uncertainty, str) else dict(uncertainty),
+        "uncertainty": dict(uncertainty) if isinstance(uncertainty, Mapping) else uncertainty,
         "learn_map": learn_map,
         "map_memory": map_memory,
         "threshold_over": threshold_over,
@@ -302,7 +302,7 @@ def policies_asked(policy_id: str | None, policy_ids: Sequence[str] | None) -> d
     """The member of a body that names the policies. InputError unless exactly one of the two is given."""
     if (policy_id is None) == (policy_ids is None):
         raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
-    if isinstance(policy_ids, str):  # else each letter would be taken for an id
+    if isinstance(policy_ids, str) or not isinstance(policy_ids, Iterable | None):  # a text is its letters
         raise InputError("this is no list", path="policy_ids", got=policy_ids, expected="ids or names")
     return {"policy_id": policy_id} if policy_ids is None else {"policy_ids": list(policy_ids)}
 
