@@ -257,6 +257,34 @@ def test_after_a_step_without_a_decision_a_switch_needs_the_pose(
             assert session.switch(other).next_t == 1  # x_t is known by now
 
 
+def test_a_pose_that_a_switch_told_stands_and_the_same_switch_again_is_the_one_made(
+    server: RunningServer,
+) -> None:
+    """As on a server: x_t is among the states, counts for the verdict, and the step that follows keeps it."""
+    with ShieldClient(server.url, timeout=300.0) as client:
+        remote = client.sessions.create(policy_id="case1", initial_pose=START)
+        local = LocalShield.shipped("case1").session(initial_pose=START)
+        pose = remote.step(START, np.zeros(20)).next_poses[1]
+        local.step(START, np.zeros(20))
+        for session, policy in ((remote, "case1-dqn"), (local, LocalShield.shipped("case1-dqn"))):
+            for _ in range(2):
+                session.switch(policy, clock="restart", pose=pose)
+            elsewhere = (pose[0] + 0.01, *pose[1:])
+            for refused in (
+                lambda: session.switch(policy, clock="restart", pose=elsewhere),  # noqa: B023
+                lambda: session.step(elsewhere, np.zeros(20)),  # noqa: B023
+            ):
+                with pytest.raises(HistoryConflict):
+                    refused()
+            with pytest.raises(HistoryConflict):
+                session.close(elsewhere)
+            session.record(elsewhere)
+            session.step(elsewhere, np.zeros(20))
+        assert len(local.info.rules) == len(remote.info.rules) == 2
+        assert [each.pose for each in local.trajectory()] == [each.pose for each in remote.trajectory()]
+        assert local.close() == remote.close()
+
+
 @pytest.mark.parametrize("clock", ["keep", "restart"])
 def test_a_switch_that_fails_leaves_everything_as_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Any
@@ -459,6 +487,8 @@ def test_a_setting_may_come_from_numpy_and_what_is_known_of_the_robot_is_as_on_a
         ({"free": np.float64(5.0)}, "free"),
         ({"occupied": [1, 2]}, "occupied[0]"),
         ({"logits": [10**400, 0, 0, 0]}, "logits"),
+        ({"occupied": [[1e9, 2]]}, "occupied[0]"),
+        ({"deadline": -1.0}, "deadline"),
     ],
 )
 def test_what_a_step_cannot_read_is_said_and_changes_nothing(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -65,14 +64,14 @@ class LocalSession:
         self.finished = self.main_task_done = self.closed = False
         self._told_done = False  # whether the last step said that the main task is done
         self._over = False  # whether a server would refuse what follows: it is not told of a drawn `end`
-        self._shaping, self._initial = shaping, initial_pose
+        self._shaping = shaping
         self._rules = [Rule(policy, shield)]
         self._first = dict(shield.task.signals)
         self._carry = handover.begun(way)
         self._poses: list[Pose] = []
         self._signals: dict[str, list[float]] = {name: [] for name in shield.task.signals}
         self._decisions: dict[int, Decision] = {}
-        self._given: dict[int, Pose] = {}  # x_t of the next step, where a switch told it
+        self._given = {0: initial_pose}  # x_t of the next step, where its beginning or a switch told it
 
     @property
     def id(self) -> str:
@@ -87,12 +86,15 @@ class LocalSession:
     def _rule(self) -> Rule:
         return self._rules[-1]
 
+    @property
+    def _known(self) -> list[Pose]:
+        """The poses up to x_t where that is told already, else up to the one before it."""
+        return [*self._poses, *(pose for t, pose in self._given.items() if t == self.t)]
+
     def __enter__(self) -> LocalSession:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if not self.closed:
             self.close()
 
@@ -115,7 +117,9 @@ class LocalSession:
         nothing here. Raises what that raises where the caller is wrong.
         """
         wire.check_flags(main_task_done=main_task_done, witnesses=witnesses, explain=explain)
-        over = self.main_task_done if main_task_done is None else main_task_done
+        over = bool(self.main_task_done if main_task_done is None else main_task_done)
+        if deadline is not None:
+            wire.seconds_value(deadline, "deadline")
         self._check(over)
         sent = {} if signals is None else wire.signal_values(signals)
         check_signals(self._first, sent)  # what another rule of the session reads is kept, too
@@ -144,8 +148,9 @@ class LocalSession:
         return answer
 
     def record(self, pose: Numbers) -> None:
-        """Note x_t of a step that goes without a decision, and move on to t + 1."""
-        self._arrived(self._at(pose), self._held({}))
+        """Note x_t of a step that goes without a decision, and move on to t + 1. One told before stands."""
+        x_t = wire.pose_values(pose)
+        self._arrived(self._given.get(self.t, x_t), self._held({}))
 
     def switch(
         self, policy: LocalShield, *, clock: Literal["keep", "restart"] = "keep", pose: Numbers | None = None
@@ -155,14 +160,16 @@ class LocalSession:
         `clock` and `pose` are those of the SDK's `Session.switch`. Raises InfeasibleSwitch where the new rule
         cannot be kept from there; nothing is changed then.
         """
-        self._check(self.main_task_done)
         if not isinstance(policy, type(self._rule.policy)):
-            raise InputError(
-                "this is no policy in process", path="policy", got=policy, expected="a LocalShield"
-            )
+            wrong = "this is no policy in process"
+            raise InputError(wrong, path="policy", got=policy, expected="a LocalShield")
         given = self._given.get(self.t) if pose is None else self._at(pose)
+        old, made = self._rule, (policy.card["id"], self.t, clock)
+        if len(self._rules) > 1 and made == (old.policy.card["id"], old.begins, old.clock):
+            return self.info  # this very switch was made last
+        self._check(self.main_task_done)
         x_t = self._foreseen() if given is None else given
-        old, rule = self._rule, self._rule.followed_by(policy, self._shaping, self.t, clock)
+        rule = old.followed_by(policy, self._shaping, self.t, clock)
         first = {**policy.task.signals, **self._first}
         held = self._held({}, self.t + 1, first)
         seen, signals = rule.since([*self._poses, x_t]), rule.signals(held)
@@ -172,9 +179,8 @@ class LocalSession:
         carry = handover.carried_over(self._carry, same_map, same_robot, later)
         way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
         carry = handover.carried_over(self._carry, same_map, same_robot, later, way)
-        known = self._poses if given is None and self.t > 0 else [*self._poses, x_t]
-        rules = [*self._rules, rule]
-        have = told(rules, known, held)
+        known = self._poses if given is None else [*self._poses, x_t]
+        have = told([*self._rules, rule], known, held)
         info = replace(
             self.info,
             **policy.about(),
@@ -185,7 +191,7 @@ class LocalSession:
             rules=have,
             any_signal=any_signal(rule.shield, seen, signals),
         )
-        self._rules = rules
+        self._rules.append(rule)
         self._carry, self._first = carry, first
         self._given = {} if given is None else {self.t: given}
         self._signals = {name: values[: self.t] for name, values in held.items()}
@@ -205,8 +211,8 @@ class LocalSession:
     def close(self, pose: Numbers | None = None) -> Verdict:
         """End the session; `pose` is the state the last action led to. Closing again changes nothing."""
         if not self.closed and pose is not None:
-            self.record(pose)
-        poses = self._poses or [self._initial]
+            self._arrived(self._at(pose), self._held({}))
+        poses = self._known
         self.spec_status, bounds = self._rule.verdict(poses, self._held({}, len(poses)))
         self.closed = self.finished = self._over = True
         low, high = map(handover.finite, bounds)
@@ -214,10 +220,10 @@ class LocalSession:
 
     def trajectory(self) -> tuple[TrajectoryItem, ...]:
         """The states x_0..x_t, and the answers by the contract's names."""
-        held = self._held({}, len(self._poses))
+        held = self._held({}, len(self._known))
         return tuple(
             TrajectoryItem(t, pose, {name: held[name][t] for name in reads}, self._told(t), rule)
-            for t, pose in enumerate(self._poses)
+            for t, pose in enumerate(self._known)
             for rule in [max(i for i, each in enumerate(self._rules) if each.begins <= t)]
             for reads in [sorted(self._rules[rule].shield.task.signals)]
         )
@@ -239,24 +245,20 @@ class LocalSession:
 
     def _foreseen(self) -> Pose:
         """Where the last decision's action leads. Raises HistoryGap after a step without a decision."""
-        if self.t == 0:
-            return self._initial
         last = self._decisions.get(self.t - 1)
         if last is None:
             raise HistoryGap(f"nothing says where the robot is at step {self.t}", path="pose", expected="x_t")
         return self._poses[-1] if last.execute is None else last.next_poses[last.execute]
 
     def _at(self, pose: Numbers) -> Pose:
-        """x_t. Raises HistoryConflict where x_0 is not where the session began."""
+        """x_t. Raises HistoryConflict where the session's beginning, or a switch, told another one."""
         x_t = wire.pose_values(pose)
-        if self.t > 0:
-            return x_t
-        gap = [a - b for a, b in zip(x_t, self._initial, strict=True)]
+        told = self._given.get(self.t, x_t)
+        gap = [a - b for a, b in zip(x_t, told, strict=True)]
         if max(abs(gap[0]), abs(gap[1]), abs(wrap(gap[2]))) > SAME_POSE:
-            raise HistoryConflict(
-                "the session began elsewhere", path="pose", got=list(x_t), expected=f"{list(self._initial)}"
-            )
-        return self._initial
+            conflict = f"the pose of step {self.t} is not the one told before"
+            raise HistoryConflict(conflict, path="pose", got=list(x_t), expected=f"{list(told)}")
+        return told
 
     def _held(
         self, sent: Mapping[str, float], length: int | None = None, first: Mapping[str, float] | None = None
