@@ -285,11 +285,13 @@ def test_a_session_of_a_server_is_exported_by_the_command(server: RunningServer,
         client.policies.delete(made.id)
         client.maps.delete(room.id)
     assert run("export", gone.id, "--to", "mcap", "--url", server.url) == f"{gone.id}.mcap: 1 steps\n"
-    for to in ("csv", "rrd"):
-        words = ["export", "record", "--to", to, "--out", f"nowhere/a.{to}"]
-        refused = run_specshield(*words, cwd=tmp_path)
+    nowhere = "No such file or directory"
+    for to, out, why in (
+        ("csv", "nowhere/a", nowhere), ("rrd", "nowhere/a", nowhere), ("rrd", "room", "Is a directory"),
+    ):  # fmt: skip
+        refused = run_specshield("export", "record", "--to", to, "--out", out, cwd=tmp_path)
         (line,) = refused.stderr.splitlines()
-        assert f"nowhere/a.{to} cannot be written: No such file or directory" in line
+        assert f"{out} cannot be written: {why}" in line
     (tmp_path / "README.md").write_text("# no record\n")
     refused = run_specshield("export", "README.md", "--to", "csv", cwd=tmp_path)
     (line,) = refused.stderr.splitlines()

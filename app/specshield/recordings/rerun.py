@@ -14,7 +14,7 @@ from specshield.recordings.recording import Recording
 def write_rrd(recording: Recording, path: Path) -> None:
     """Timelines `step` and `time`; `world` in metres, and scalars below `decision`."""
     stream = rerun.RecordingStream("specshield", recording_id=recording.id)
-    path.touch()  # OSError where it cannot be written, of which rerun makes a RuntimeError
+    path.open("ab").close()  # OSError where it cannot be written, of which rerun makes a RuntimeError
     stream.save(path)
     if recording.grid is not None:
         rows, columns = np.nonzero(recording.grid.occupied)
