@@ -6,6 +6,7 @@ import pytest
 from client_script import SESSION, answer, drive, lost, problem
 
 from specshield import errors
+from specshield.client import wire
 from specshield.client.models import SessionInfo, build
 from specshield.client.state import SessionState
 
@@ -157,6 +158,16 @@ def test_a_failed_step_changes_nothing_and_recorded_poses_follow_with_the_next()
     state.record((2, 0, 0))
     _, (body,) = step(state, 3, decided(3, M))
     assert sent_poses(body) == (3, [1, 2, 3])
+
+
+@pytest.mark.parametrize("pose", [None, (1, 0, 0)])
+def test_a_switch_has_the_time_of_what_prepares_something(pose):
+    """A preference for another policy takes a server ten seconds."""
+    state = session()
+    step(state, 0, decided(0, M))
+    command = next(state._switch("p2", pose=pose))
+    assert isinstance(command, wire.Request)
+    assert command.slow
 
 
 @pytest.mark.parametrize(

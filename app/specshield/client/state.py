@@ -228,7 +228,6 @@ class SessionState:
         A main task that is over stays over: what is left to do then is the new rule.
         Raises InfeasibleSwitch where the new rule cannot be kept from there; nothing is changed then.
         """
-        yield Within(None)
         body = {**policies_asked(policy_id, policy_ids), "clock": clock}
         poses = self._poses if pose is None else {**self._poses, self.t: wire.pose_values(pose)}
         if pose is None:

@@ -25,8 +25,8 @@ class ShieldClient:
     """The service at `base_url`.
 
     `timeout` [s] is what a decision may take, one try, from looking up the server's name to the last byte;
-    what prepares something (a map, a policy, a session) gets at least 30 s. Lost answers are asked for again
-    (see `core`), so a call returns or raises within five timeouts, a step within its `deadline`. A
+    what prepares something (a map, a policy, a session, a switch) gets at least 30 s. Lost answers are asked
+    for again (see `core`), so a call returns or raises within five timeouts, a step within its `deadline`. A
     `transport` of your own has to keep these times itself. Every error is a `SpecshieldError`; no answer is
     a `TransportError`. `stream`: steps go over one WebSocket a session, in MessagePack, which is faster and
     needs `pip install 'specshield[stream]'`.
