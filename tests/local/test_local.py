@@ -477,6 +477,25 @@ def test_a_setting_may_come_from_numpy_and_what_is_known_of_the_robot_is_as_on_a
         assert local.step(START, logits) == replace(remote.step(START, logits), timings={})
 
 
+def test_what_a_policy_is_made_of_may_come_from_numpy_as_in_the_sdk() -> None:
+    def made(listed: Any, number: Any) -> Any:
+        turn = {"x": 0.0, "y": 0.0, "z": 0.0, "w": number(1.0)}
+        origin = {"position": {"x": number(0.0), "y": 0.0, "z": 0.0}, "orientation": turn}
+        info = {"resolution": number(0.25), "width": 20, "height": 20, "origin": origin}
+        dock = {"type": "circle", "center": listed([3.0, 3.0]), "radius": number(0.5)}
+        move = {"name": "forward", "translate": number(0.25)}
+        return LocalShield.make(
+            {"format": "occupancy_grid", "info": info, "data": listed([0] * 400)},
+            "F[0,40] Dock and G[0,40] battery > 1",
+            {"Dock": dock},
+            signals={"battery": number(3.0)},
+            robot={"footprint": {"radius": number(0.25)}, "actions": [move, {"name": "wait"}]},
+            check=False,
+        ).card["id"]
+
+    assert made(np.array, np.float32) == made(list, float)
+
+
 @pytest.mark.parametrize(
     ("asked", "path"),
     [

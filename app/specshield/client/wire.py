@@ -128,11 +128,8 @@ def encode(body: Mapping[str, Any]) -> bytes:
         for name, value in body.items():
             members.append(_json({name: value})[1:-1])
     except (TypeError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"{name}: cannot be sent as JSON: {error}",
-            path=name,
-            expected="finite numbers, texts, lists and objects of them",
-        ) from error
+        expected = "finite numbers, texts, lists and objects of them"
+        raise InputError(f"{name}: cannot be sent as JSON: {error}", path=name, expected=expected) from error
     return f"{{{','.join(members)}}}".encode()
 
 

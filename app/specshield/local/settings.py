@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from specshield.client.wire import Array
 from specshield.errors import InputError
 from specshield.lookahead.preferences import PREFERENCES, PROJECTION
 from specshield.shield.uncertainty import MOST_TRANSLATION, Uncertainty
@@ -72,11 +71,19 @@ def read_settings(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read(given: Mapping[str, Any], kinds: Mapping[str, Kind], at: str = "") -> dict[str, Any]:
-    """Numbers of numpy become those of Python."""
-    values = {name: each.tolist() if isinstance(each, Array) else each for name, each in given.items()}
+    values: dict[str, Any] = plain(given)
     for name, value in values.items():
         kind = kinds.get(name, Kind(f"one of {', '.join(kinds)}", lambda _: False))
         if not kind.holds(value):
             wrong = "the setting is not valid" if name in kinds else "there is no such setting"
             raise InputError(wrong, path=f"{at}{name}", got=value, expected=kind.told)
     return values
+
+
+def plain(value: Any) -> Any:
+    """Arrays and numbers of numpy, wherever they are in it, as lists and numbers of Python."""
+    if isinstance(value, Mapping):
+        return {name: plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    return value.tolist() if hasattr(value, "tolist") else value

@@ -18,7 +18,7 @@ from specshield.client.wire import pose_values
 from specshield.errors import MapError, NotFound, PolicyError
 from specshield.local.rule import Rule, told
 from specshield.local.session import LocalSession
-from specshield.local.settings import read_settings
+from specshield.local.settings import plain, read_settings
 from specshield.lookahead.preferences import PROJECTION, prepare
 from specshield.map_files import read_map_files
 from specshield.policy.methods import DEFAULT, METHODS, Run, load_policy
@@ -85,21 +85,15 @@ class LocalShield:
             robot, spec, formula = card["robot"], card["spec"], card["spec"]["formula"]
             weights = (folder / "policy.safetensors").read_bytes()
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise PolicyError(
-                f"no policy can be read there: {error}",
-                path="folder",
-                got=str(folder),
-                expected="a folder with card.json, which has a robot and a spec, and policy.safetensors",
-            ) from None
+            expected = "a folder with card.json, which has a robot and a spec, and policy.safetensors"
+            wrong = f"no policy can be read there: {error}"
+            raise PolicyError(wrong, path="folder", got=str(folder), expected=expected) from None
         if world is None:
             found = sorted(folder.glob("*.yaml"))
             if len(found) != 1:
-                raise MapError(
-                    "the folder does not say which map the policy is for",
-                    path="world",
-                    got=[path.name for path in found],
-                    expected=f"one .yaml in {folder}, or a `world`",
-                )
+                wrong = "the folder does not say which map the policy is for"
+                got, expected = [each.name for each in found], f"one .yaml in {folder}, or a `world`"
+                raise MapError(wrong, path="world", got=got, expected=expected)
             world = found[0]
         grid, rooms = _read_world(world)
         named = spec.get("regions"), rooms, spec.get("signals")
@@ -127,6 +121,7 @@ class LocalShield:
         warn of what they show. The rest is as in the SDK's `policies.create`.
         """
         grid, own = _read_world(world)
+        regions, robot, signals, options = map(plain, (regions, robot, signals, options))
         made_robot = robot if isinstance(robot, Robot) else robot_from_json(robot)
         task = make_task(grid, made_robot, formula, regions, {**own, **(rooms or {})}, signals)
         how = METHODS.get(method)
@@ -211,6 +206,6 @@ def _read_world(world: World) -> tuple[OccupancyGrid, Mapping[str, Region]]:
     if isinstance(world, OccupancyGrid):
         return world, {}
     if isinstance(world, Mapping):
-        members = dict(world)
+        members = plain(world)
         return read_map(members.pop("format", None), members)
     return read_map_files(Path(world if isinstance(world, os.PathLike) else str(world)))
