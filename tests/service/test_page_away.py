@@ -74,6 +74,32 @@ def test_what_watches_a_fleet_lasts_through_a_restart(tmp_path, browse):
     assert [text for text in complaints if "ERR_" not in text and "503" not in text] == []
 
 
+def test_who_comes_back_to_a_page_sees_the_session_that_has_the_id_now(server, browse):
+    """A robot that begins each episode under the same id: the page was hidden, and heard of nothing."""
+    id, url = "north-again", server.url
+    hide = """hidden => {
+      Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
+      document.dispatchEvent(new Event("visibilitychange"));
+    }"""
+    for t in range(2):
+        stand(url, id, t)
+    with browse() as (session, complaints), browse() as (floor, _):
+        session.goto(f"{url}/#/sessions/{id}")
+        floor.goto(f"{url}/#/floor?sessions={id}")
+        for page in (session, floor):
+            page.get_by_text("live", exact=True).wait_for()
+            page.evaluate(hide, True)
+        httpx.delete(f"{url}/v1/sessions/{id}", timeout=None).raise_for_status()
+        stand(url, id)
+        for page in (session, floor):
+            page.evaluate(hide, False)
+        session.get_by_role("heading", name="Step 0").wait_for()
+        session.get_by_text("live", exact=True).wait_for()
+        floor.get_by_role("row", name=id).get_by_text("erased").wait_for()
+        assert complaints == []
+    httpx.delete(f"{url}/v1/sessions/{id}", timeout=None).raise_for_status()
+
+
 def test_a_view_that_cannot_be_read_is_told_and_the_page_does_not_begin_anew_for_ever(server, browse):
     with browse() as (page, _):
         page.route("**/views/maps.js", lambda route: route.abort())

@@ -8,16 +8,18 @@ const SILENT = 40_000; // [ms] without a word after which a connection is lost: 
 
 /**
  * Calls `take` with each item of these sessions, and at the end of one with {session, finished: true}, which has
- * `erased: true` where the session is no longer there.
- * after: Map of id to the last step that is known, -1 for none; it is kept up to date.
+ * `erased: true` where the session is no longer there, and `anew: true` where another has its id by now.
+ * after: Map of id to the last step that is known, -1 for none; it is kept up to date. created: Map of id to the
+ * session's `created_at`.
  * connected: called with true when the stream is there, and with false when it is lost; it is asked for again.
  */
-export async function follow(after, take, connected, signal) {
+export async function follow(after, created, take, connected, signal) {
   const end = (item) => {
     after.delete(item.session);
     take(item);
   };
-  let doubted = false; // whether a stream has ended, and with it may have the sessions: they may be erased
+  const fate = (id, signal) => become(id, created.get(id), signal);
+  let doubted = false; // whether a stream has ended: since then the sessions may have been erased
   while (after.size && !signal.aborted) {
     await seen(signal);
     const line = new Line(signal);
@@ -26,27 +28,27 @@ export async function follow(after, take, connected, signal) {
       connected(true);
     };
     try {
-      for (const id of doubted ? [...after.keys()] : [])
-        if (await erased(id, line.signal)) end({ session: id, finished: true, erased: true });
+      for (const id of doubted ? [...after.keys()] : []) {
+        const told = await fate(id, line.signal);
+        if (told.erased) end({ session: id, finished: true, ...told });
+      }
       if (!after.size) return;
-      doubted = false;
       const places = [...after].map(([id, t]) => `session=${encodeURIComponent(`${id}:${t}`)}`);
       for await (const item of events(`v1/events?${places.join("&")}`, line.signal, alive)) {
-        if (item.finished) end({ ...item, erased: await erased(item.session, line.signal) });
+        if (item.finished) end({ ...item, ...(await fate(item.session, line.signal)) });
         else {
           after.set(item.session, item.t);
           take(item);
         }
       }
-      doubted = true;
     } catch (error) {
       if (line.silent || passes(error)) {
-        doubted = true;
         if (!signal.aborted) connected(false);
       } else if (!line.signal.aborted) throw error;
     } finally {
       line.close();
     }
+    doubted = true;
     await pause(AGAIN);
   }
 }
@@ -76,13 +78,13 @@ class Line {
   }
 }
 
-/** Whether a session is no longer there. */
-async function erased(id, signal) {
+/** What has become of a session: {} where it is there, else `erased`, with `anew` where another has its id. */
+async function become(id, created, signal) {
   try {
-    await ask(`v1/sessions/${encodeURIComponent(id)}`, { signal });
-    return false;
+    const session = await ask(`v1/sessions/${encodeURIComponent(id)}`, { signal });
+    return session.created_at === created ? {} : { erased: true, anew: true };
   } catch (error) {
-    if (error.status === 404) return true;
+    if (error.status === 404) return { erased: true };
     throw error;
   }
 }

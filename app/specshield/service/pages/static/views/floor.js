@@ -64,6 +64,7 @@ export async function show(place, { query, signal }) {
   await Promise.all([floor.load(signal).then(draw), ...Array.from({ length: AT_ONCE }, read)]);
   const by = new Map(all.map((each) => [each.session.id, each]));
   const after = new Map(all.filter((each) => !each.session.finished).map((each) => [each.session.id, each.items.length - 1]));
+  const created = new Map(all.map(({ session }) => [session.id, session.created_at]));
   const take = (item) => {
     const each = by.get(item.session);
     state.heard();
@@ -74,7 +75,7 @@ export async function show(place, { query, signal }) {
     }
     draw();
   };
-  follow(after, take, (connected) => state.live(connected), signal).then(
+  follow(after, created, take, (connected) => state.live(connected), signal).then(
     () => signal.aborted || state.over("over"),
     (error) => {
       state.over("no longer followed");

@@ -25,17 +25,18 @@ export async function show(place, { id, signal }) {
 }
 
 async function listen(place, watch, state, items, signal) {
-  const { id } = watch.session;
+  const { id, created_at } = watch.session;
   const last = items.findLast((item) => item.decision)?.t ?? -1;
   const take = (item) => {
-    if (item.rule >= watch.session.rules?.length) return dispatchEvent(new Event("hashchange")); // another rule
+    const another = item.anew || item.rule >= watch.session.rules?.length; // session of this id, or rule
+    if (another) return dispatchEvent(new Event("hashchange"));
     state.heard();
     if (!item.finished) return watch.push(item);
     state.over(item.erased ? "erased: the server no longer has this session" : `over, the rule is ${item.spec_status}`);
     say(item.erased ? "The session was erased." : `The session is over: the rule is ${item.spec_status}.`);
   };
   try {
-    await follow(new Map([[id, last]]), take, (connected) => state.live(connected), signal);
+    await follow(new Map([[id, last]]), new Map([[id, created_at]]), take, (connected) => state.live(connected), signal);
   } catch (error) {
     state.over("no longer followed");
     place.append(problem(error));
