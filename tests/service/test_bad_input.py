@@ -105,6 +105,20 @@ def test_bodies_that_are_no_json_object(client, unchanged, content):
     problem(response, 422, response.json()["type"])
 
 
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b'{"policy_id": "\xff"}', "its text is not UTF-8"),
+        (b"[" * 20_000, "it is nested too deeply"),
+        (b'{"seed": ' + b"9" * 5000 + b"}", "a number has too many digits"),
+    ],
+)
+@pytest.mark.parametrize("path", ["", "/nosuch/close", "/nosuch/switch", "/nosuch/steps"])
+def test_bodies_about_sessions_that_cannot_be_read_say_why(client, path, content, why):
+    told = client.post(f"/v1/sessions{path}", content=content, headers={"Content-Type": "application/json"})
+    assert problem(told, 422, "invalid-input")["detail"] == f"the body is not JSON: {why}"
+
+
 def test_json_that_is_not_said_to_be(client, unchanged):
     response = client.post("/v1/specs/validate", content=json.dumps({"formula": "x > 0"}))
     told = problem(response, 415, "unsupported-media-type", "Content-Type")

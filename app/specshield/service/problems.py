@@ -67,6 +67,11 @@ FIELD_ERRORS: Mapping[str, type[InputError]] = {
 }
 
 
+UNREADABLE: Mapping[type[Any], str] = {  # why a body whose reading failed so is no JSON
+    RecursionError: "it is nested too deeply",
+    UnicodeDecodeError: "its text is not UTF-8",
+    ValueError: "a number has too many digits",
+}
 LISTS = ("errors", "conjuncts")  # stay the lists that they are: their entries were cut when they were made
 
 
@@ -122,9 +127,8 @@ def failed() -> Response:
     """For what nobody expected. Whoever sends it raises the error again: uvicorn writes the traceback to the
     log and closes the connection, which the caller has to know before it asks there again.
     """
-    return response(
-        errors.ServerError("the server failed on this request; its log says more"), {"Connection": "close"}
-    )
+    error = errors.ServerError("the server failed on this request; its log says more")
+    return response(error, {"Connection": "close"})
 
 
 class ProblemResponse(Response):
@@ -155,11 +159,8 @@ def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = 
         what = below or "the body"
         return InputError(f"{what} is not JSON: {reason}", path=below or None, expected="a JSON object")
     if isinstance(body, bytes):  # not read at all
-        return errors.UnsupportedMediaType(
-            "the body is not declared as JSON",
-            path="Content-Type",
-            expected="the header Content-Type: application/json",
-        )
+        told, expected = "the body is not declared as JSON", "the header Content-Type: application/json"
+        return errors.UnsupportedMediaType(told, path="Content-Type", expected=expected)
     # Where a word or an object would do, an object is told what it lacks, not that it is no word.
     found = [
         e for e in found if e["type"] != "literal_error" or not isinstance(e.get("input"), dict)
@@ -257,15 +258,15 @@ def install(app: FastAPI) -> None:
     async def http(request: Request, error: HTTPException) -> Response:
         path = request.url.path
         if error.status_code == 404:
-            return response(
-                errors.NotFound(f"there is no {path} here", got=path, expected="a path listed at /docs")
-            )
+            told, expected = f"there is no {path} here", "a path listed at /docs"
+            return response(errors.NotFound(told, got=path, expected=expected))
         if error.status_code == 405:
-            allowed = _allowed(request)
-            message = f"{path} does not take {request.method}"
-            return response(
-                errors.MethodNotAllowed(message, got=request.method, expected=allowed), {"Allow": allowed}
-            )
+            told, allowed = f"{path} does not take {request.method}", _allowed(request)
+            wrong = errors.MethodNotAllowed(told, got=request.method, expected=allowed)
+            return response(wrong, {"Allow": allowed})
+        reason = UNREADABLE.get(type(error.__cause__))
+        if reason is not None:
+            return response(InputError(f"the body is not JSON: {reason}", expected="a JSON object"))
         return response(InputError(str(error.detail), expected="a request in the form that /docs describes"))
 
     @app.exception_handler(ClientGone)

@@ -19,11 +19,6 @@ MOST_FIELDS = 64  # of what is no step: each unknown field costs an error to be 
 _json, _msgpack = msgspec.json.Decoder(StepBody), msgspec.msgpack.Decoder(StepBody)
 _any = msgspec.msgpack.Decoder(ext_hook=lambda code, data: bytes(data))
 _pack = msgspec.msgpack.Encoder()
-_REASONS = {
-    RecursionError: "it is nested too deeply",
-    UnicodeDecodeError: "its text is not UTF-8",
-    ValueError: "a number has too many digits",
-}
 
 
 def read_step(body: bytes | str, packed: bool) -> StepBody:
@@ -49,7 +44,7 @@ def _parsed(body: bytes | str, packed: bool) -> Any:
     try:
         return _any.decode(body) if packed and isinstance(body, bytes) else json.loads(body)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        reason = _REASONS.get(type(error)) or getattr(error, "msg", str(error))
+        reason = problems.UNREADABLE.get(type(error)) or getattr(error, "msg", str(error))
         raise InputError(
             f"the body is not {name}: {reason}", expected="a JSON object" if not packed else "a map"
         ) from None
