@@ -1,5 +1,6 @@
 """What a caller can get wrong: a problem that names field, value and what is valid, and no change."""
 
+import codecs
 import io
 import json
 import math
@@ -117,6 +118,23 @@ def test_bodies_that_are_no_json_object(client, unchanged, content):
 def test_bodies_about_sessions_that_cannot_be_read_say_why(client, path, content, why):
     told = client.post(f"/v1/sessions{path}", content=content, headers={"Content-Type": "application/json"})
     assert problem(told, 422, "invalid-input")["detail"] == f"the body is not JSON: {why}"
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "status"),
+    [
+        ("maps", grid_json(), 201),
+        ("specs/validate", {"formula": "F[0,3] x > 1"}, 200),
+        ("policies", {"map_id": "nosuch", "spec": {"formula": "F[0,3] x > 1"}}, 404),
+        ("sessions", {"policy_id": "nosuch", "initial_pose": START}, 404),
+        ("sessions/nosuch/steps", {"t": 0, "poses": [START]}, 404),
+    ],
+)
+def test_a_byte_order_mark_is_passed_over(client, path, body, status):
+    """PowerShell writes one, and Windows' editors do."""
+    content = codecs.BOM_UTF8 + json.dumps(body).encode()
+    told = client.post(f"/v1/{path}", content=content, headers={"Content-Type": "application/json"})
+    assert told.status_code == status, told.text
 
 
 def test_json_that_is_not_said_to_be(client, unchanged):

@@ -5,6 +5,7 @@ Every function takes the settings first, and gives what the server needs for its
 
 from __future__ import annotations
 
+import codecs
 import math
 import re
 import signal
@@ -228,7 +229,7 @@ def _bytes(content: Content) -> bytes:
 
 def _object(content: bytes) -> dict[str, Any]:
     try:
-        members = msgspec.json.decode(content)
+        members = msgspec.json.decode(content.removeprefix(codecs.BOM_UTF8))
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"the body is not JSON: {error}", expected="a JSON object") from None
     if not isinstance(members, dict):
@@ -238,6 +239,7 @@ def _object(content: bytes) -> dict[str, Any]:
 
 def parse(adapter: TypeAdapter[T], content: bytes, below: str = "") -> T:
     """`content` as JSON of this shape. Raises InputError, its path below `below`."""
+    content = content.removeprefix(codecs.BOM_UTF8)  # that some editors and shells write
     try:
         return adapter.validate_json(content)
     except ValidationError as invalid:
