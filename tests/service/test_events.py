@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
+import signal
 import socket
 import threading
 import time
 from typing import Any
 
 import httpx
+import redis
 
 from specshield.service.access.owners import scoped
 from specshield.service.sessions import record
@@ -267,6 +270,29 @@ def test_an_erased_session_ends_its_streams_and_an_unknown_one_has_none(server, 
     for wrong in ("-2", "x", str(10**9)):
         response = client.get(f"/v1/sessions/{session['id']}/events", headers={"Last-Event-ID": wrong})
         assert response.json()["type"] == "invalid-input"
+
+
+def test_a_stream_that_needs_a_store_which_is_away_ends_and_the_log_tells_of_no_failure(tmp_path):
+    with (
+        serving(tmp_path, SPECSHIELD_STORE_TIMEOUT="0.5") as server,
+        httpx.Client(base_url=server.url, timeout=None) as client,
+        contextlib.closing(redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket"))) as store,
+    ):
+        body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}
+        session = client.post("/v1/sessions", json=body).json()["id"]
+        body = {"t": 0, "poses": [[4.5, 5.0, 0.0]], "logits": [0.0] * 20}
+        assert client.post(f"/v1/sessions/{session}/steps", json=body).status_code == 200
+        Reader(server.url, session)  # so that the server knows of the session
+        while not watched(client):
+            time.sleep(0.05)
+        pid = store.info()["process_id"]
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            for path in (f"/v1/sessions/{session}/events?after=-1", f"/v1/events?session={session}:-1"):
+                assert client.get(path).text == "retry: 1000\n\n"
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        assert "Traceback" not in server.log.read_text()
 
 
 def watched(client: httpx.Client) -> bool:

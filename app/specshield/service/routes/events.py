@@ -5,6 +5,7 @@ server-sent events; and `/v1/sessions/{id}/record`, all of it, to be verified.
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
 from typing import Annotated, Any
 
 import anyio
@@ -12,6 +13,7 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import Field
 from starlette.types import Receive, Scope, Send
 
+from specshield.errors import StoreError
 from specshield.service import examples
 from specshield.service.access.owners import Owner, scoped
 from specshield.service.problems import until_gone
@@ -26,7 +28,7 @@ overview = APIRouter(tags=["sessions"])
 
 
 class EventStream(Response):
-    """Sends what the stream gives until it ends, its key is refused, or the reader is gone."""
+    """Sends what the stream gives until it ends, its key is refused, the store is away or the reader gone."""
 
     media_type = EVENTS
 
@@ -43,7 +45,7 @@ class EventStream(Response):
         shown = dict(scope["headers"]).get(b"authorization", b"")
         await send({"type": "http.response.start", "status": 200, "headers": self.raw_headers})
         async with anyio.create_task_group() as group:
-            with anyio.CancelScope() as reading:
+            with anyio.CancelScope() as reading, suppress(StoreError):
                 group.start_soon(end_after, until_gone, receive)
                 group.start_soon(end_after, scope["app"].state.server.keys.until_refused, shown)
                 async for content in self._stream:

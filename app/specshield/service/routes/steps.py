@@ -30,9 +30,8 @@ class StepRoute:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        found = (
-            PATH.fullmatch(scope["path"]) if scope["type"] == "http" and scope["method"] == "POST" else None
-        )
+        asked = scope["type"] == "http" and scope["method"] == "POST"
+        found = PATH.fullmatch(scope["path"]) if asked else None
         if found is None:
             await self.app(scope, receive, send)
             return
