@@ -23,6 +23,30 @@ def keyed(tmp_path_factory):
         yield running
 
 
+@pytest.mark.parametrize("ends", ["close", "delete"])
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_a_session_that_is_over_keeps_no_connection(server, ends, asynchronous):
+    """Whoever drives many episodes with one client would run out of files."""
+
+    async def awaited():
+        async with AsyncShieldClient(server.url, timeout=60.0, stream=True) as client:
+            session = await client.sessions.create(policy_id="case1", initial_pose=POSE)
+            await session.step(POSE, [0.0] * 20)
+            opened = len(client._streams._open)
+            await (session.close() if ends == "close" else client.sessions.delete(session.id))
+            return opened, len(client._streams._open)
+
+    def blocking():
+        with ShieldClient(server.url, timeout=60.0, stream=True) as client:
+            session = client.sessions.create(policy_id="case1", initial_pose=POSE)
+            session.step(POSE, [0.0] * 20)
+            opened = len(client._streams._open)
+            _ = session.close() if ends == "close" else client.sessions.delete(session.id)
+            return opened, len(client._streams._open)
+
+    assert (asyncio.run(awaited()) if asynchronous else blocking()) == (1, 0)
+
+
 class Watcher(threading.Thread):
     """Reads the decisions of a session until it ends."""
 

@@ -126,6 +126,13 @@ def test_a_flag_may_be_one_of_numpy(stepping):
     assert sent == {"main_task_done": True, "witnesses": True, "explain": True}
 
 
+def test_the_connection_of_a_session_that_is_finished_is_left(stepping):
+    """Under another rule it may go on, over a new one."""
+    server = Server({**decided(0), "finished": True})
+    stepping(server, 3)
+    assert len(server.paths) == 2
+
+
 def test_a_loop_that_is_closed_keeps_no_connection():
     """Each `asyncio.run` has a loop of its own."""
     with served(Server()) as url:
@@ -229,7 +236,8 @@ def test_a_forked_process_asks_over_connections_of_its_own():
 
 def test_of_two_connections_for_one_session_one_is_kept_and_none_of_a_closed_client(monkeypatch):
     left, answering = [], threading.Event()
-    monkeypatch.setattr(stream, "leave", lambda connection: left.append(connection) or leave(connection))
+    leaving = staticmethod(lambda connection: left.append(connection) or leave(connection))
+    monkeypatch.setattr(stream.SyncStreams, "_leave", leaving)
     server = Server(answering, answering, None, closing := threading.Event())
     with served(server) as url, ShieldClient(url, timeout=60.0, stream=True) as client:
         asking = [

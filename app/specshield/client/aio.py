@@ -78,9 +78,10 @@ class AsyncShieldClient:
         exchange = Exchange(request, self._http.base_url, self._timeout, ends)
         if exchange.seconds <= 0.0:
             return exchange.failure(httpx.PoolTimeout(""))
-        message = None if self._streams is None else packed(request)
-        if self._streams is not None and message is not None:
-            return await self._streams.perform(exchange, message)
+        if self._streams is not None:
+            if (message := packed(request)) is not None:
+                return await self._streams.perform(exchange, message)
+            self._streams.end(request)
         bounded.ENDS.set(exchange.ends)
         try:
             reply = await asyncio.wait_for(self._exchanged(exchange), exchange.ends - time.monotonic())

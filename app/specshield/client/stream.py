@@ -2,8 +2,8 @@
 
 A message is the body of a step, its answer that of the answer or a problem document. A try has the same time
 as one over HTTP. A connection on which a try failed is left, so nothing that still comes on it is ever read,
-and the next try makes another. What is longer than `SHORT` goes over HTTP: a short message fits the socket's
-buffer, so sending it cannot block.
+and the next try makes another; so is that of a session which is over. What is longer than `SHORT` goes over
+HTTP: a short message fits the socket's buffer, so sending it cannot block.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import contextlib
 import os
 import socket
 import time
+from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,6 @@ from specshield.client.wire import Failure, Reply, Request
 from specshield.errors import InputError
 
 if TYPE_CHECKING:
-    from websockets.asyncio.client import ClientConnection as AsyncSocket
     from websockets.sync.client import ClientConnection as Socket
 
 SHORT = 16_384  # bytes; chosen by hand, far below what the socket's buffer takes
@@ -42,8 +42,23 @@ def packed(request: Request) -> bytes | None:
     return message if len(message) <= SHORT else None
 
 
+def leave(connection: Any) -> None:
+    """Without a closing handshake, which would wait for the other side."""
+    with contextlib.suppress(OSError, AttributeError):
+        connection.socket.shutdown(socket.SHUT_RDWR)
+
+
+def abort(connection: Any) -> None:
+    """The same with asyncio."""
+    with contextlib.suppress(AttributeError):
+        connection.transport.abort()
+
+
 class Streams:
     """What both shells share: where a session's stream is, and what an answer means."""
+
+    _here: Callable[[], Any]  # the process, or the loop, that a connection made now is of
+    _leave: Callable[[Any], None]  # gives a connection up
 
     def __init__(self, http: httpx.Client | httpx.AsyncClient) -> None:
         """InputError where the packages are missing."""
@@ -51,12 +66,29 @@ class Streams:
             import msgpack  # noqa: F401
             import websockets  # noqa: F401
         except ImportError as error:
-            raise InputError(
-                f"stream=True needs the package {error.name}, which is not installed",
-                path="stream",
-                expected="pip install 'specshield[stream]', or stream=False",
-            ) from error
+            told = f"stream=True needs the package {error.name}, which is not installed"
+            expected = "pip install 'specshield[stream]', or stream=False"
+            raise InputError(told, path="stream", expected=expected) from error
         self._http = http
+        self._open: dict[tuple[Any, str], Any] = {}  # by what `_here` gives, and the path of the steps
+
+    def close(self) -> None:
+        while self._open:
+            (there, _), connection = self._open.popitem()
+            if there == self._here():
+                self._leave(connection)
+
+    def end(self, request: Request) -> None:
+        """Leaves the stream of a session that this request closes or erases."""
+        if request.method != "GET":
+            steps = request.path.removesuffix("/close") + "/steps"
+            self._leave(self._open.pop((self._here(), steps), None))
+
+    def _keep(self, connection: Any, path: str, reply: Reply | None) -> None:
+        """For the next step, where this one has an answer and the session is not over."""
+        over = reply is None or reply.parsed.get("finished") or self._http.is_closed
+        if over or self._open.setdefault((self._here(), path), connection) is not connection:
+            self._leave(connection)
 
     def _address(self, request: Request) -> str:
         base = str(self._http.base_url.copy_with(scheme=self._http.base_url.scheme.replace("http", "ws")))
@@ -98,15 +130,13 @@ def _failed(exchange: Exchange, error: Exception) -> Reply | Failure:
 class SyncStreams(Streams):
     """As with HTTP (bounded.py), a forked process opens its own connections."""
 
-    def __init__(self, http: httpx.Client) -> None:
-        super().__init__(http)
-        self._open: dict[tuple[int, str], Socket] = {}
+    _here, _leave = staticmethod(os.getpid), staticmethod(leave)
 
     def perform(self, exchange: Exchange, message: bytes) -> Reply | Failure:
         import websockets
 
-        mine, reply = (os.getpid(), exchange.request.path), None
-        connection: Any = self._open.pop(mine, None)
+        path, reply = exchange.request.path, None
+        connection: Any = self._open.pop((self._here(), path), None)
         try:
             connection = connection or self._connected(exchange)
             connection.send(message)
@@ -116,8 +146,7 @@ class SyncStreams(Streams):
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
             return _failed(exchange, error)
         finally:
-            if not reply or self._http.is_closed or self._open.setdefault(mine, connection) is not connection:
-                leave(connection)
+            self._keep(connection, path, reply)
         return exchange.failure(httpx.ReadError(STALE)) if reply is None else reply
 
     def _connected(self, exchange: Exchange) -> Socket:
@@ -131,28 +160,14 @@ class SyncStreams(Streams):
             raise TimeoutError
         return made.result()
 
-    def close(self) -> None:
-        while self._open:
-            (process, _), connection = self._open.popitem()
-            if process == os.getpid():
-                leave(connection)
-
 
 def _leave_late(made: Future[Socket]) -> None:
     if made.exception() is None:
         leave(made.result())
 
 
-def leave(connection: Any) -> None:
-    """Without a closing handshake, which would wait for the other side."""
-    with contextlib.suppress(OSError, AttributeError):
-        connection.socket.shutdown(socket.SHUT_RDWR)
-
-
 class AsyncStreams(Streams):
-    def __init__(self, http: httpx.AsyncClient) -> None:
-        super().__init__(http)
-        self._open: dict[tuple[asyncio.AbstractEventLoop, str], AsyncSocket] = {}
+    _here, _leave = staticmethod(asyncio.get_running_loop), staticmethod(abort)
 
     async def perform(self, exchange: Exchange, message: bytes) -> Reply | Failure:
         import websockets
@@ -171,8 +186,8 @@ class AsyncStreams(Streams):
         """The connection is kept only where it brought the answer: whoever cancels leaves it too."""
         from websockets.asyncio.client import connect
 
-        mine, reply = (asyncio.get_running_loop(), exchange.request.path), None
-        connection = self._open.pop(mine, None)
+        path, reply = exchange.request.path, None
+        connection: Any = self._open.pop((self._here(), path), None)
         if connection is None:
             for other in [kept for kept in list(self._open) if kept[0].is_closed()]:
                 self._open.pop(other, None)  # each asyncio.run has a loop of its own
@@ -182,12 +197,5 @@ class AsyncStreams(Streams):
             await connection.send(message)
             reply = self._read(exchange, await connection.recv())
         finally:
-            if not reply or self._http.is_closed or self._open.setdefault(mine, connection) is not connection:
-                connection.transport.abort()
+            self._keep(connection, path, reply)
         return reply
-
-    def close(self) -> None:
-        while self._open:
-            (loop, _), connection = self._open.popitem()
-            if loop is asyncio.get_running_loop():
-                connection.transport.abort()

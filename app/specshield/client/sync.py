@@ -85,9 +85,10 @@ class ShieldClient:
         exchange = Exchange(request, self._http.base_url, self._timeout, ends)
         if exchange.seconds <= 0.0:
             return exchange.failure(httpx.PoolTimeout(""))
-        message = None if self._streams is None else packed(request)
-        if self._streams is not None and message is not None:
-            return self._streams.perform(exchange, message)
+        if self._streams is not None:
+            if (message := packed(request)) is not None:
+                return self._streams.perform(exchange, message)
+            self._streams.end(request)
         token = bounded.ENDS.set(exchange.ends)
         try:
             with contextlib.ExitStack() as opened:

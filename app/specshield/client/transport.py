@@ -27,12 +27,9 @@ def address(base_url: str) -> httpx.URL:
     except (httpx.InvalidURL, TypeError):  # TypeError: it is no text
         url = httpx.URL("")
     if url.scheme not in ("http", "https") or not url.host or (url.port or 0) > 65535:
-        raise InputError(
-            "this is not the address of a server",
-            path="base_url",
-            got=base_url,
-            expected="http://host:port or https://host:port, with a port of at most 65535",
-        )
+        expected = "http://host:port or https://host:port, with a port of at most 65535"
+        told = "this is not the address of a server"
+        raise InputError(told, path="base_url", got=base_url, expected=expected)
     return url
 
 
@@ -40,11 +37,8 @@ def headers(api_key: str | None) -> dict[str, str]:
     """InputError for a key that no header can carry."""
     sendable = isinstance(api_key, str) and re.fullmatch(r"[!-~]([ -~]*[!-~])?", api_key)
     if api_key is not None and not sendable:
-        raise InputError(
-            "the API key cannot be sent in a header",
-            path="api_key",
-            expected="printable ASCII, with no space at either end",
-        )
+        expected = "printable ASCII, with no space at either end"
+        raise InputError("the API key cannot be sent in a header", path="api_key", expected=expected)
     plain = {"Accept-Encoding": "identity"}  # what is compressed could be larger than it looks
     return plain if api_key is None else {**plain, "Authorization": f"Bearer {api_key}"}
 

@@ -238,9 +238,8 @@ def json_object(reply: Reply) -> dict[str, Any]:
     check(reply)
     body = reply.document
     if not isinstance(body, dict):
-        raise ServerError(
-            "the answer is not a JSON object; is this a specshield server?", status=reply.status
-        )
+        told = "the answer is not a JSON object; is this a specshield server?"
+        raise ServerError(told, status=reply.status)
     return body
 
 
