@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from client_script import SESSION, answer, drive, lost, problem
 
@@ -290,7 +291,7 @@ def test_a_decision_says_why_an_action_is_forbidden(why, line):
     told = {"conjunct": "F[50,100] Region2", "robustness": why[0], "late_by": why[1]}
     told |= {"detail": why[2]} if len(why) > 2 else {}
     decision, _ = step(session(), 0, decided(0, M, explanations=[None, told, None]))
-    assert decision.why("b") == decision.why(B) == f"b is forbidden: {line}"
+    assert decision.why("b") == decision.why(B) == decision.why(np.int64(B)) == f"b is forbidden: {line}"
     assert decision.why("m") == "m is not forbidden"
     with pytest.raises(errors.InputError, match="no such action"):
         decision.why("x")

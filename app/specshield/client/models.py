@@ -206,8 +206,8 @@ class Decision:
         Raises InputError for an action that there is not.
         """
         count = len(self.j_values)
-        i = self.action_names.index(action) if action in self.action_names else action
-        if not isinstance(i, int) or not 0 <= i < count:
+        i: Any = self.action_names.index(action) if action in self.action_names else action
+        if not hasattr(i, "__index__") or not 0 <= i < count:
             names = ", ".join(self.action_names)
             raise InputError(
                 "there is no such action",
