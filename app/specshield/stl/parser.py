@@ -191,8 +191,8 @@ class _Parser:
             raise self._error(f"'{_clip(token.text)}' is too large", token, "a number that a float64 holds")
         return nodes.Number(value)
 
-    def _name(self, token: Token) -> Name:
-        if self._token.kind == "(" and token.text in BODY_WORDS:
+    def _name(self, token: Token, of_region: bool = False) -> Name:
+        if self._token.kind == "(" and token.text in BODY_WORDS and not of_region:
             return self._body_name(token)
         if self._names is not None and token.text not in self._names:
             known = sorted(name for name in self._names if "(" not in name)
@@ -206,7 +206,7 @@ class _Parser:
         """`touches(R)` or `inside(R)`: `names` holds them for every region."""
         self._next()
         region = self._take("name", f"the name of a region after '{word.text}('")
-        found = self._name(region).name
+        found = self._name(region, of_region=True).name
         self._take(")", f"')' after the region of '{word.text}'")
         name = nodes.body_name(word.text, found)
         if self._names is not None and name not in self._names:
