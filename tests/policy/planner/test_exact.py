@@ -1,5 +1,7 @@
 """What descending the fields does not find: starts near a deadline, and narrow places."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,10 @@ from specshield.policy.planner.policy import synthesise
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body, simulate
 from specshield.shield.episode import decide, make_shield, start
+from specshield.stl import robustness
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
+from tests.policy.rooms import OCCUPIED, REGIONS, flat
 
 ROOM = OccupancyGrid(np.pad(np.zeros((48, 48), bool), 1, constant_values=True), 0.1)
 
@@ -43,3 +47,23 @@ def test_a_place_much_smaller_than_a_cell_is_found_and_kept_to(heading):
         carry = decision.carry
     off = np.abs(np.array(poses) - after[-1])
     assert np.any((np.hypot(off[:, 0], off[:, 1]) < 0.02) & (off[:, 2] < (0.0175 if heading else 10.0)))
+
+
+@pytest.mark.parametrize("rule", ["F[0,60] East", "F[60,61] East or F[60,61] Wall"])
+def test_a_choice_of_places_is_searched_for_as_one_place_is(rule):
+    """The door that the fields lead through is shut on a session's own map. No literal of a choice is due."""
+    occupied = OCCUPIED.copy()
+    occupied[25:, 20] = False
+    wall = {"type": "circle", "center": [2.05, 0.3], "radius": 0.04}
+    task = flat(rule, regions=REGIONS | {"Wall": wall})
+    task = replace(task, grid=replace(task.grid, occupied=occupied))
+    shut = occupied.copy()
+    shut[10:20, 20] = True
+    policy, body = synthesise(task), make_body(task.robot, replace(task.grid, occupied=shut))
+    start = np.array([*task.grid.to_map([1.6, 1.2]), 0.3])
+    ways = policy.on_body(body).propose(start[None], {}, 0.0).motions
+    poses = np.empty((*ways.shape, 3))
+    for motions, led in zip(ways, poses, strict=True):
+        simulate(body, start, motions, led)
+    driven = [task.samples(np.concatenate([start[None], led])) for led in poses]
+    assert any(robustness(task.formula, each) > 0.0 for each in driven)

@@ -40,9 +40,10 @@ def search_exactly(world: World, way: Way, nodes: Nodes, effort: float, most: in
     tree, n, left = make_tree(most, 0), 0, most
     for _ in range(LEGS):
         due, before = nodes.need[0, :, DUE].copy(), n
+        choice = (due == NO_DATE).all()  # of several literals, any of which may fail
         for k in np.argsort(due):
             k = int(k)
-            if due[k] == NO_DATE or world.field[k, 0] < 0:
+            if (due[k] == NO_DATE and not choice) or world.field[k, 0] < 0:
                 continue
             read_at(world, way, n)
             if holds(world, k, way.rho):

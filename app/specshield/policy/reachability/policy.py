@@ -23,7 +23,6 @@ from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.progress import Rules, make_rules
 from specshield.policy.progress.recall import pasts
-from specshield.policy.progress.values import initial_signals
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
 from specshield.policy.reachability.guide import HURRIED, hurried, share_with_slack
@@ -37,10 +36,11 @@ from specshield.policy.reachability.stored import read_tables, stored
 from specshield.policy.reachability.tables import Guide, Tables
 from specshield.policy.shape import lattice_shape
 from specshield.robot.barred import NOTHING_BARRED, in_vain
-from specshield.robot.dynamics import Body, calmest_motion, make_body, simulate
+from specshield.robot.dynamics import Body, calmest_motion, make_body
 from specshield.robot.room import widened
 from specshield.rule.values import signal_rows
-from specshield.rule.view import look, rate, view_of
+from specshield.rule.view import view_of
+from specshield.shield.feasibility import prefix_of, simulated
 from specshield.shield.proposal import Proposal, joined
 from specshield.stl import SATISFIED_ABOVE
 from specshield.task import Task
@@ -202,17 +202,12 @@ class ReachabilityPolicy(Carded):
 
     def _keeps(self, pose: Floats) -> bool:
         """Whether something that is proposed from a pose at the first step keeps the rule."""
-        view, held = view_of(self.task, self.task.formula), initial_signals(self.task).reshape(1, -1)
-        known = np.empty(view.tree.size)
-        low, _ = look(view, pose.reshape(1, 3), held, known)
-        if self.task.horizon == 0:
-            return bool(low > SATISFIED_ABOVE)
-        motions = self._proposal(pose.reshape(1, 3), {}, 0.0, AFTER).motions
-        poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
-        for row, led in zip(motions, poses, strict=True):
-            simulate(self._body, pose, row, led)
-        rate(view, known, 0, poses, held, rho, np.empty((len(motions), view.tree.size)))
-        return bool(rho.max() > SATISFIED_ABOVE)
+        formula, history = self.task.formula, pose.reshape(1, 3)
+        prefix = prefix_of(self.task, formula, view_of(self.task, formula), history, {})
+        if prefix.steps == 0:
+            return prefix.low > SATISFIED_ABOVE
+        motions = self._proposal(history, {}, 0.0, AFTER).motions
+        return bool(simulated(prefix, self._body, [motions], 0).rho.max() > SATISFIED_ABOVE)
 
 
 def synthesise(task: Task, settings: Settings | None = None, run: Run | None = None) -> ReachabilityPolicy:
