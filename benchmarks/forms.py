@@ -1,11 +1,15 @@
 """Whether noise and slips break rules of every form: with what a session asks for by default, and without.
 
     python -m benchmarks.forms [--runs 40] [--seed 0]
+    python -m benchmarks.forms --worlds [--runs 40] [--seed 0]
 
 The goal-seeking model drives a Stretch in the apartment of case 1, from anywhere that the rule can be kept
 from. Slips: one motion in twenty does nothing. Noise: each motion ends off by sigma 1 cm along x and along y
 and by sigma half a degree. Printed, for each rule: in how many runs it was kept, and KL a run [nats], by
 `uncertainty: "none"` in the exact world and with slips and noise, and by default in the same three.
+
+With --worlds: in worlds that are not as told (evaluation/worlds/world.py), by a scan and by contact alone,
+how many runs were kept of those that an oracle can keep, and the time of decisions that changed the map [ms].
 """
 
 from __future__ import annotations
@@ -18,11 +22,14 @@ import numpy as np
 from evaluation import disturbance
 from evaluation.experiment import SESSIONS
 from evaluation.methods import Method, Shielded
+from evaluation.worlds.runs import SENSING, Trial, run_in
+from evaluation.worlds.world import WORLDS
 from specshield.errors import SpecshieldError
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.methods import DEFAULT
 from specshield.policy.planner.policy import synthesise as plan
 from specshield.policy.reachability.policy import synthesise as make_tables
+from specshield.service.warmup import PARTS, warm_up
 from specshield.shield.episode import Config, Shield, make_shield, start
 from specshield.sim.cases import Case, load_case
 from specshield.sim.model import GoalSeeker
@@ -51,6 +58,7 @@ RULES = (  # what it is, the method, the rule
 )
 CONFIGS = {"none": Config(), "default": SESSIONS["default"]}
 NOISES = ("none", "slip", "gaussian")
+UNTOLD, FELT = WORLDS[1:], SENSING[:2]
 START, DRAW, MODEL, MISMATCH = range(4)  # streams of a run's seed
 
 
@@ -58,21 +66,53 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--worlds", action="store_true", help="in worlds that are not as told")
     asked = parser.parse_args()
+    show = show_worlds if asked.worlds else show_noises
+    show(asked.runs, asked.seed)
+
+
+def show_noises(count: int, seed: int) -> None:
     columns = [f"{config}, {noise}" for config in CONFIGS for noise in NOISES]
     print("| what | rule | method | " + " | ".join(columns) + " |")
     print("|---|---|---|" + "--:|" * len(columns))
     for what, method, rule in RULES:
-        base = load_case("case1")
-        task = make_task(base.task.grid, base.task.robot, rule, base.spec["regions"], base.rooms)
-        case, policy = replace(base, task=task), (plan if method == "planner" else make_tables)(task)
+        case = case_of(rule)
+        policy = (plan if method == "planner" else make_tables)(case.task)
         cells = []
         for config in CONFIGS.values():
             shield = make_shield([policy], config)
             for noise in NOISES:
-                runs = [run(case, shield, noise, [asked.seed, i]) for i in range(asked.runs)]
+                runs = [run(case, shield, noise, [seed, i]) for i in range(count)]
                 cells.append(f"{sum(ok for ok, _ in runs)} ({np.mean([kl for _, kl in runs]):.0f})")
         print(f"| {what} | `{rule}` | {method} | " + " | ".join(cells) + " |", flush=True)
+
+
+def case_of(rule: str) -> Case:
+    base = load_case("case1")
+    task = make_task(base.task.grid, base.task.robot, rule, base.spec["regions"], base.rooms)
+    return replace(base, task=task)
+
+
+def show_worlds(runs: int, seed: int) -> None:
+    for part in PARTS:  # kernels are loaded, as in a server
+        warm_up(part)
+    columns = [f"{world}, {sensing}" for world in UNTOLD for sensing in FELT]
+    print("| what | rule | method | " + " | ".join(columns) + " | p99 [ms] |")
+    print("|---|---|---|" + "--:|" * (len(columns) + 1))
+    for what, method, rule in RULES:
+        case, make = case_of(rule), plan if method == "planner" else make_tables
+        cells, times = list[str](), list[float]()
+        for world in UNTOLD:
+            shield = make_shield([make(disturbance.believed(world, case.task))])
+            for sensing in FELT:
+                trial = Trial(rule, world, sensing, seed)
+                found = [run_in(trial, i, case, shield, make, "goal-seeker") for i in range(runs)]
+                could = [each for each in found if each.could]
+                cells.append(f"{sum(each.kept for each in could)} of {len(could)}")
+                times += [ms for each in found for ms in each.changed_ms]
+        p99 = f"{np.percentile(times, 99):.0f}" if times else ""
+        print(f"| {what} | `{rule}` | {method} | " + " | ".join(cells) + f" | {p99} |", flush=True)
 
 
 def run(case: Case, shield: Shield, noise: str, seed: list[int]) -> tuple[bool, float]:

@@ -12,7 +12,7 @@ import numpy as np
 from evaluation.disturbance import believed
 from evaluation.houses import load_house_case
 from evaluation.models import named
-from evaluation.worlds.oracle import can_keep
+from evaluation.worlds.oracle import Make, can_keep
 from evaluation.worlds.robots import ROBOTS
 from evaluation.worlds.world import STAYS, World, look, make_world
 from specshield.errors import InfeasibleStart, PoseError
@@ -94,12 +94,18 @@ def prepared(case: str, collider: bool, robot: str) -> tuple[Case, Shield]:
 
 def run(trial: Trial, i: int) -> Outcome:
     """Run i. Its start, model, draws and world follow from the seed and i alone, whatever is sensed."""
-    own = int(np.random.SeedSequence([trial.seed, i]).generate_state(1)[0])
     case, plain = prepared(trial.case, trial.world == "collider", trial.robot)
+    model = "learned" if trial.robot == "stretch" else "goal-seeker"
+    return run_in(trial, i, case, plain, synthesise, model)
+
+
+def run_in(trial: Trial, i: int, case: Case, plain: Shield, make: Make, model: str) -> Outcome:
+    """The same in a case, with a shield as it is told. make: makes the oracle's policies. model: its name."""
+    own = int(np.random.SeedSequence([trial.seed, i]).generate_state(1)[0])
     shield = replace(plain, config=replace(trial.config, seed=own))
     world, pose = _begin(trial, case, plain, own)
-    could = can_keep(world, pose)
-    return _drive(trial, i, own, case, shield, world, pose, could)
+    could = can_keep(world, pose, make)
+    return _drive(trial, i, own, case, shield, world, pose, could, model)
 
 
 def _begin(trial: Trial, case: Case, shield: Shield, own: int) -> tuple[World, Pose]:
@@ -127,9 +133,17 @@ def certified_way(shield: Shield, pose: Pose) -> np.ndarray:
 
 
 def _drive(
-    trial: Trial, i: int, own: int, case: Case, shield: Shield, world: World, pose: Pose, could: bool
+    trial: Trial,
+    i: int,
+    own: int,
+    case: Case,
+    shield: Shield,
+    world: World,
+    pose: Pose,
+    could: bool,
+    asked: str,
 ) -> Outcome:
-    model = named("learned" if trial.robot == "stretch" else "goal-seeker").make(case)
+    model = named(asked).make(case)
     robot = SimulatedRobot(world.case, pose)
     terminal = case.task.robot.terminal
     poses = np.empty((MAX_STEPS + 1, 3))
