@@ -12,8 +12,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.robot.dynamics import Body, step
 
-# [m] how much larger. Chosen by hand: of 23 runs of a robot whose footprint lies 8 cm behind its origin, with
-# walls 5 cm off in case 1, 12 kept the rule without it, and 23 with 0.05. 0.08 and more cost more.
+# [m] how much larger, chosen by hand (docs/decisions.md): 0.08 and more cost more.
 ROOM = 0.05
 
 

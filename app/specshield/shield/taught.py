@@ -53,9 +53,8 @@ from specshield.world.learned import (
     revised,
 )
 
-# [steps] what a way around something takes that only contacts show. Chosen by hand: of 60 runs in cases 1 and
-# 2, `evaluation worlds --world obstacle --sensing contact` kept 58 and 52 with 12, and 59 and 56 with 20. A
-# robot that turns round for it gets up to as many more: of 30 runs a locobot kept 28 so, and 22 without them.
+# [steps] what a way around something takes that only contacts show, by hand (docs/decisions.md). A robot that
+# turns round for it gets up to as many more: of 30 runs a locobot kept 28 so, and 22 without them.
 AROUND = 20
 NEARBY = 2.0  # [m] poses farther away than this say nothing of a thing that was run into
 SAME_PLACE = 1e-6  # [m]; what rounding explains

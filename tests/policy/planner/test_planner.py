@@ -13,6 +13,7 @@ from specshield.errors import InfeasibleStart, PolicyError
 from specshield.policy.methods import Run, load_policy
 from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
+from specshield.robot.barred import in_vain
 from specshield.robot.dynamics import make_body, simulate
 from specshield.shield.episode import decide, make_shield, start
 from specshield.stl import robustness
@@ -314,3 +315,23 @@ def test_where_there_is_nothing_to_find_it_ends_and_says_the_same_again():
     history = np.array([[*policy.task.grid.to_map((1.0, 1.0)), 0.0]])
     first, second = (policy.propose(history, {}, 0.0) for _ in range(2))
     np.testing.assert_array_equal(first.motions, second.motions)
+
+
+@pytest.mark.parametrize("x", [1.5, 1.87])
+def test_a_way_is_found_without_the_motions_that_led_nowhere(x):
+    """Nothing leads straight ahead, nor backwards. The second place is too near a wall for the lattice to
+    know a way out, which takes two motions.
+    """
+    task = flat("F[0,60] West")
+    policy, body = synthesise(task), make_body(task.robot, task.grid)
+    history = np.array([[*task.grid.to_map([x, 0.5]), task.grid.origin[2] + np.pi]])
+    history[0, 2] -= 2.0 * np.pi
+    moves = [m for m, (far, _) in enumerate(task.robot.motions) if far]
+    barred = np.array([[*history[0], m, 0.01, 0.2] for m in moves])
+    ways = policy.avoiding(barred).propose(history, {}, 0.0).motions
+    poses = np.empty((*ways.shape, 3))
+    for motions, led in zip(ways, poses, strict=True):
+        simulate(body, history[0], motions, led)
+    free = ~in_vain(barred, history[0], ways, poses, True)
+    driven = [task.samples(np.concatenate([history, led])) for led in poses[free]]
+    assert any(robustness(task.formula, each) > 0.0 for each in driven)

@@ -56,8 +56,6 @@ class Policy(Carded):
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """As `Proposer` says."""
-        if len(history) > self.task.horizon:  # no step is left
-            return Proposal(np.empty((1, 0), np.int64), 0)
         rules = self.scene.rules
         scene = self.scene._replace(rules=rules._replace(signals=rules.signals.copy(), margin=margin))
         rows = signal_rows(self.task, signals, len(history))

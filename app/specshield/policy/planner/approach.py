@@ -13,8 +13,8 @@ from specshield.policy.lattice import SHORTEST_MOVE
 from specshield.policy.planner.due_dates import read_pose
 from specshield.policy.planner.fields import OUT_OF_REACH, to_go_after, to_go_at
 from specshield.policy.planner.literals import PREDICATE
-from specshield.policy.planner.way import Way, World, holds, keeps, move, note_at, read_at, stay
-from specshield.robot.dynamics import displacement, motion_count, step
+from specshield.policy.planner.way import Way, World, holds, keeps, lead, move, note_at, read_at, stay
+from specshield.robot.dynamics import displacement, motion_count
 
 # Chosen by hand; nothing measured.
 STUCK_AFTER = 6  # [steps] without a gain after which a descent is stuck
@@ -64,7 +64,7 @@ def descend(world: World, way: Way, k: int, f: int, waits: bool, n: int, stop: i
             m = world.pad if padding else m
             if padding and not barred:
                 break
-            nx, ny, nth = step(body, x, y, theta, m)
+            nx, ny, nth = lead(world, x, y, theta, m)
             led = abs(nx - x) + abs(ny - y) > SHORTEST_MOVE or nth != theta
             if led or padding:
                 read_pose(world.literals, nx, ny, nth, way.values, way.stack, way.rho)
@@ -128,7 +128,7 @@ def descend_by_beam(
                 back = d * moved < 0.0 or angle * turned < 0.0
                 if back or (m == world.pad and world.stands):
                     continue
-                x, y, theta = step(body, before[0], before[1], before[2], m)
+                x, y, theta = lead(world, before[0], before[1], before[2], m)
                 led = abs(x - before[0]) + abs(y - before[1]) > SHORTEST_MOVE or theta != before[2]
                 if shortest == 0 and not led:
                     continue

@@ -18,6 +18,7 @@ from specshield.policy.planner.fields import to_go_at
 from specshield.policy.planner.search import Nodes, guard, search
 from specshield.policy.planner.way import DUE, Way, World, holds, keeps, move, read_at
 from specshield.policy.tree import Tree, is_new, make_tree, pop, push, put, trace
+from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import around, motion_count, step_from
 
 # Chosen by hand; python -m benchmarks.deadlines measures what is found.
@@ -95,7 +96,7 @@ def _reach(
         cos, sin, room = around(body, x0, y0, theta0)
         for m in range(motion_count(body)):
             x, y, theta = step_from(body, x0, y0, theta0, cos, sin, room, m)
-            if x == x0 and y == y0 and theta == theta0:
+            if (x == x0 and y == y0 and theta == theta0) or is_barred(world.barred, x0, y0, theta0, m):
                 continue
             ahead = to_go_at(body, world.fields, f, x, y, theta)
             if n + made + ahead > stop + ASTRAY:

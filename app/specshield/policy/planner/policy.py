@@ -7,11 +7,7 @@ not found costs permission, never safety; how often a way that exists is found i
 what reachability does not: reactive rules over signals, patrols (G F), until, disjunctions of temporal parts,
 nested mixes.
 
-A robot that cannot stand still, or cannot turn in place, is planned for too. In random rooms with one to
-three random conjuncts, of the first motions after which some future of 7 or 8 steps keeps the rule, it
-certifies 0.99 for a robot that moves on arcs and cannot stand, and 0.99 or more for one that turns but cannot
-stand, for one that goes to and fro on a line, and for one that stands and turns. Longer horizons are not
-measured.
+A robot that cannot stand still, or cannot turn in place, is planned for too (docs/decisions.md).
 """
 
 from __future__ import annotations
@@ -46,6 +42,7 @@ from specshield.policy.reachability.sight import BESIDE, about
 from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.reasons.still_open import bounds_after, still_open
+from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turning_motion
 from specshield.rule.values import REGIONS, places, regions_of, signal_rows
 from specshield.rule.view import look
@@ -86,36 +83,39 @@ class PlannerPolicy(Carded):
 
     def on_body(self, body: Body, guess: bool = False) -> PlannerPolicy:
         """The policy on another map: its fields lead as they did, its ways are those that there are."""
-        other = replace(self)
-        other.__dict__.update(_body=body, _world=self._world._replace(body=body))
-        return other
+        return self._in(self._world._replace(body=body))
+
+    def avoiding(self, barred: Floats) -> PlannerPolicy:
+        """The policy for a robot that some motions led nowhere (robot/barred.py)."""
+        return self._in(self._world._replace(barred=barred))
 
     def foreseeing(self, signals: Floats) -> PlannerPolicy:
         """The policy that takes the signals to hold these values [S] from x_{t+1} on, whatever they hold."""
-        other = replace(self, foreseen=signals)
-        other.__dict__.update(_body=self._body, _world=self._world)
+        return replace(self, foreseen=signals)._in(self._world)
+
+    def _in(self, world: World) -> PlannerPolicy:
+        other = replace(self)
+        other.__dict__.update(_body=world.body, _world=world)
         return other
 
     def _world_of(self, formula: Formula) -> World:
         """The world as a search sees it for the task's formula, or for what is left of it."""
         packed, literals = literals_of(self.task, formula)
         _, all_literals = literals_of(self.task, self.task.formula)
-        index = {(found.predicate, found.side): i for i, found in enumerate(all_literals)}
-        known = [index.get((each.predicate, each.side), -1) for each in literals]
-        field = np.full((len(literals), 2), -1, np.int64)
-        for k, i in enumerate(known):
-            if i >= 0:
-                field[k] = self.chosen[i]
+        known = {each[:2]: fields for each, fields in zip(all_literals, self.chosen, strict=True)}
+        leads = [known.get(each[:2], np.array([-1, -1], np.int32)) for each in literals]
         pad, stands = calmest_motion(self._body), self.task.robot.wait_motion >= 0
         # Without a turn in place the lattice has few of the ways that there are: its fields rule out nothing.
         band = BAND if turning_motion(self._body) >= 0 else 2.0 * OUT_OF_REACH
-        return World(self._body, self.fields, packed, field, band, pad, stands, cost_of(packed.formula.tree))
+        columns, cost = np.array(leads, np.int64).reshape(-1, 2), cost_of(packed.formula.tree)
+        return World(self._body, self.fields, packed, columns, band, pad, stands, cost, NOTHING_BARRED)
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        """A plan from x_t, and one after each other first motion."""
-        if len(history) > self.task.horizon:  # no step is left
-            return Proposal(np.empty((1, 0), np.int64), 0)
-        return self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)[0]
+        """A plan from x_t, and one after each other first motion; those that are barred are tried last."""
+        ways, _ = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
+        if len(self._world.barred) == 0:
+            return ways
+        return joined(ways, self.avoiding(NOTHING_BARRED).propose(history, signals, margin))
 
     def _plan(
         self, history: Floats, signals: Mapping[str, Floats], margin: float, most: int
@@ -159,7 +159,7 @@ class PlannerPolicy(Carded):
         look(literals.formula, history, rows, known)
         motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
         effort = self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
-        world = world._replace(literals=literals)
+        world = world._replace(literals=literals, barred=self._world.barred)
         held = rows[-1] if self.foreseen is None else self.foreseen
         first, found = plan_all(world, t, history[-1], held, known, effort, most, motions)
         return Proposal(motions, int(first)), bool(found)
@@ -221,14 +221,12 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
             tell(FIELDS_SHARE * (column * len(literals) + k + 1) / (2 * len(literals)))
     cell = number_cells(used)
     code = np.array(list(codes.values()), np.uint16).reshape(len(codes), int(used.sum()), free.shape[2])
-    fields = Fields(cell, code, pitch)
     # Trying it also leaves its kernels compiled where a server finds them.
-    policy = PlannerPolicy(task, {}, settings, fields, chosen)
-    metrics: dict[str, float] = {}
+    policy = PlannerPolicy(task, {}, settings, Fields(cell, code, pitch), chosen)
     share = policy.feasible_start(
         lattice, on_progress=lambda done: tell(FIELDS_SHARE + (1.0 - FIELDS_SHARE) * done)
     )
-    metrics["feasible_start"] = round(share, 4)
+    metrics = {"feasible_start": round(share, 4)}
     if task.signals:
         worst = worst_signals(task)
         at_worst = {} if worst is None else dict(zip(task.signals, worst.T, strict=True))
@@ -239,8 +237,7 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
         "size_bytes": int(code.nbytes + cell.nbytes),
         "wall_time_s": round(time.perf_counter() - began, 3),
     }
-    card = make_card(task, "planner", options_to_json(settings), 0, metrics, run.spec)
-    return PlannerPolicy(task, card, settings, fields, chosen)
+    return replace(policy, card=make_card(task, "planner", options_to_json(settings), 0, metrics, run.spec))
 
 
 def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy:

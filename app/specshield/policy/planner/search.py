@@ -151,6 +151,7 @@ def _expand(world: World, way: Way, nodes: Nodes, d: int, n: int, used: int) -> 
         if f < 0 or holds(world, k, way.rho):
             continue
         ahead = to_go_at(world.body, world.fields, f, way.poses[n, 0], way.poses[n, 1], way.poses[n, 2])
+        ahead = 0.0 if ahead == math.inf and world.barred.shape[0] > 0 else ahead  # the way out may be barred
         if not ahead - world.band < min(steps - n, by - s):
             continue
         if dwelling >= 0:

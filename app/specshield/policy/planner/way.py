@@ -12,6 +12,7 @@ from specshield.compiled import leaf
 from specshield.policy.planner.due_dates import Bounds, note, read_pose
 from specshield.policy.planner.fields import Fields
 from specshield.policy.planner.literals import PREDICATE, SIDE, PackedLiterals
+from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import Body, step
 
 # What is needed of a literal, the columns of `need`: the step by which it has to hold once; from which step
@@ -25,7 +26,8 @@ class World(NamedTuple):
 
     field [L, 2]: the field that leads to each literal freely, and the one that keeps to what has to hold for
     a while; -1 for none. band: how far the fields may err [steps]. pad: the motion that stays, or comes
-    nearest to it; stands: whether it stays. cost: of one evaluation of the formula [about us].
+    nearest to it; stands: whether it stays. cost: of one evaluation of the formula [about us]. barred [n, 6]:
+    motions that are taken to lead nowhere (robot/barred.py).
     """
 
     body: Body
@@ -36,6 +38,7 @@ class World(NamedTuple):
     pad: int
     stands: bool
     cost: float
+    barred: Floats
 
 
 class Way(NamedTuple):
@@ -95,10 +98,18 @@ def note_at(world: World, way: Way, n: int) -> None:
 
 
 @leaf
+def lead(world: World, x: float, y: float, theta: float, motion: int) -> tuple[float, float, float]:
+    """Where a motion leads from a pose."""
+    if is_barred(world.barred, x, y, theta, motion):
+        return x, y, theta
+    return step(world.body, x, y, theta, motion)
+
+
+@leaf
 def move(world: World, way: Way, n: int, motion: int) -> None:
     """Makes `motion` the nth. way.rho has to hold the predicates at poses[n]; then it has those after it."""
     poses = way.poses
-    x, y, theta = step(world.body, poses[n, 0], poses[n, 1], poses[n, 2], motion)
+    x, y, theta = lead(world, poses[n, 0], poses[n, 1], poses[n, 2], motion)
     way.motions[n] = motion
     poses[n + 1, 0], poses[n + 1, 1], poses[n + 1, 2] = x, y, theta
     if x != poses[n, 0] or y != poses[n, 1] or theta != poses[n, 2]:

@@ -134,8 +134,6 @@ class ReachabilityPolicy(Carded):
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
         """A continuation after each first motion."""
-        if len(history) > self.task.horizon:  # no step is left
-            return Proposal(np.empty((1, 0), np.int64), 0)
         return self._proposal(history, signals, margin, FIRST if len(history) == 1 else ON)
 
     def _proposal(
