@@ -59,6 +59,7 @@ USUAL_HORIZON = 150  # [steps] up to which a plan may cost no more than the effo
 BAND = 6.0  # [steps] by which the fields may err; chosen by hand, nothing measured
 # Poses of a search for a way that the fields miss, at a session's first step and later on; chosen by hand.
 FIRST, ON = 300_000, 20_000
+GUESSED = 0.25  # of the effort of a plan, where one decision makes several of them; chosen by hand
 STARTS = 50  # poses that a new policy is tried from
 FIELDS_SHARE = 0.3  # of the time that making a policy takes, about
 
@@ -69,13 +70,14 @@ class PlannerPolicy(Carded):
 
     chosen [L, 2]: of each literal of the formula, which field leads to it freely, and which keeps to what has
     to hold for a while; -1 for none. foreseen [S]: what the signals hold from x_{t+1} on; None: their last
-    values.
+    values. share: of the effort that the settings allow.
     """
 
     settings: Settings
     fields: Fields
     chosen: Int32s
     foreseen: Floats | None = None
+    share: float = 1.0
 
     @cached_property
     def _world(self) -> World:
@@ -83,7 +85,7 @@ class PlannerPolicy(Carded):
 
     def on_body(self, body: Body, guess: bool = False) -> PlannerPolicy:
         """The policy on another map: its fields lead as they did, its ways are those that there are."""
-        return self._in(self._world._replace(body=body))
+        return replace(self, share=GUESSED if guess else 1.0)._in(self._world._replace(body=body))
 
     def avoiding(self, barred: Floats) -> PlannerPolicy:
         """The policy for a robot that some motions led nowhere (robot/barred.py)."""
@@ -111,11 +113,14 @@ class PlannerPolicy(Carded):
         return World(self._body, self.fields, packed, columns, band, pad, stands, cost, NOTHING_BARRED)
 
     def propose(self, history: Floats, signals: Mapping[str, Floats], margin: float) -> Proposal:
-        """A plan from x_t, and one after each other first motion; those that are barred are tried last."""
-        ways, _ = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
-        if len(self._world.barred) == 0:
+        """A plan from x_t, and one after each other first motion. Where there is none without barred motions,
+        it looks for one with them, unless the decision has other maps to try.
+        """
+        ways, found = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
+        if found or len(self._world.barred) == 0 or self.share < 1.0:
             return ways
-        return joined(ways, self.avoiding(NOTHING_BARRED).propose(history, signals, margin))
+        quick = replace(self, share=GUESSED)._in(self._world._replace(barred=NOTHING_BARRED))
+        return joined(ways, quick.propose(history, signals, margin))
 
     def _plan(
         self, history: Floats, signals: Mapping[str, Floats], margin: float, most: int
@@ -125,9 +130,8 @@ class PlannerPolicy(Carded):
         most: poses of a search for a way that the fields miss.
         """
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
-        _, high = look(
-            self._world.literals.formula, history, rows, np.empty(self._world.literals.formula.tree.size)
-        )
+        formula = self._world.literals.formula
+        _, high = look(formula, history, rows, np.empty(formula.tree.size))
         parts: Iterable[Formula] = (self.task.formula,)
         if high <= SATISFIED_ABOVE:
             left = residuals(self.task.formula, self.task.samples(history, signals), t)
@@ -158,10 +162,11 @@ class PlannerPolicy(Carded):
         known = np.empty(literals.formula.tree.size)
         look(literals.formula, history, rows, known)
         motions = np.empty((len(self.task.robot.motions), self.task.horizon - t), np.int64)
-        effort = self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
+        effort = self.share * self.settings.effort * max(1.0, self.task.horizon / USUAL_HORIZON) ** 2
         world = world._replace(literals=literals, barred=self._world.barred)
         held = rows[-1] if self.foreseen is None else self.foreseen
-        first, found = plan_all(world, t, history[-1], held, known, effort, most, motions)
+        allowed = effort, int(self.share * most)
+        first, found = plan_all(world, t, history[-1], held, known, *allowed, motions)
         return Proposal(motions, int(first)), bool(found)
 
     def feasible_start(
@@ -232,11 +237,8 @@ def synthesise(task: Task, settings: Settings | None = None, run: Run | None = N
         at_worst = {} if worst is None else dict(zip(task.signals, worst.T, strict=True))
         share = policy.feasible_start(lattice, at_worst) if at_worst else 0.0
         metrics["feasible_start_any_signal"] = round(share, 4)
-    metrics |= {
-        "fields": len(codes),
-        "size_bytes": int(code.nbytes + cell.nbytes),
-        "wall_time_s": round(time.perf_counter() - began, 3),
-    }
+    size, took = int(code.nbytes + cell.nbytes), round(time.perf_counter() - began, 3)
+    metrics |= {"fields": len(codes), "size_bytes": size, "wall_time_s": took}
     return replace(policy, card=make_card(task, "planner", options_to_json(settings), 0, metrics, run.spec))
 
 
