@@ -6,16 +6,12 @@ import subprocess
 import sys
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 
 from specshield.errors import PolicyError
 from specshield.policy.dqn.method import Settings
-from specshield.policy.methods import METHODS, Run, available, missing
+from specshield.policy.methods import METHODS, available, missing
 from specshield.policy.options import option, options_schema, options_to_json, read_options
-from specshield.robot import robot_from_json
-from specshield.task import make_task
-from specshield.world.occupancy import OccupancyGrid
 
 
 @dataclass(frozen=True)
@@ -24,16 +20,6 @@ class Some:
     beam: int = option(12, "Poses kept.", low=1, high=256)
     reward: str = option("progress", "Which one.", choices=("progress", "paper"))
     exploration: tuple[float, float] = option((0.5, 0.01), "Chances.", high=1.0)
-
-
-@pytest.mark.parametrize("method", ["reachability", "planner"])
-def test_after_the_last_step_nothing_is_proposed(method):
-    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": [{"name": "go", "translate": 0.2}]})
-    task = make_task(OccupancyGrid(np.zeros((8, 8), bool), 0.2), robot, "G[0,1] x > 0.3", {})
-    policy = METHODS.get(method).make(task, METHODS.get(method).options(), Run())
-    for states in (2, 3):
-        proposed = policy.propose(np.full((states, 3), 0.5), {}, 0.0)
-        assert (proposed.motions.shape, proposed.preferred) == ((1, 0), 0)
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from tests.serving import serving, wait_for
 def held(tmp_path, monkeypatch):
     """A folder of kernels with none in it, and the lock that a server needs to compile them.
 
-    They are for a processor of which the package holds none, whatever was started from it before.
+    They are for a processor that nobody has started a server for before.
     """
     kernels = tmp_path / "kernels"
     monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
@@ -94,7 +94,8 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
             assert told["type"] == "starting"
         for path in ("/livez", "/metrics", "/docs", "/openapi.json"):
             assert httpx.get(f"{server.url}{path}", timeout=None).status_code == 200, path
-        assert told["kernels"]["compiled"] < 10 < told["kernels"]["expected"]
+        # Those of a server that was once started without NUMBA_CACHE_DIR are copied, and they count.
+        assert told["kernels"]["compiled"] < told["kernels"]["expected"]
         assert told["parts"] == {"reachability": "compiling", "shield and dqn": "compiling"}
         wait_for(lambda: starting(server.url))
         fcntl.flock(lock, fcntl.LOCK_UN)
