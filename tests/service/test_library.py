@@ -1,5 +1,6 @@
 """Maps and policies: whose they are, what an id promises, how they go, and what they may take of the disk."""
 
+import asyncio
 import io
 import json
 import threading
@@ -197,7 +198,7 @@ def test_nobody_begins_to_use_what_is_being_deleted(claims, monkeypatch):
     with claims.adding("policies", id, key, 10):
         pass
     assert claims.mark("policies", id, "marks", "one") is None
-    assert not claims.settled("policies", id, "marks")
+    assert not asyncio.run(claims.settled("policies", id, "marks"))
     with pytest.raises(Exception, match="being deleted"), claims.adding("policies", id, Key("other", ""), 10):
         pass
     with pytest.raises(Exception, match="being deleted"):

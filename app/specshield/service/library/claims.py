@@ -1,4 +1,4 @@
-"""Whose the maps and policies are, and what they take of the disk. Blocking, like the files they are about.
+"""Whose the maps and policies are, and what they take of the disk. All but `Claims.settled` is blocking.
 
 Content is kept once, under its hash; each owner that sent or asked for it has a claim on it, and it goes with
 the last one. One script decides every change (claims.lua), so that of a deletion and of a creation that needs
@@ -8,6 +8,7 @@ then takes the claim; whoever uses a policy looks at the mark after its use can 
 
 from __future__ import annotations
 
+import asyncio
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -46,14 +47,16 @@ class Claims:
     def holds(self, kind: str, id: str, owner: str) -> bool:
         return bool(reached(lambda: self._store().hexists(_key(kind, owner), id)))
 
-    def settled(self, kind: str, id: str, owner: str) -> bool:
-        """Whether the owner holds it, once no deletion of it is under way."""
-        deadline = time.monotonic() + PATIENCE
-        while reached(lambda: self._store().exists(_key("mark", kind, id))):
+    async def settled(self, kind: str, id: str, owner: str) -> bool:
+        """Whether the owner holds it, once no deletion of it is under way. No thread waits: many callers
+        would hold those that the deletion needs.
+        """
+        deadline, key = time.monotonic() + PATIENCE, _key("mark", kind, id)
+        while await asyncio.to_thread(reached, lambda: self._store().exists(key)):
             if time.monotonic() > deadline:
                 return False
-            time.sleep(WAIT)
-        return self.holds(kind, id, owner)
+            await asyncio.sleep(WAIT)
+        return await asyncio.to_thread(self.holds, kind, id, owner)
 
     def named(self, kind: str, name: str, owner: str) -> str | None:
         """The id of what this owner calls by that name."""
@@ -154,9 +157,8 @@ class Claims:
         deadline = time.monotonic() + PATIENCE
         while (said := self._run(what, *args)) == "busy":
             if time.monotonic() > deadline:
-                raise Conflict(
-                    "it is being deleted", path="id", got=args[1], expected="to be asked for again"
-                )
+                expected = "to be asked for again"
+                raise Conflict("it is being deleted", path="id", got=args[1], expected=expected)
             time.sleep(WAIT)
         return said
 
@@ -227,9 +229,8 @@ def missing(kind: str, key: str, asked: str = "an id or name") -> NotFound:
 
 
 def taken(name: str, id: str) -> NameTaken:
-    return NameTaken(
-        f"the name {name!r} is taken", path="name", got=name, expected="a name that nothing else has", id=id
-    )
+    expected = "a name that nothing else has"
+    return NameTaken(f"the name {name!r} is taken", path="name", got=name, expected=expected, id=id)
 
 
 def reached(action: Callable[[], Any]) -> Any:

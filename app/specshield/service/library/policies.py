@@ -88,11 +88,11 @@ class Policies(Claimed):
             raise missing("policies", key)
         return found
 
-    def still_there(self, ids: Sequence[str], owner: str) -> None:
+    async def still_there(self, ids: Sequence[str], owner: str) -> None:
         """Raises NotFound where a policy is gone: asked once whoever deletes it can see that it is used."""
         shipped = {record.id for record in self._named.values()}
         for id in ids:
-            if id not in shipped and not self.claims.settled("policies", id, owner):
+            if id not in shipped and not await self.claims.settled("policies", id, owner):
                 raise missing("policies", id)
 
     def task(self, about: Description) -> Task:

@@ -57,8 +57,8 @@ Begun = tuple[dict[str, Any], State, Floats]  # its config, its state without wh
 
 
 class Sessions:
-    """What takes longer than a moment runs in threads, and what waits for others in threads of its own; the
-    store is awaited. A session is known by its key, which says whose it is (access/owners.py).
+    """What takes longer than a moment runs in threads; the store, and a deletion that is under way, are
+    awaited. A session is known by its key, which says whose it is (access/owners.py).
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Sessions:
             else:
                 begun = await self._run(begin, self._shields, request, settings, preference, key.name)
         except Exception:  # whatever was wrong with a policy that has been deleted meanwhile, it is not there
-            await asyncio.to_thread(self._policies.still_there, ids, key.name)
+            await self._policies.still_there(ids, key.name)
             raise
         config, state, rows = begun
         state = msgspec.structs.replace(state, expires_at=time.time() + self._settings.session_ttl)
@@ -99,7 +99,7 @@ class Sessions:
         change = Change(state.packed(), pack(rows))
         await self._store.create(stored_as, files.to_json(config), change, *limits)
         try:  # whoever deletes a policy sees this session now, or has marked the policy before
-            await asyncio.to_thread(self._policies.still_there, config["policy_ids"], key.name)
+            await self._policies.still_there(config["policy_ids"], key.name)
         except SpecshieldError:
             await self._store.delete(stored_as)
             raise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -58,7 +57,7 @@ class Switches:
             if not isinstance(version, bytes):
                 continue
             try:  # whoever deletes a policy sees this session now, or has marked the policy before
-                await asyncio.to_thread(self._policies.still_there, ids, owner)
+                await self._policies.still_there(ids, owner)
             except SpecshieldError:
                 await self._store.append(id, version, Change(found.state, found.rows, config=found.config))
                 raise
