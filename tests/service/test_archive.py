@@ -249,11 +249,15 @@ def test_a_listing_holds_store_and_archive_in_order_and_each_session_once(url, a
     run(url, archive, story)
 
 
-def test_a_session_that_moves_while_they_are_listed_is_listed(url, archive):
-    """Or a policy could be deleted that it uses."""
+@pytest.mark.parametrize("before", [False, True])
+def test_a_session_that_moves_while_they_are_listed_is_listed(url, archive, before):
+    """Or a policy could be deleted that it uses. before: whether an older state of it lies in the archive."""
 
     async def story(store):
-        await begin(store, "ann@robot", 1)
+        version = await begin(store, "ann@robot", 1)
+        if before:
+            await move(store, "ann@robot")
+            assert isinstance(await store.append("ann@robot", version, change(1)), bytes)
         slow = ArchivingStore(url, 10.0, TTL, Held(archive))
         listing = asyncio.create_task(slow.everything("ann@", None, 10))
         await asyncio.to_thread(slow.archive.reached.wait)

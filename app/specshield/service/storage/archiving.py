@@ -72,8 +72,7 @@ class ArchivingStore(Store):
 
     async def load(self, id: str, t: int | None = None) -> Record | None:
         """Two round trips and a file where the session is not in the store."""
-        found = await super().load(id, t)
-        if found is not None:
+        if (found := await super().load(id, t)) is not None:
             return found
         dump = await self.in_thread(self._archived, id)
         if dump is None:  # or it has just come back
@@ -109,10 +108,10 @@ class ArchivingStore(Store):
         async with self._reaching():
             low = f"({owner}{after or ''}" if owner or after else "-"
             high = f"({owner[:-1]}A" if owner else "+"  # A follows @
-            running = [id.decode() for id in await self.redis.zrangebylex(INDEX, low, high, 0, limit)]
+            running = {id.decode() for id in await self.redis.zrangebylex(INDEX, low, high, 0, limit)}
         entries = self.archive.after(owner, after)  # after the store: a session may leave it meanwhile
         archived = await self.in_thread(lambda: {each.key: each for each in islice(entries, limit)})
-        ids = sorted({*running, *archived})[:limit]
+        ids = sorted(running | archived.keys())[:limit]
         async with self._reaching():
             fit, room = await self._that_fit(ids, PAGE_BYTES)
             more, ids = len(ids) == limit or len(fit) < len(ids), fit
@@ -123,7 +122,8 @@ class ArchivingStore(Store):
             if config is not None:
                 found.append((config, state))
                 continue
-            entry = archived.get(id) or await self.in_thread(self.archive.find, id)  # it may just have left
+            kept = None if id in running else archived.get(id)  # what has just left has a newer file
+            entry = kept or await self.in_thread(self.archive.find, id)
             head = None if entry is None else await self.in_thread(self.archive.head, entry)
             if head is not None:
                 found.append(head)
