@@ -69,6 +69,13 @@ def test_the_share_of_feasible_starts_is_over_real_headings():
     assert 0.3 < share < 0.7
 
 
+def test_a_start_where_the_arithmetic_is_not_finite_is_no_feasible_one():
+    """And no reason to make no policy: half of all headings are fine."""
+    base = load_case("case1").task
+    policy = synthesise(make_task(base.grid, STRETCH, "F[0,5] 1 / (abs(theta) - theta) > 0"))
+    assert 0.2 < policy.card["metrics"]["feasible_start"] < 0.8
+
+
 def test_such_a_policy_comes_back_from_its_files():
     policy = synthesise(task_of(DOCK, 60))
     again = load_policy(policy.weights(), policy.card, policy.task)

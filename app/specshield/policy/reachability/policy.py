@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from specshield.arrays import Bools, Floats
-from specshield.errors import MapError, PolicyError
+from specshield.errors import MapError, PolicyError, SampleError
 from specshield.policy.card import Card, Carded, make_card
 from specshield.policy.dqn.environment import free_poses
 from specshield.policy.extent import COARSEST, fitting_pitch, places_that_matter
@@ -201,7 +201,10 @@ class ReachabilityPolicy(Carded):
     def _keeps(self, pose: Floats) -> bool:
         """Whether something that is proposed from a pose at the first step keeps the rule."""
         formula, history = self.task.formula, pose.reshape(1, 3)
-        prefix = prefix_of(self.task, formula, view_of(self.task, formula), history, {})
+        try:
+            prefix = prefix_of(self.task, formula, view_of(self.task, formula), history, {})
+        except SampleError:  # the rule's arithmetic is not finite there
+            return False
         if prefix.steps == 0:
             return prefix.low > SATISFIED_ABOVE
         motions = self._proposal(history, {}, 0.0, AFTER).motions
@@ -274,9 +277,5 @@ def _extent(task: Task, body: Body, rules: Rules, settings: Settings) -> tuple[f
         return pitch, places_that_matter(task, body, rules, pitch)
     least = math.ceil(100.0 * pitch / COARSEST) / 100.0
     would = f"options.pitch {least:.2f} or more" if least <= 1.0 else "fewer windows that overlap"
-    raise PolicyError(
-        "the tables are too large",
-        path="options.pitch",
-        got=f"{entries} entries for each pose at a pitch of {settings.pitch:g} m",
-        expected=would,
-    )
+    got = f"{entries} entries for each pose at a pitch of {settings.pitch:g} m"
+    raise PolicyError("the tables are too large", path="options.pitch", got=got, expected=would)
