@@ -264,6 +264,14 @@ def test_a_broken_g_is_enforced_again_from_the_next_step():
     assert trapped.j_values[WAIT] == 0.0
 
 
+def test_of_a_broken_g_over_an_f_the_visit_that_is_open_yet_is_kept():
+    """Due once in steps 0 to 2, 1 to 3 and 2 to 4: the last can be kept yet, though the G ends at step 2."""
+    cells = cells_of("G[0,2] F[0,2] A", lambda s: s["A"][..., 2:5].any(-1))
+    decision = decide(shield_of(cells), walk(cells, WAIT, WAIT, WAIT), EVEN)
+    assert (decision.mode, decision.reason) == ("violated", None)
+    assert decision.j_values == (1.0, 0.0, 0.0, 0.0, 1.0)
+
+
 def test_where_nothing_can_be_kept_the_policy_takes_over():
     cells = cells_of("F[0,1] A and F[0,3] x > 99", lambda s: np.zeros(s["A"].shape[:-1], bool))
     decision = decide(shield_of(cells, Scripted(cells, waits, LEFT)), walk(cells, WAIT, WAIT), EVEN)

@@ -9,21 +9,21 @@ from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts, rob
 
 
 def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[list[Formula], list[Always]]:
-    """The conjuncts that can still be kept, and the broken ones of the form G whose windows are not over."""
+    """The conjuncts that can still be kept, and the broken G of which some step is open yet."""
     kept: list[Formula] = []
     broken: list[Always] = []
     for conjunct in conjuncts(formula):
         _, high = robustness_bounds(conjunct, {name: prefix[name] for name in conjunct.names})
         if high > SATISFIED_ABOVE:
             kept.append(conjunct)
-        elif isinstance(conjunct, Always) and conjunct.b > t:
+        elif isinstance(conjunct, Always) and conjunct.horizon > t:
             broken.append(conjunct)
     return kept, broken
 
 
 def again(broken: Sequence[Always], t: int) -> list[Formula]:
-    """Those of the broken G whose windows reach step t, each enforced from step t on."""
-    return [Always(max(each.a, t), each.b, each.child) for each in broken if each.b >= t]
+    """The broken G that look as far as step t, each enforced from step t on, or at its last step at least."""
+    return [Always(min(max(each.a, t), each.b), each.b, each.child) for each in broken if each.horizon >= t]
 
 
 def joined(parts: Sequence[Formula]) -> Formula:
