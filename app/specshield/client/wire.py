@@ -171,7 +171,7 @@ def point_values(points: Points, where: str) -> list[list[float]]:
 def _finite(
     values: Any, error: type[InputError], where: str, told: str, count: int, most: float = FARTHEST
 ) -> list[float]:
-    expected = f"{count} number{'s' if count > 1 else ''} from {-most:g} to {most:g}"
+    expected = "a finite number" if count == 1 else f"{count} numbers from {-most:g} to {most:g}"
     found = _floats(values, error, where, expected)
     if len(found) != count or not all(abs(value) <= most for value in found):
         raise error(told, path=where, got=found, expected=expected)
