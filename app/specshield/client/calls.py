@@ -302,7 +302,7 @@ def policies_asked(policy_id: str | None, policy_ids: Sequence[str] | None) -> d
     """The member of a body that names the policies. InputError unless exactly one of the two is given."""
     if (policy_id is None) == (policy_ids is None):
         raise InputError("give policy_id or policy_ids", path="policy_id", expected="exactly one of the two")
-    if isinstance(policy_ids, str) or not isinstance(policy_ids, Iterable | None):  # a text is its letters
+    if isinstance(policy_ids, str) or not isinstance(policy_ids, Iterable | None):  # letters are no ids
         raise InputError("this is no list", path="policy_ids", got=policy_ids, expected="ids or names")
     return {"policy_id": policy_id} if policy_ids is None else {"policy_ids": list(policy_ids)}
 

@@ -108,6 +108,6 @@ def _check_type(path: str, declared: str) -> None:
     elif path.endswith("/steps"):
         taken.append("application/msgpack")
     if kind not in taken and not JSON.fullmatch(kind):
-        told, expected = "the body is not declared as a type that is taken here", " or ".join(taken)
-        expected = f"the header Content-Type: {expected}"
+        told = "the body is not declared as a type that is taken here"
+        expected = f"the header Content-Type: {' or '.join(taken)}"
         raise UnsupportedMediaType(told, path="Content-Type", got=declared, expected=expected)
