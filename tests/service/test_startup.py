@@ -95,7 +95,9 @@ def test_a_starting_server_says_how_far_it_is_and_leaves_nothing_running(tmp_pat
         for path in ("/livez", "/metrics", "/docs", "/openapi.json"):
             assert httpx.get(f"{server.url}{path}", timeout=None).status_code == 200, path
         # Those of a server that was once started without NUMBA_CACHE_DIR are copied, and they count.
-        assert told["kernels"]["compiled"] < told["kernels"]["expected"]
+        copied = sum(1 for _ in compiled.SHIPPED.rglob("*.nbi"))
+        assert told["kernels"]["compiled"] < copied + 10
+        assert told["kernels"]["expected"] > 10
         assert told["parts"] == {"reachability": "compiling", "shield and dqn": "compiling"}
         wait_for(lambda: starting(server.url))
         fcntl.flock(lock, fcntl.LOCK_UN)
