@@ -71,13 +71,14 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
         "demo": ["demo", "--out", str(tmp_path)],
         "evaluate": ["evaluate", "--case", "case1", "--methods", "ours", "--processes", "2"],
     }[command]
-    running = subprocess.Popen(
-        [*SPECSHIELD, *arguments, "--runs", "500"],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-        preexec_fn=listens_to_interrupts,
-    )
+    with open(tmp_path / "told", "w") as told:
+        running = subprocess.Popen(
+            [*SPECSHIELD, *arguments, "--runs", "500"],
+            stdout=subprocess.DEVNULL,
+            stderr=told,
+            start_new_session=True,
+            preexec_fn=listens_to_interrupts,
+        )
     try:
         if command == "demo":
             wait_for(lambda: len(children(running.pid)) >= 3)  # the server, a robot, and the tracker as below
@@ -86,9 +87,14 @@ def test_a_command_that_is_stopped_leaves_nothing_running(command, how, tmp_path
         else:
             wait_for(lambda: len(children(running.pid)) >= 3)  # two workers and what tracks their semaphores
             started = children(running.pid)
-        os.kill(running.pid, how)
+        if how == signal.SIGINT:  # a terminal sends it to all
+            os.killpg(running.pid, how)
+        else:
+            running.send_signal(how)
         assert running.wait(HUNG) != 0
         wait_for(lambda: not any(map(runs, started)))
+        # A process that is just starting when its parent is killed cannot but say so.
+        assert how == signal.SIGKILL or "Traceback" not in (tmp_path / "told").read_text()
     finally:
         running.kill()
 

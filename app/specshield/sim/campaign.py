@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from multiprocessing import active_children, get_context, parent_process
+from multiprocessing import get_context, parent_process
 from queue import SimpleQueue
 from typing import Any, NamedTuple, TypeVar
 
@@ -53,15 +53,11 @@ def robots(url: str) -> Iterator[Executor]:
     """A process for each core that drives robots, through clients of the service at `url`: the models of
     several robots would wait for each other in one. What has not begun by the end of the block is called off.
     """
-    others = active_children()
     pool = ProcessPoolExecutor(min(cores(), MOST_ROBOTS), get_context("spawn"), _begin_process, (url,))
     try:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)  # those that drive come to their end
-        # An interrupt that comes while a process is started leaves one of which the pool does not know.
-        for left in {*active_children()}.difference(others):
-            left.terminate()
 
 
 def run(
@@ -89,16 +85,20 @@ def run(
 def each_done(futures: Iterable[Future[T]]) -> Iterator[tuple[int, T]]:
     """The number of each future and its result, as they come.
 
-    An interrupt that comes while the futures are made or waited for is raised afterwards. Python would raise
-    it at once. If one of the pool's locks is just being taken then, the lock stays held, and at its end the
-    program waits for that lock for ever.
+    An interrupt that comes while the futures are made or waited for is raised afterwards. Raised at once, it
+    could leave one of the pool's locks held, and the program would wait for that for ever at its end. The
+    processes that the pool starts meanwhile never see an interrupt: the parent ends them.
     """
     done: SimpleQueue[Future[T] | None] = SimpleQueue()  # None: an interrupt came
     number = dict[Future[T], int]()
     with _interrupts_into(done):
-        for future in futures:
-            number[future] = len(number)
-            future.add_done_callback(done.put)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            for future in futures:
+                number[future] = len(number)
+                future.add_done_callback(done.put)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
     while number or not done.empty():
         with _interrupts_into(done):
             found = done.get()
@@ -126,14 +126,12 @@ _case = cache(load_case)
 
 def _begin_process(url: str) -> None:
     global _client
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends it
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _client = ShieldClient(url, timeout=PATIENCE)
 
 
 def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
+    if (parent := parent_process()) is not None:
         parent.join()
         os._exit(1)
 
