@@ -202,6 +202,7 @@ def test_where_slack_is_lacking_the_conjunct_is_named_that_lacks_it_however_deep
         ("F[4,4] A", (2, 0), []),
         ("F[4,5] A", (2, 0), []),
         ("F[0,1] (A and F[1,7] A)", (0, 0), [FORWARD, WAIT]),
+        ("G[5,5] (x > 0 -> G[0,1] A)", (2, 0), []),
     ],
 )
 def test_a_slack_that_is_longer_than_the_window_is_explained_all_the_same(rule, place, motions):

@@ -65,7 +65,7 @@ def later(part: Formula, late: int) -> Formula | None:
         case Eventually(a, b) | Until(a, b):
             return replace(part, b=b + late) if -late <= (b - a) // 2 else None
         case Always(a, b, child) if is_predicate(child):
-            return replace(part, a=min(a + late, b)) if a < b else None
+            return replace(part, a=min(a + late, b)) if a < b and -late <= a // 2 else None
         case Always(child=child) if inner := later(child, late):
             return replace(part, child=inner)
         case Implies(right=right) if inner := later(right, late):
