@@ -405,6 +405,29 @@ def test_the_tail_of_the_witness_certifies_where_the_policy_does_not():
     assert kept.residual == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("alone", [1, 2])
+def test_the_witness_certifies_also_after_steps_in_which_it_was_followed_without_a_decision(alone):
+    """As a robot does that has lost the service for a while. No policy finds a way for it afterwards."""
+    cells, way = cells_of("F[0,6] B", lambda s: s["B"].any(-1)), [LEFT, RIGHT, FORWARD, FORWARD]
+    first = decide(shield_of(cells, Scripted(cells, lambda t, m: way)), [START], EVEN)
+    lost = shield_of(cells, Scripted(cells, waits))
+    decision = decide(lost, walk(cells, WAIT, *way[:alone]), None, True, carry=first.carry)
+    assert (decision.mode, decision.action, decision.residual) == ("completion", way[alone], None)
+    assert decide(lost, walk(cells, WAIT, *way[:alone]), None, True).mode == "fallback"
+
+
+def test_of_two_witnesses_from_one_pose_the_one_counts_that_was_followed_without_a_decision():
+    """In front of a wall `forward` leads where `wait` does; each goes on by a way of its own."""
+    cells, south = cells_of("F[0,7] B", lambda s: s["B"].any(-1)), REACH.pose(0, 0, 3)
+    ways = {FORWARD: [LEFT, FORWARD, FORWARD], WAIT: [RIGHT, RIGHT, RIGHT, FORWARD, FORWARD]}
+    first = decide(shield_of(cells, Scripted(cells, lambda t, m: ways.get(m, []))), [south], EVEN)
+    assert first.j_values[:4] == (1.0, 0.0, 0.0, 1.0)
+    for motion, way in ways.items():
+        history = walk(cells, motion, way[0], start=south)
+        decision = decide(shield_of(cells, Scripted(cells, waits)), history, None, True, carry=first.carry)
+        assert (decision.mode, decision.action) == ("completion", way[1])
+
+
 def test_the_witness_is_used_before_anything_better():
     """In completion the robot goes on as certified, though the policy now prefers something else."""
     first = decide(

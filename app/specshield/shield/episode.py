@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from specshield.arrays import Bools, Floats
 from specshield.compiled import leaf
 from specshield.errors import InfeasibleStart, PoseError
-from specshield.robot.dynamics import Body, in_collision, successors, wrap
+from specshield.robot.dynamics import Body, in_collision, simulate, successors, wrap
 from specshield.robot.oddity import oddities
 from specshield.shield import shaping
 from specshield.shield.answer import answer_of, unmodified
@@ -128,7 +128,7 @@ def decide(
     places = np.empty((len(robot.motions) + 1, 3))  # where each motion leads, and x_t, where what ends does
     nexts, places[-1] = places[:-1], poses[-1]
     touches = _look_around(shield.body, poses[-1], nexts)
-    tail, residual = _follow(carry, poses, task.horizon - t, len(robot.motions))
+    tail, residual = _follow(carry, poses, task.horizon - t, shield.body)
     before, shield = shield, with_begun(shield, carry, poses)
     memory, weights = None if carry is None else carry.memory, None
     chance, left = None, shield.config.threshold
@@ -182,10 +182,7 @@ def decide(
     remembered = None
     if seen is not None:
         follows = shield.config.learn_map and taught.followed.surely
-        done = answer.distribution
-        if follows:
-            done = np.zeros(len(robot.actions))
-            done[action] = 1.0
+        done = np.eye(len(robot.actions))[action] if follows else answer.distribution
         remembered = remember(shield, seen, done, moved, nexts, poses[-1])
     return Decision(
         t=t,
@@ -259,21 +256,24 @@ def _wrapped(poses: Floats) -> bool:
 
 
 def _follow(
-    carry: Carry | None, poses: Floats, steps: int, motions: int
+    carry: Carry | None, poses: Floats, steps: int, body: Body
 ) -> tuple[bytes | None, tuple[float, float] | None]:
     """The tail of the witness followed to x_t, or a new rule's way; how far x_t is from where f leads."""
     way = None if carry is None else carry.way
-    if way is not None and (len(way) != steps or max(way, default=0) >= motions):
+    if way is not None and (len(way) != steps or max(way, default=0) >= len(body.translate)):
         way = None
-    if carry is None or carry.t != len(poses) - 2:
+    if carry is None or not 0 <= carry.t <= len(poses) - 2:
         return way, None
-    gap = np.empty(len(carry.next_poses))
-    off = _gaps(carry.next_poses, poses[-1], gap)
-    near = off[0] + off[1] + SAME_POSE  # a blocked move leads where waiting does
-    for witness, far in zip(carry.witnesses, gap.tolist(), strict=True):
-        if far <= near and witness:
-            return way or witness, off
-    return way or None, off
+    alone, gap = len(poses) - 2 - carry.t, np.empty(len(carry.next_poses))  # alone: steps without a decision
+    off = _gaps(carry.next_poses, poses[carry.t + 1], gap)
+    ways = [w for w, far in zip(carry.witnesses, gap, strict=True) if w and far <= sum(off) + SAME_POSE]
+    if alone > 0 and len(ways) > 1:  # a blocked move leads where waiting does
+        ends = np.empty((len(ways), alone, 3))
+        for w, end in zip(ways, ends, strict=True):
+            simulate(body, poses[carry.t + 1], np.frombuffer(w[:alone], np.uint8).astype(np.int64), end)
+        _gaps(np.ascontiguousarray(ends[:, -1]), poses[-1], gap)
+        ways = [ways[int(np.argmin(gap[: len(ways)]))]]
+    return way or (ways[0][alone:] if ways else None), None if alone > 0 else off
 
 
 @leaf
