@@ -94,6 +94,28 @@ def test_bytes_left_out_doubled_or_added_are_found(case1, data):
             chain.read(changed)
 
 
+def test_what_no_hash_covers_is_as_a_server_writes_it(case1):
+    """An empty step at the end; and the values of a signal from before the switch that brought it."""
+    file = msgspec.msgpack.decode(case1[0])
+    assert len(file["rows"]) > 24 * len(file["steps"])
+    with pytest.raises(InputError, match="the last not empty"):
+        chain.read(msgspec.msgpack.encode({**file, "steps": [*file["steps"], b""]}))
+
+    rows, steps = np.frombuffer(file["rows"], "<f8").reshape(-1, 3)[:8], file["steps"][:4]
+    config = json.loads(file["config"])
+    config["spec"]["signals"] = {"alarm": 0.0}
+    config |= {"from": 4, "origin": 4, "before": record.link(record.digest(steps[3]), rows[:0]).hex()}
+    lines = file["config"] + b"\n" + json.dumps(config).encode()
+    wide = np.hstack([rows, np.zeros((8, 1))])
+    content, seal = chain.pack(lines, wide.tobytes(), steps)
+    assert chain.read(content).seal == seal
+    for t in range(8):
+        changed = wide.copy()
+        changed[t, 3] = -0.0  # one bit
+        with pytest.raises(InputError, match="a signal has values" if t < 4 else "the seal"):
+            chain.read(content.replace(wide.tobytes(), changed.tobytes()))
+
+
 @given(st.binary(max_size=300))
 def test_what_is_no_record_is_refused(content):
     with pytest.raises(

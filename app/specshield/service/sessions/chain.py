@@ -17,7 +17,7 @@ from specshield.arrays import Floats
 from specshield.errors import InputError
 from specshield.service.sessions import record
 from specshield.service.sessions.record import StepRecord
-from specshield.service.sessions.rules import added
+from specshield.service.sessions.rules import added, widened
 
 FORMAT: Literal["specshield-record-1"] = "specshield-record-1"
 WHERE = "what GET /v1/sessions/{id}/record answers, or `save_record` of the SDK writes"
@@ -122,8 +122,8 @@ def read(content: bytes) -> Chain:
         raise _broken(None, "the file is not written as a server writes it", "every byte as it was")
     names = _names(configs)
     rows = _rows(file.rows, 3 + len(names[-1]))
-    if len(file.steps) > len(rows):
-        raise _broken(None, f"{len(file.steps)} steps and {len(rows)} poses", "a pose for each step")
+    if len(file.steps) > len(rows) or not all(file.steps[-1:]):  # no hash covers an empty one at the end
+        raise _broken(None, f"{len(file.steps)} steps and {len(rows)} poses", "as many, the last not empty")
     _check_switches(configs, names, rows)
     last, begin, rule = record.digest(lines[0]), 0, 0
     for t in range(len(rows) + 1):
@@ -164,9 +164,9 @@ def _check_switches(configs: Sequence[Config], names: Sequence[list[str]], rows:
             raise _broken(config.begins, "a rule begins out of its turn", None)
         if config.origin != (config.begins if config.clock == "restart" else old.origin):
             raise _broken(config.begins, f"the origin of a rule is not what `{config.clock}` means", None)
-        for column in range(len(names[i - 1]), len(names[i])):
-            if (rows[: config.begins, 3 + column] != config.spec.signals[names[i][column]]).any():
-                raise _broken(config.begins, "a signal has values before its rule began", None)
+        first, known = rows[: config.begins, : 3 + len(names[i])], names[i - 1]
+        if widened(first[:, : 3 + len(known)], known, config.spec.signals).tobytes() != first.tobytes():
+            raise _broken(config.begins, "a signal has values before its rule began", None)
 
 
 def _rows(content: bytes, width: int) -> Floats:
