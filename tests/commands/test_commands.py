@@ -209,8 +209,12 @@ def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
     assert re.search(r"^wrong +what answers at \S+ is no specshield server", lost.stdout, re.M), lost.stderr
     assert ill.returncode == 1
     assert f"port {port} cannot be served on: Address already in use\n" in ill.stdout
-    assert re.search(r"^wrong +the store at REDIS_URL does not answer", ill.stdout, re.M)
-    assert "Traceback" not in ill.stderr
+    parted = run_specshield(
+        "doctor", REDIS_URL="redis+cluster://127.0.0.1:1", SPECSHIELD_DATA_DIR=str(tmp_path)
+    )
+    for told in (ill, parted):
+        assert re.search(r"^wrong +the store at REDIS_URL does not answer", told.stdout, re.M)
+        assert "Traceback" not in told.stderr
 
 
 def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):

@@ -74,6 +74,12 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
         ("worker", {"REDIS_URL": "foo"}, "REDIS_URL is not valid", "redis://127.0.0.1:6379/0"),
         (
             "serve",
+            {"REDIS_URL": "redis://h/0?ssl_cacerts=/etc/ca.pem"},
+            "REDIS_URL is not valid",
+            "redis://127.0.0.1:6379/0",
+        ),
+        (
+            "serve",
             {"SPECSHIELD_API_KEYS": "secret"},
             "SPECSHIELD_API_KEYS is not a setting",
             "SPECSHIELD_API_KEY,",

@@ -36,6 +36,15 @@ FIRST = 16384 // 3  # slots of the cluster's first master, whose replica takes o
 STEPS = 12
 
 
+@pytest.mark.parametrize("url", ["rediss+cluster://h1,h2", "rediss+sentinel://h1/service", "rediss://h1"])
+def test_options_are_numbers_and_booleans_where_redis_py_wants_them(url):
+    told = f"{url}?ssl_check_hostname=false&health_check_interval=10&ssl_ca_certs=/a%20b"
+    made = connect(told.replace("//", "//user:p%40ss@"))
+    options = made.connection_kwargs if "cluster" in url else made.connection_pool.connection_kwargs
+    assert (options["username"], options["password"], options["ssl_ca_certs"]) == ("user", "p@ss", "/a b")
+    assert (options["ssl_check_hostname"], options["health_check_interval"]) == (False, 10)
+
+
 @contextmanager
 def on_store(folder: Any, url: str, **settings: str) -> Iterator[RunningServer]:
     """A server with a worker. What ends moves to the archive a second later."""

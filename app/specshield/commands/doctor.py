@@ -145,7 +145,7 @@ def _disk(settings: Settings) -> Iterator[Finding]:
 
 
 def _store(settings: Settings) -> Iterator[Finding]:
-    from specshield.service.storage.connect import connect
+    from specshield.service.storage.connect import FAILURES, connect
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_first
     from specshield.service.storage.objects import open_objects
@@ -155,7 +155,6 @@ def _store(settings: Settings) -> Iterator[Finding]:
         yield Finding("ok", "the store is the server's own, in the data folder")
         open_objects(settings.files_at)
         return
-    import redis
 
     began = time.perf_counter()
     try:
@@ -166,9 +165,9 @@ def _store(settings: Settings) -> Iterator[Finding]:
             took = 1000 * (time.perf_counter() - began)
             yield Finding("ok", f"the store at REDIS_URL answers in {took:.1f} ms")
             check_first(store, settings.files_at)
-    except redis.RedisError as error:
+    except FAILURES as error:
         yield Finding(
-            "wrong", f"the store at REDIS_URL does not answer: {error}", "start it, or mend REDIS_URL"
+            "wrong", f"the store at REDIS_URL does not answer: {error!s:.200}", "start it, or mend REDIS_URL"
         )
 
 

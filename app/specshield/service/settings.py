@@ -14,7 +14,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from specshield import shipped
 from specshield.errors import InputError
 from specshield.service.access.site import AUTHORITY
-from specshield.service.storage.connect import FORMS, connect
+from specshield.service.storage.connect import FORMS, connect, is_cluster
 
 LONGEST = 24 * 3600  # [s] that a wait may be set to: timers do not take every number
 ALIKE = 0.9  # of a name's letters, by difflib: Kubernetes sets SPECSHIELD_PORT, SPECSHIELD_SERVICE_HOST...
@@ -160,8 +160,10 @@ class Settings(BaseSettings):
     @classmethod
     def _is_a_store(cls, url: str | None) -> str | None:
         try:
-            if url is not None:
-                connect(url)  # opens nothing yet
+            if url is not None and not is_cluster(url):
+                connect(url).connection_pool.make_connection()  # looks at all options, and opens nothing yet
+            elif url is not None:
+                connect(url)  # does so too
         except (ValueError, TypeError):
             raise ValueError(f"a URL as {FORMS}") from None
         return url

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
-from urllib.parse import parse_qsl, unquote, urlsplit
+from urllib.parse import unquote, urlsplit
 
 import redis
 import redis.asyncio
@@ -21,6 +21,7 @@ import redis.asyncio.cluster
 import redis.asyncio.retry
 import redis.asyncio.sentinel
 import redis.cluster
+import redis.connection
 import redis.exceptions
 import redis.retry
 import redis.sentinel
@@ -124,9 +125,7 @@ def _parse(url: str) -> tuple[list[tuple[str, int]], list[str], Mapping[str, Any
         if not one.hostname:
             raise ValueError("a host without a name")
         hosts.append((one.hostname, one.port or PORTS[kind]))
-    found: dict[str, Any] = dict(parse_qsl(parts.query))
-    name, _, password = user.partition(":")
-    found |= {"username": unquote(name)} if name else {}
-    found |= {"password": unquote(password)} if password else {}
+    parse: Any = redis.connection.parse_url  # gives numbers and booleans where redis-py takes no text
+    found: dict[str, Any] = parse(f"redis://{user}@?{parts.query}")
     found |= {"ssl": True} if scheme == "rediss" else {}
     return hosts, [unquote(name) for name in parts.path.split("/") if name], found
