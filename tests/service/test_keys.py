@@ -239,6 +239,30 @@ def test_a_rate_counts_what_was_asked_and_fills_up_again():
         rates.take(key, True)
 
 
+def test_a_key_that_was_lost_with_all_of_the_store_is_refused_and_one_made_since_is_known(keyed):
+    async def act(keys):
+        server, lost = Keys(keys._store), await keys.create("lost")
+        try:
+            await server.refresh()
+            assert (await server.check(f"Bearer {lost}".encode())).name == "lost"
+            await keys._store.delete("specshield:keys")  # as FLUSHALL does
+            for shown in (f"Bearer {lost}".encode(), b""):
+                await server.refresh()
+                with pytest.raises(Unauthorized):
+                    await server.check(shown)
+            made = await keys.create("made")
+            assert (await server.check(f"Bearer {made}".encode())).name == "made"
+            await keys._store.delete("specshield:keys")
+            again = await keys.create("again")  # before the server has looked
+            assert (await server.check(f"Bearer {again}".encode())).name == "again"
+            with pytest.raises(Unauthorized):
+                await server.check(f"Bearer {made}".encode())
+        finally:
+            await keys._store.delete("specshield:keys")
+
+    on_keys(keyed, act)
+
+
 def test_unknown_keys_do_not_ask_the_store_each():
     asked = 0
 

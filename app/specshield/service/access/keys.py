@@ -1,8 +1,8 @@
 """API keys with names. The store holds a hash of each, and what it may use; a key itself is shown once.
 
-They are in one hash of the store, `specshield:keys`, by name; the field "" counts the changes. A server keeps
-all of them in memory and asks every REFRESH seconds whether they have changed: so a request costs no trip to
-the store, whatever key it shows, and a revoked key is refused that long after at the latest.
+They are in one hash of the store, `specshield:keys`, by name; the field "" has another token after each
+change. A server keeps all of them in memory and asks every REFRESH seconds whether they have changed: so a
+request costs no trip to the store, whatever key it shows, and a revoked key is refused that long after.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Keys:
             await asyncio.sleep(max(0.0, self._tried_at + MISS_EVERY - time.monotonic()))
             began = time.monotonic()
             try:
-                version = await _reached(self._store.hget(KEYS, ""))
+                version = await _reached(self._store.hget(KEYS, "")) or (self._version and b"")  # emptied
                 if version is not None and version != self._version:
                     listed = {key.digest: key for key in await self.listed()}
                     self._known, self._version = {**self._own, **listed}, version
@@ -136,14 +136,14 @@ class Keys:
         if not await _reached(self._store.hsetnx(KEYS, name, record)):
             expected = "another; or revoke that one first"
             raise InputError("there is a key of this name", path="name", got=name, expected=expected)
-        await _reached(self._store.hincrby(KEYS, "", 1))
+        await _reached(self._store.hset(KEYS, "", secrets.token_hex(8)))
         return secret
 
     async def revoke(self, name: str) -> None:
         """What it made stays, and belongs to the next key of this name. Raises NotFound."""
         if not name or not await _reached(self._store.hdel(KEYS, name)):
             raise NotFound("there is no such key", path="name", got=name, expected="a name of `keys list`")
-        await _reached(self._store.hincrby(KEYS, "", 1))
+        await _reached(self._store.hset(KEYS, "", secrets.token_hex(8)))
 
 
 OPEN = Key("", "")  # whoever asks a server that asks for no key
