@@ -292,6 +292,30 @@ def test_a_session_that_another_server_has_back_at_once_stays_on_the_list(url, a
     run(url, archive, story)
 
 
+def test_a_store_whose_memory_is_full_is_freed_by_moves_and_deletions(url, archive):
+    async def story(store: ArchivingStore) -> None:
+        await begin(store, "mover@moves", 3)
+        await begin(store, "mover@goes", 3)
+        await store.redis.config_set("maxmemory", 1)
+        try:
+            with pytest.raises(StoreError, match="the store refuses"):
+                await begin(store, "mover@new", 0)
+            for what in ("turn", "sweep"):
+                assert await store.my_turn(what, "me", 30)
+                assert await store.my_turn(what, "me", 30)
+                assert not await store.my_turn(what, "another", 30)
+            dump = await store.dump("mover@moves")
+            assert await store.put_away("mover@moves", time.time() + TTL, dump)
+            assert await store.count_bytes() > 0
+            assert await store.delete("mover@goes")
+            assert await store.redis.keys("specshield:v2:*") == []
+            assert (await store.load("mover@moves")).version == dump.version
+        finally:
+            await store.redis.config_set("maxmemory", 0)
+
+    run(url, archive, story)
+
+
 def test_what_has_expired_is_not_read_and_its_file_is_removed(url, archive):
     async def story(store):
         await begin(store, "old", 1)

@@ -35,12 +35,12 @@ class Mover:
 
     async def run(self) -> None:
         """Until it is cancelled."""
-        every = min(EVERY, self._ended)
+        every, sweep_every = min(EVERY, self._ended), min(SWEEP_EVERY, self._ttl)
         while True:
             try:
-                mine = await self._store.my_turn(self._me, int(3 * every) + 1)
-                if mine and await self._store.first_within("sweep", min(SWEEP_EVERY, self._ttl)):
-                    await self._store.count_bytes(exactly=await self.sweep())
+                mine = await self._store.my_turn("turn", self._me, int(3 * every) + 1)
+                if mine and await self._store.my_turn("sweep", secrets.token_hex(8), sweep_every):
+                    await self._store.count_bytes(await self.sweep() - await self._store.count_bytes())
                 self._store.full = await self._store.count_bytes() >= self._room
                 if mine and not self._store.full:
                     await self.move()

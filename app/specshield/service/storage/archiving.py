@@ -22,20 +22,23 @@ from specshield.service.storage.store import INDEX, PAGE_BYTES, Change, Dump, Re
 
 P = ParamSpec("P")
 R = TypeVar("R")
-TURN = "specshield:archive:turn"  # the name of the server whose turn it is to move sessions
+TURN = "specshield:archive:"  # and of what: the name of the server whose turn it is
 SIZE = "specshield:archive:bytes"
 FENCE = 600  # [s]; longer than any server takes from reading a file to bringing it back. Chosen by hand.
 TRIES = 5  # of reading a file that a newer one replaces, and of bringing a session back
 AT_ONCE = 8  # reads and writes of files of one server process; more would wait for the same disk
 
-# KEYS of all: session, rows, steps, fence.  ARGV: version, FENCE.  Returns 1 where the session has left the
-# store with this version, now or before; 0 where it goes on; -1 where it was erased.
+# A store whose memory is full takes all writes of a script if the first one needs no memory. So it is in
+# those that have to be done to free some.
+
+# KEYS of the next three: session, rows, steps, fence.  ARGV: version, FENCE.  Returns 1 where the session has
+# left the store with this version, now or before; 0 where it goes on; -1 where it was erased.
 LEAVE = """\
 local version, fence = redis.call('HGET', KEYS[1], 'version'), redis.call('GET', KEYS[4])
 if version and version ~= ARGV[1] then return 0 end
 if not version then return (not fence or fence == ARGV[1]) and 1 or -1 end
-redis.call('SET', KEYS[4], ARGV[1], 'EX', ARGV[2])
 redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])
+redis.call('SET', KEYS[4], ARGV[1], 'EX', ARGV[2])
 return 1"""
 
 # ARGV: version, FENCE, time to live [ms], config, state, rows, steps...  Returns 1 where it is back.
@@ -51,8 +54,17 @@ return 1"""
 
 # ARGV: '', FENCE.  Returns 1 where there was one.
 ERASE = """\
+local found = redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3])
 redis.call('SET', KEYS[4], 'erased', 'EX', ARGV[2])
-return redis.call('UNLINK', KEYS[1], KEYS[2], KEYS[3]) > 0 and 1 or 0"""
+return found > 0 and 1 or 0"""
+
+# ARGV: name, time to live [s].  Returns 1 where nobody but this name holds the key: it then does.
+TAKE = """\
+if (redis.call('GET', KEYS[1]) or ARGV[1]) ~= ARGV[1] then return 0 end
+redis.call('PERSIST', KEYS[1])
+redis.call('SET', KEYS[1], ARGV[1], 'EX', ARGV[2])
+return 1"""
+COUNT = "redis.call('PERSIST', KEYS[1]) return redis.call('INCRBY', KEYS[1], ARGV[1])"
 
 
 class ArchivingStore(Store):
@@ -61,7 +73,8 @@ class ArchivingStore(Store):
     def __init__(self, url: str, timeout: float, ttl: int, archive: Archive, replicas: int = 0) -> None:
         super().__init__(url, timeout, ttl, replicas)
         self.archive = archive
-        self._leave, self._return, self._erase = map(self.redis.register_script, (LEAVE, RETURN, ERASE))
+        made = map(self.redis.register_script, (LEAVE, RETURN, ERASE, TAKE, COUNT))
+        self._leave, self._return, self._erase, self._take, self._count = made
         self.full = False
         self._files = anyio.CapacityLimiter(AT_ONCE)
 
@@ -151,26 +164,15 @@ class ArchivingStore(Store):
         found = [(id, waits[id], state) for id, state in zip(idle, states, strict=True) if state is not None]
         return found, ids[-1] if len(ids) == limit else None
 
-    async def my_turn(self, name: str, seconds: int) -> bool:
-        """Whether nobody but `name` moved sessions in so many seconds; it is then the turn of `name`."""
+    async def my_turn(self, what: str, name: str, seconds: int) -> bool:
+        """Whether nobody but `name` had a turn at this in so many seconds; it is then the turn of `name`."""
         async with self._reaching():
-            if await self.redis.set(TURN, name, nx=True, ex=seconds):
-                return True
-            mine: bool = await self.redis.get(TURN) == name.encode()
-            return mine and bool(await self.redis.expire(TURN, seconds))
+            return bool(await self._take(keys=[TURN + what], args=[name, seconds]))
 
-    async def first_within(self, what: str, seconds: int) -> bool:
-        """Whether nobody has asked for this in so many seconds."""
-        async with self._reaching():
-            return bool(await self.redis.set(f"specshield:archive:{what}", 1, nx=True, ex=seconds))
-
-    async def count_bytes(self, more: int = 0, exactly: int | None = None) -> int:
+    async def count_bytes(self, more: int = 0) -> int:
         """The bytes of the archive: as they were last counted, and what has moved there since."""
         async with self._reaching():
-            if exactly is None:
-                return int(await self.redis.incrby(SIZE, more))
-            await self.redis.set(SIZE, exactly)
-            return exactly
+            return int(await self._count(keys=[SIZE], args=[more]))
 
     async def put_away(self, id: str, expires: float, dump: Dump) -> bool:
         """Moves a session to the archive. False where it goes on, or was erased meanwhile."""
@@ -203,10 +205,8 @@ class ArchivingStore(Store):
     def _archived(self, id: str) -> Dump | None:
         for _ in range(TRIES):
             entry = self.archive.find(id)
-            if entry is None:
-                return None
-            dump = self.archive.read(entry)
-            if dump is not None:
+            dump = None if entry is None else self.archive.read(entry)
+            if entry is None or dump is not None:
                 return dump
         return None
 
