@@ -263,6 +263,25 @@ def test_a_key_that_was_lost_with_all_of_the_store_is_refused_and_one_made_since
     on_keys(keyed, act)
 
 
+def test_a_key_is_revoked_in_a_store_whose_memory_is_full(keyed):
+    async def act(keys):
+        server, secret = Keys(keys._store, "own"), await keys.create("full")
+        await server.refresh()
+        assert (await server.check(f"Bearer {secret}".encode())).name == "full"
+        await keys._store.config_set("maxmemory", 1)
+        try:
+            await keys.revoke("full")
+        finally:
+            await keys._store.config_set("maxmemory", 0)
+        await server.refresh()
+        with pytest.raises(Unauthorized):
+            await server.check(f"Bearer {secret}".encode())
+        with pytest.raises(NotFound):
+            await keys.revoke("full")
+
+    on_keys(keyed, act)
+
+
 def test_unknown_keys_do_not_ask_the_store_each():
     asked = 0
 

@@ -27,6 +27,7 @@ from specshield.service.storage.connect import reaching
 T = TypeVar("T")
 KEYS = "specshield:keys"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+REVOKE = "return redis.call('HDEL', KEYS[1], ARGV[1]) > 0 and redis.call('HSET', KEYS[1], '', ARGV[2])"
 MOST_KEYS = 1000  # each takes some 300 bytes of every server; chosen by hand
 REFRESH = 2.0  # [s] chosen by hand: how long a revoked key may still work
 MISS_EVERY = 0.2  # [s] at most so often do keys that are not known make a server ask the store; by hand
@@ -140,10 +141,9 @@ class Keys:
         return secret
 
     async def revoke(self, name: str) -> None:
-        """What it made stays, and belongs to the next key of this name. Raises NotFound."""
-        if not name or not await _reached(self._store.hdel(KEYS, name)):
+        """What it made stays, and belongs to the next key of this name. All or nothing. Raises NotFound."""
+        if not name or await _reached(self._store.eval(REVOKE, 1, KEYS, name, secrets.token_hex(8))) is None:
             raise NotFound("there is no such key", path="name", got=name, expected="a name of `keys list`")
-        await _reached(self._store.hset(KEYS, "", secrets.token_hex(8)))
 
 
 OPEN = Key("", "")  # whoever asks a server that asks for no key
