@@ -419,6 +419,7 @@ RAW = {
     "NaN": b'{"t": 0, "poses": [[1, 1.5, 0]], "logits": [NaN, 0, 0, 0, 0]}',
     "Infinity": b'{"t": 0, "poses": [[1, 1.5, 0]], "logits": [Infinity, 0, 0, 0, 0]}',
     "1e999": b'{"t": 0, "poses": [[1, 1.5, 0]], "logits": [1e999, 0, 0, 0, 0]}',
+    "-Infinity": b'{"t": 0, "poses": [[1, 1.5, 0]], "logits": [-Infinity, 0, 0, 0, 0]}',
 }
 
 
@@ -426,7 +427,8 @@ RAW = {
 def test_numbers_that_are_none(client, begin, content):
     path = f"/v1/sessions/{begin()['id']}/steps"
     response = client.post(path, content=content, headers={"Content-Type": "application/json"})
-    problem(response, 422, "invalid-logits", "logits[0]")
+    answer = problem(response, 422, "invalid-logits", "logits[0]")
+    assert answer["expected"] == "a finite number, or null for minus infinity"
 
 
 @pytest.mark.parametrize(

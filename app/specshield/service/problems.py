@@ -189,10 +189,8 @@ def _expected(item: Mapping[str, Any]) -> str:
         return f"one of {context['expected_tags']}"
     told = {
         "extra_forbidden": "the fields that /docs lists",
-        "missing": "a value: this field is required",
-        "union_tag_not_found": "a value: this field is required",
-        "model_type": "an object",
-        "model_attributes_type": "an object",
+        **dict.fromkeys(("missing", "union_tag_not_found"), "a value: this field is required"),
+        **dict.fromkeys(("model_type", "model_attributes_type"), "an object"),
         "int_parsing": "a whole number",
         "string_too_short": "a text of {min_length} or more characters",
         "string_too_long": "a text of at most {max_length} characters",
@@ -200,6 +198,8 @@ def _expected(item: Mapping[str, Any]) -> str:
         "too_short": "at least {min_length} of them",
         "too_long": "at most {max_length} of them",
     }
+    if item["type"] == "finite_number" and "logits" in item["loc"]:
+        return "a finite number, or null for minus infinity"
     if item["type"] in told:
         return told[item["type"]].format(**context)
     return said.removeprefix("Value error, ").removeprefix("Input should be ")
