@@ -90,6 +90,9 @@ def test_what_cannot_work_is_refused(model: Any) -> None:
         ShieldLogitsProcessor(lambda logits: None, [[3, 4], [5]])
     with pytest.raises(InputError, match="begin another's"):
         ShieldLogitsProcessor(lambda logits: None, [[3], [3, 4]], logits=np.zeros(2))
+    for temperature in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="expected a number above 0"):
+            ShieldLogitsProcessor(lambda logits: None, [[3], [4]], temperature=temperature)
     with pytest.raises(InputError, match="of its own"):
         ShieldLogitsProcessor(lambda logits: None, [[3], [3]])
     shaping = ShieldLogitsProcessor(lambda logits: None, [[3], [4]])

@@ -37,9 +37,9 @@ class ShieldLogitsProcessor(LogitsProcessor):
     ask: gives the decision for logits [A]; session.step with the pose, usually. tokens: of each action, in
     the order of the robot's actions. logits: the model's own, one an action, as `score_actions` has them;
     None where every action is a single token, whose scores are taken. temperature: of the model's
-    distribution. eos: the token that ends an action whose tokens begin another's.
+    distribution, above 0. eos: the token that ends an action whose tokens begin another's.
 
-    Raises InputError for actions that cannot be told apart, LogitsError for logits of another number.
+    Raises InputError for tokens or a temperature that cannot be used, LogitsError for too few or many logits.
     """
 
     def __init__(
@@ -52,6 +52,9 @@ class ShieldLogitsProcessor(LogitsProcessor):
         eos: int | None = None,
     ) -> None:
         self._ask, self._eos, self._temperature = ask, eos, temperature
+        if not 0.0 < temperature < np.inf:
+            what, expected = "a temperature divides the logits", "a number above 0"
+            raise InputError(what, path="temperature", got=temperature, expected=expected)
         self._tokens = check_tokens(tokens, eos)
         self._logits = None if logits is None else np.asarray(logits, dtype=np.float64)
         if self._logits is None and self.longest > 1:
@@ -68,9 +71,8 @@ class ShieldLogitsProcessor(LogitsProcessor):
     def __call__(self, input_ids: torch.LongTensor, scores: torch.Tensor) -> torch.Tensor:
         """scores [1, V] of the next token: those of the tokens that go on with an allowed action."""
         if len(scores) != 1:
-            raise InputError(
-                "one sequence at a time", path="input_ids", got=list(input_ids.shape), expected="shape [1, n]"
-            )
+            what, got = "one sequence at a time", list(input_ids.shape)
+            raise InputError(what, path="input_ids", got=got, expected="shape [1, n]")
         if self.decision is None:
             self._prompt = input_ids.shape[1]
             if self._logits is None:
@@ -115,9 +117,8 @@ def check_tokens(tokens: Sequence[Sequence[int]], eos: int | None = None) -> lis
     read = [tuple(int(token) for token in sequence) for sequence in tokens]
     for i, one in enumerate(read):
         if not one or one in read[:i]:
-            raise InputError(
-                "an action needs tokens of its own", path=f"tokens[{i}]", got=list(one), expected="a new list"
-            )
+            what = "an action needs tokens of its own"
+            raise InputError(what, path=f"tokens[{i}]", got=list(one), expected="a new list")
         if eos is None and any(other[: len(one)] == one and other != one for other in read):
             what, end = "this action's tokens begin another's", "an `eos` that tells where an action ends"
             raise InputError(what, path=f"tokens[{i}]", got=list(one), expected=end)
@@ -140,5 +141,4 @@ def score_actions(
     ahead = torch.log_softmax(model(input_ids=rows).logits[:, start - 1 : -1].double(), dim=-1)
     each = ahead.gather(2, rows[:, start:, None])[:, :, 0].cpu().numpy()
     counted = np.arange(width) < np.array([len(sequence) for sequence in ended])[:, None]
-    total: Floats = np.where(counted, each, 0.0).sum(axis=1)
-    return total
+    return np.asarray(np.where(counted, each, 0.0).sum(axis=1), dtype=np.float64)
