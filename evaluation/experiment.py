@@ -217,9 +217,8 @@ def split(method: str) -> tuple[str, Config]:
     """The kind of a method, and its session's settings. Raises NotFound or InputError."""
     kind, at, asked = method.partition("@")
     if kind not in METHODS:
-        raise NotFound(
-            f"there is no method {kind!r}", path="methods", got=method, expected=f"of {', '.join(METHODS)}"
-        )
+        names = ", ".join(METHODS)
+        raise NotFound(f"there is no method {kind!r}", path="methods", got=method, expected=f"one of {names}")
     if not at:
         return kind, Config()
     metres, _, steps = asked.partition("/")
