@@ -14,7 +14,8 @@ from specshield.stl.formula import BODY_WORDS, KEYWORDS
 from specshield.task import POSE_NAMES
 from tests.browsing import needs_chromium
 from tests.houses import HOUSES, needs_houses
-from tests.service.world import ahead, grid_json
+from tests.service.test_switch import CRAWLER, END
+from tests.service.world import ahead, grid_json, send_policy
 from tests.serving import serving
 from tests.world.test_procthor import SIZES, house
 
@@ -438,6 +439,43 @@ def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step, brow
         assert page.locator(".actions tbody tr").count() == 5
         client.post(f"/v1/sessions/{session['id']}/close", json={})
         page.get_by_text("over, the rule is pending").wait_for()
+    assert complaints == []
+
+
+def test_steps_before_a_switch_are_told_under_the_rule_that_held_then(server, client, begin, step, browse):
+    """What another robot did elsewhere is not told as motions of the present one, nor drawn on its floor."""
+    session, poses = begin(), ahead(3)
+    for t in range(3):
+        assert step(session, t, [poses[t]]).status_code == 200
+
+    def switch(t, policy_id, pose):
+        body = {"t": t, "policy_id": policy_id, "poses": [pose], "clock": "restart"}
+        assert client.post(f"/v1/sessions/{session['id']}/switch", json=body).status_code == 200
+
+    crawler = send_policy(client, spec={"formula": "F[0,20] End", "regions": {"End": END}}, robot=CRAWLER)
+    switch(3, crawler["id"], poses[3])
+    assert step(session, 3, [poses[3]], logits=[0.0, None, 0.0]).status_code == 200
+    with browse() as (page, complaints):
+        page.goto(f"{server.url}/#/sessions/{session['id']}")
+        heading = page.get_by_role("heading", level=2).first
+        page.get_by_role("heading", name="Step 3, step 0 of 20 of its rule").wait_for()
+        assert page.locator(".robot:not([hidden])").count() == 1
+        page.get_by_label("Step", exact=True).fill("1")
+        page.get_by_text("Decided under an earlier rule: F[0,6] Goal and G[0,8] battery > 10").wait_for()
+        assert heading.inner_text() == "Step 1 of 8"
+        page.get_by_text("Decided for another robot").wait_for()
+        assert page.locator(".next").get_attribute("points") == ""
+        assert page.locator(".robot:not([hidden])").count() == 1
+        switch(4, "case1", [4.5, 5.0, 0.0])
+        assert step(session, 4, [[4.5, 5.0, 0.0]], logits=[0.0] * 20).status_code == 200
+        page.get_by_role("heading", name="Step 4, step 0 of 140 of its rule").wait_for()
+        assert page.locator(".way").get_attribute("points") == "4.500,-5.000"
+        page.get_by_label("Step", exact=True).fill("3")
+        page.get_by_text("Decided under an earlier rule, on another floor: F[0,20] End").wait_for()
+        assert page.locator(".robot:not([hidden])").count() == 0
+        page.get_by_role("link", name="Robots", exact=True).click()
+        row = page.locator("tbody tr", has=page.locator(f"a[title='{session['id']}']"))
+        assert "5, step 1 of 140 of its rule" in row.inner_text()
     assert complaints == []
 
 

@@ -2,32 +2,36 @@
 
 import { svg } from "./dom.js";
 import { centre, continuation } from "./motion.js";
+import { sameFloor, sameRobot } from "./rules.js";
 
 const COLORS = 8;
 
 export class Mark {
-  /** robot: as the API shows it. index: which of the colours it has. */
-  constructor(floor, robot, name, index = 0) {
-    this.floor = floor;
-    this.robot = robot;
+  /** session: as the API shows it. index: which of the colours its robot has. */
+  constructor(floor, session, index = 0) {
+    const { robot, id } = session;
+    Object.assign(this, { floor, session, robot });
     const color = `color-${index % COLORS}`;
     this.way = svg("polyline", { class: `way ${color}` });
     this.next = svg("polyline", { class: `next ${color}` });
     this.disc = svg("circle", { r: robot.footprint.radius });
     this.nose = svg("line");
-    this.body = svg("g", { class: `robot ${color}`, hidden: true }, svg("title", {}, name), this.disc, this.nose);
+    this.body = svg("g", { class: `robot ${color}`, hidden: true }, svg("title", {}, id), this.disc, this.nose);
     floor.layers.ways.append(this.next, this.way);
     floor.layers.robots.append(this.body);
     this.fits = (point, radius) => !floor.occupancy || floor.occupancy.fits(point, radius);
   }
 
-  /** items: of the trajectory up to the one that is shown. ahead: whether to draw the continuation. */
-  show(items, ahead = true) {
+  /** items: of the trajectory up to the one that is shown. What was on another floor, before a switch, is not drawn. */
+  show(items) {
     const last = items.at(-1);
     if (!last) return;
-    this.way.setAttribute("points", this.floor.line(items.map((item) => item.pose)));
-    this.next.setAttribute("points", ahead ? this.floor.line(continuation(this.robot, last, this.fits)) : "");
-    this.move(last.pose);
+    const here = items.filter((item) => sameFloor(this.session, item));
+    const ahead = here.at(-1) === last && sameRobot(this.session, last) ? continuation(this.robot, last, this.fits) : [];
+    this.way.setAttribute("points", this.floor.line(here.map((item) => item.pose)));
+    this.next.setAttribute("points", this.floor.line(ahead));
+    if (here.at(-1) === last) this.move(last.pose);
+    else this.body.setAttribute("hidden", "");
   }
 
   move(pose) {

@@ -30,7 +30,7 @@ export async function show(place, { query, signal }) {
   const floor = new Floor(map, `Floor with ${robots.length} robots`);
   floor.regions(Object.assign({}, ...robots.map((session) => session.spec.regions)), await avoided(robots, signal));
   const all = robots.map((session, i) => {
-    return { session, items: [], mark: new Mark(floor, session.robot, session.id, i), row: row(session, i) };
+    return { session, items: [], mark: new Mark(floor, session, i), row: row(session, i) };
   });
   const state = new State();
   const draw = onceAFrame(() => all.forEach((each) => shown(each, replay.t)));
@@ -67,6 +67,7 @@ export async function show(place, { query, signal }) {
   const created = new Map(all.map(({ session }) => [session.id, session.created_at]));
   const take = (item) => {
     const each = by.get(item.session);
+    if (item.rule >= each.session.rules.length) return dispatchEvent(new Event("hashchange")); // another rule, or floor
     state.heard();
     if (item.finished) Object.assign(each.session, { spec_status: item.spec_status ?? each.session.spec_status, erased: item.erased });
     else {

@@ -2,6 +2,7 @@
 // what it got, and whether the rule can still be kept after it.
 
 import { el, metres, pair, percent } from "../lib/dom.js";
+import { ruleOf, sameFloor, sameRobot, within } from "../lib/rules.js";
 
 const MODES = {
   prior: "The rule is settled: the model chooses alone.",
@@ -57,10 +58,11 @@ export class Panel {
 
   show(item) {
     const { decision } = item;
+    const rule = ruleOf(this.session, item);
     const head = el(
       "div",
       { class: "row spread" },
-      el("h2", {}, `Step ${item.t}`, el("small", {}, item.t > this.session.horizon ? `, the rule had ${this.session.horizon}` : ` of ${this.session.horizon}`)),
+      el("h2", {}, `Step ${item.t}`, el("small", {}, within(item.t, rule))),
       decision && el("span", { class: `badge ${decision.spec_status}` }, decision.spec_status),
     );
     if (!decision) {
@@ -68,8 +70,15 @@ export class Panel {
       return;
     }
     const open = this.element.querySelector("details")?.open;
-    this.element.replaceChildren(head, ...this.mode(decision), this.numbers(decision), this.actions(item));
+    const earlier = rule !== this.session.rules.at(-1) && this.earlier(rule, item);
+    this.element.replaceChildren(head, ...[earlier].filter(Boolean), ...this.mode(decision), this.numbers(decision), this.actions(item));
     if (open) this.element.querySelector("details")?.setAttribute("open", "");
+  }
+
+  /** Which rule held at a step before a switch. */
+  earlier({ formula }, item) {
+    const elsewhere = sameFloor(this.session, item) ? "" : ", on another floor";
+    return el("p", { class: "earlier" }, `Decided under an earlier rule${elsewhere}: `, el("code", {}, formula));
   }
 
   mode(decision) {
@@ -100,10 +109,11 @@ export class Panel {
     );
   }
 
-  actions({ decision, logits }) {
+  actions(item) {
+    const { decision, logits } = item;
     const wanted = prior(logits);
     const { actions, robot } = this.session;
-    if (decision.distribution.length !== actions.length) return el("p", {}, "Decided for another robot, before a switch.");
+    if (!sameRobot(this.session, item)) return el("p", {}, "Decided for another robot, before a switch.");
     const groups = alike(robot.actions);
     const said = new Map(); // each reason, and the action that it was written out for
     const row = (group) => this.row(group.map((i) => actions[i]), robot.actions[group[0]], group, decision, wanted, said);

@@ -28,7 +28,7 @@ async function listen(place, watch, state, items, signal) {
   const { id, created_at } = watch.session;
   const last = items.findLast((item) => item.decision)?.t ?? -1;
   const take = (item) => {
-    const another = item.anew || item.rule >= watch.session.rules?.length; // session of this id, or rule
+    const another = item.anew || item.rule >= watch.session.rules.length; // session of this id, or rule
     if (another) return dispatchEvent(new Event("hashchange"));
     state.heard();
     if (!item.finished) return watch.push(item);

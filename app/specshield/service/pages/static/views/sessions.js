@@ -3,6 +3,7 @@
 import { all } from "../lib/api.js";
 import { called, el, keep, say, short, write } from "../lib/dom.js";
 import { again } from "../lib/patience.js";
+import { within } from "../lib/rules.js";
 
 const EVERY = 2000; // [ms] between two looks at the list
 const MOST = 64; // robots on one picture
@@ -74,9 +75,8 @@ function fillRow(row, session) {
 }
 
 /** How far a robot is in its rule; a session that was only told where its robot was has no step. */
-function step({ next_t: t, horizon, finished }) {
-  if (t > horizon) return `${t}, the rule had ${horizon}`;
-  return finished && t === 0 ? "none decided" : `${t} of ${horizon}`;
+function step({ next_t: t, rules, finished }) {
+  return finished && t === 0 ? "none decided" : `${t}${within(t, rules.at(-1))}`;
 }
 
 function nobody() {

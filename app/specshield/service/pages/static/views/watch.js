@@ -14,7 +14,7 @@ export class Watch {
     this.session = session;
     this.items = [];
     this.floor = new Floor(map, `Floor with robot ${session.id}`);
-    this.mark = new Mark(this.floor, session.robot, session.id);
+    this.mark = new Mark(this.floor, session);
     this.panel = new Panel(session);
     this.charts = [
       [new Chart("Robustness ahead", metres), (d) => d.robustness[taken(d)]],
@@ -53,7 +53,8 @@ export class Watch {
     this.mark.show(known);
     this.panel.show(item);
     const decided = this.items.filter((each) => each?.decision);
-    const last = Math.max(this.session.horizon, this.items.length - 1);
+    const { origin, horizon } = this.session.rules.at(-1);
+    const last = Math.max(origin + horizon, this.items.length - 1);
     for (const [chart, value, hidesZero] of this.charts) {
       const values = decided.map((each) => [each.t, value(each.decision)]);
       const known = values.filter(([, v]) => v !== null && v !== undefined && Math.abs(v) < 1e6);
