@@ -479,6 +479,30 @@ def test_steps_before_a_switch_are_told_under_the_rule_that_held_then(server, cl
     assert complaints == []
 
 
+def test_no_action_is_said_to_keep_a_broken_rule_nor_signals_to_be_metres(server, begin, step, browse):
+    broken, short = begin(), begin(evaluation="robustness", threshold=0.9)
+    assert step(broken, 0, [ahead(0)[0]]).json()["mode"] == "shaped"
+    assert step(broken, 1, [ahead(1)[1]], signals={"battery": 5.0}).json()["mode"] == "violated"
+    answer = step(short, 0, [ahead(0)[0]]).json()
+    assert (answer["mode"], answer["reason"]) == ("fallback", "infeasible")
+    assert answer["feasible_mass"] > 0
+    with browse() as (page, complaints):
+        page.goto(f"{server.url}/#/sessions/{broken['id']}")
+        page.get_by_role("heading", name="Step 1").wait_for()
+        told = page.locator(".told.can").all_inner_texts()
+        assert set(told) == {"is broken; what is left of it can be kept"}
+        chart = page.locator(".chart", has_text="Robustness ahead").locator("output")
+        assert re.fullmatch(r"−\d+\.\d\d", chart.inner_text())
+        assert page.locator("dl.numbers dt", has_text=re.compile("^Kept$")).count() == 0
+        page.get_by_label("Step", exact=True).fill("0")
+        page.get_by_role("heading", name="Step 0").wait_for()
+        assert re.fullmatch(r"can be kept by \d+\.\d\d", page.locator(".told.can").first.inner_text())
+        page.goto(f"{server.url}/#/sessions/{short['id']}")
+        page.get_by_text("The threshold that was asked for cannot be had").wait_for()
+        assert "no future was found" not in page.locator(".mode").inner_text()
+    assert complaints == []
+
+
 def test_the_key_is_typed_once_and_stays_in_its_tab(tmp_path, browse):
     with serving(tmp_path, SPECSHIELD_API_KEY="a-secret-key") as running, browse() as (page, _):
         page.goto(running.url)

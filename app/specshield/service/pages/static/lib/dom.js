@@ -27,12 +27,14 @@ export const problem = (error) => el("p", { class: "problem", role: "alert" }, e
 export const percent = (share) =>
   share > 0 && share < 0.001 ? "<0.1 %" : `${(100 * share).toFixed(share > 0.0995 ? 0 : 1)} %`;
 
-/** Metres, or whatever the rule counts in. */
-export function metres(value) {
+/** A number, in a unit where one is told. */
+export function amount(value, unit = "") {
   if (value === null || value === undefined) return "–";
   if (Math.abs(value) > 1e6) return value > 0 ? "∞" : "−∞";
-  return `${value < 0 ? "−" : ""}${Math.abs(value).toFixed(2)} m`;
+  return `${value < 0 ? "−" : ""}${Math.abs(value).toFixed(2)}${unit}`;
 }
+
+export const metres = (value) => amount(value, " m");
 
 /** Both ends of a long id: those of a fleet often differ in the last letters alone. */
 export const short = (id) => (id.length > 24 ? `${id.slice(0, 11)}…${id.slice(-11)}` : id);

@@ -2,7 +2,7 @@
 // what it got, and whether the rule can still be kept after it.
 
 import { el, metres, pair, percent } from "../lib/dom.js";
-import { ruleOf, sameFloor, sameRobot, within } from "../lib/rules.js";
+import { measure, ruleOf, sameFloor, sameRobot, within } from "../lib/rules.js";
 
 const MODES = {
   prior: "The rule is settled: the model chooses alone.",
@@ -27,8 +27,8 @@ export function prior(logits) {
   return weights.map((weight) => weight / sum);
 }
 
-/** Why an action is forbidden, in words. */
-export function whyNot(decision, action) {
+/** Why an action is forbidden, in words. measured: writes a robustness. */
+function whyNot(decision, action, measured) {
   const value = decision.robustness[action];
   const told = decision.explanations?.[action];
   if (told?.detail && told.robustness > 0) return told.detail;
@@ -41,8 +41,9 @@ export function whyNot(decision, action) {
     return `no way was found after it that keeps the rule; the best way found does not keep '${told.conjunct}': ${found}`;
   }
   if (value === null || value === undefined) return "was not looked at";
-  if (value > 0) return `keeps the rule by ${metres(value)}, but not with ${inHand(decision)} in reserve`;
-  return `no way was found after it that keeps the rule; the best misses it by ${metres(Math.abs(Math.min(0, value)))}`;
+  if (decision.mode === "violated") return "no way was found after it that keeps what is left of the rule";
+  if (value > 0) return `keeps the rule by ${measured(value)}, but not with ${inHand(decision)} in reserve`;
+  return `no way was found after it that keeps the rule; the best misses it by ${measured(Math.abs(Math.min(0, value)))}`;
 }
 
 /** What a decision keeps in reserve for a robot that does not land exactly where it should. */
@@ -53,6 +54,7 @@ function inHand({ margin, slack }) {
 export class Panel {
   constructor(session) {
     this.session = session;
+    this.measured = measure(session.spec);
     this.element = el("section", { class: "card panel", "aria-label": "The decision at this step" });
   }
 
@@ -82,9 +84,11 @@ export class Panel {
   }
 
   mode(decision) {
-    const reason = REASONS[decision.reason] ?? decision.reason;
     const lost = decision.mode === "fallback" && !decision.witness;
-    const said = lost ? "No way was found that keeps what is asked; this is what comes nearest." : MODES[decision.mode];
+    const short = decision.reason === "infeasible" && decision.feasible_mass > 0; // there are ways, and a threshold above theirs
+    const reason = short ? "every way that was found keeps the rule by less than the threshold" : (REASONS[decision.reason] ?? decision.reason);
+    const asked = short ? "The threshold that was asked for cannot be had: the certified continuation decides." : MODES[decision.mode];
+    const said = lost ? "No way was found that keeps what is asked; this is what comes nearest." : asked;
     const warnings = decision.warnings.map((text) => el("li", {}, text));
     if (decision.in_collision) warnings.push(el("li", {}, "The robot touches an obstacle."));
     return [
@@ -104,7 +108,7 @@ export class Panel {
       pair("Off the expected pose", off ?? "–"),
       margin === undefined ? null : pair("Margin, slack", `${metres(margin)}, ${slack} steps`),
       left === undefined || left === null || left === 1 ? null : pair("Threshold left", left.toFixed(3)),
-      typeof any === "boolean" ? pair("Kept", any ? "whatever the signals do" : "if the signals stay as they are") : null,
+      typeof any === "boolean" && decision.mode !== "violated" ? pair("Kept", any ? "whatever the signals do" : "if the signals stay as they are") : null,
       revision ? pair("Own map", revision === 1 ? "changed once" : `changed ${revision} times`) : null,
     );
   }
@@ -146,7 +150,20 @@ export class Panel {
     const drawn = group.includes(decision.action) ? el("span", { class: "drawn", title: "The action drawn at this step" }, "drawn") : null;
     const head = el("th", { scope: "row", title: names.join(", ") }, names[0], names.length > 1 ? ` and ${names.length - 1} more` : "", drawn);
     head.append(el("small", { class: "does" }, does(action)));
-    return el("tr", {}, head, bars, verdict(decision, group[0], action, names[0], said));
+    return el("tr", {}, head, bars, this.verdict(decision, group[0], action, names[0], said));
+  }
+
+  /** said: the reasons that have been written out, each with the name of its action; a new one is added. */
+  verdict(decision, i, action, name, said) {
+    if (action.terminal) return el("td", { class: "told" }, "ends the model's task");
+    const [j, value] = [decision.j_values[i], decision.robustness[i]];
+    if (j === null) return el("td", { class: "told" }, "was not looked at");
+    if (j > 0 && decision.mode === "violated") return el("td", { class: "told can" }, "is broken; what is left of it can be kept");
+    if (j > 0 || (j !== 0 && value > 0)) return el("td", { class: "told can" }, "can be kept", el("small", {}, ` by ${this.measured(value)}`));
+    const why = whyNot(decision, i, this.measured);
+    const first = said.get(why);
+    if (!first) said.set(why, name);
+    return el("td", { class: "told cannot" }, el("strong", {}, "forbidden: "), first ? `for the same reason as ${first}` : why);
   }
 }
 
@@ -160,18 +177,6 @@ function bar(kind, share) {
   const line = el("i", { class: kind });
   line.style.width = `${(100 * share).toFixed(1)}%`;
   return el("span", {}, line, el("small", {}, percent(share)));
-}
-
-/** said: the reasons that have been written out, each with the name of its action; a new one is added. */
-function verdict(decision, i, action, name, said) {
-  if (action.terminal) return el("td", { class: "told" }, "ends the model's task");
-  const [j, value] = [decision.j_values[i], decision.robustness[i]];
-  if (j === null) return el("td", { class: "told" }, "was not looked at");
-  if (j > 0 || (j !== 0 && value > 0)) return el("td", { class: "told can" }, "can be kept", el("small", {}, ` by ${metres(value)}`));
-  const why = whyNot(decision, i);
-  const first = said.get(why);
-  if (!first) said.set(why, name);
-  return el("td", { class: "told cannot" }, el("strong", {}, "forbidden: "), first ? `for the same reason as ${first}` : why);
 }
 
 /** What an action does, in words. */

@@ -2,9 +2,10 @@
 
 import { ask } from "../lib/api.js";
 import { Chart } from "../lib/chart.js";
-import { el, metres, onceAFrame, percent } from "../lib/dom.js";
+import { el, onceAFrame, percent } from "../lib/dom.js";
 import { Floor } from "../lib/floor.js";
 import { Mark } from "../lib/mark.js";
+import { measure } from "../lib/rules.js";
 import { Panel } from "./panel.js";
 import { Replay } from "./replay.js";
 
@@ -17,7 +18,7 @@ export class Watch {
     this.mark = new Mark(this.floor, session);
     this.panel = new Panel(session);
     this.charts = [
-      [new Chart("Robustness ahead", metres), (d) => d.robustness[taken(d)]],
+      [new Chart("Robustness ahead", measure(session.spec)), (d) => d.robustness[taken(d)]],
       [new Chart("Feasible mass", percent), (d) => d.feasible_mass],
       [new Chart("Slack kept", (steps) => `${steps} ${steps === 1 ? "step" : "steps"}`), (d) => d.slack, true],
     ];
