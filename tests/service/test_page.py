@@ -428,6 +428,28 @@ def test_a_floor_with_robots_that_are_over(server, client, begin, step, browse):
     assert complaints == []
 
 
+def test_each_robots_places_are_drawn_also_where_two_rules_call_another_by_one_name(
+    server, client, begin, browse
+):
+    goal = {"type": "rectangle", "min": [1.5, 0.5], "max": [2.5, 2.5]}
+    away = {"type": "circle", "center": [3.2, 0.6], "radius": 0.2}
+    spec = {"formula": "F[0,8] Goal and G[0,9] not touches(Away)", "regions": {"Goal": goal, "Away": away}}
+    one, two = begin(), begin(policy_id=send_policy(client, spec=spec)["id"], id="second")
+    three = begin(policy_id=two["policy_ids"][0])
+    with browse() as (page, complaints):
+        page.goto(f"{server.url}/#/floor?sessions={one['id']},{two['id']},{three['id']}")
+        page.locator(".walls image").wait_for(state="attached")
+        drawn = page.locator("g.region")
+        assert [each.get_attribute("data-name") for each in drawn.all()] == ["Goal", "Goal (second)", "Away"]
+        assert [each.get_attribute("class") for each in drawn.all()] == [
+            "region visit",
+            "region visit",
+            "region avoid",
+        ]
+        assert drawn.nth(0).locator("circle").count() == drawn.nth(1).locator("polygon").count() == 1
+    assert complaints == []
+
+
 def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step, browse):
     session = begin()
     with browse() as (page, complaints):

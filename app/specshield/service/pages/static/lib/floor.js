@@ -37,6 +37,9 @@ function middle(part) {
   return [0, 1].map((k) => (Math.min(...points.map((p) => p[k])) + Math.max(...points.map((p) => p[k]))) / 2);
 }
 
+/** The region of a name that a rule avoids: `R` of `touches(R)`. */
+export const bare = (name) => name.replace(/^\w+\((.*)\)$/, "$1");
+
 export class Floor {
   /** map: as the API shows it. label: for those who do not see it. */
   constructor(map, label) {
@@ -107,7 +110,7 @@ export class Floor {
 
   /** regions: by name. avoided: names that the rule asks not to hold, `touches(R)` and the like among them. */
   regions(regions, avoided = []) {
-    const bad = new Set(avoided.map((name) => name.replace(/^\w+\((.*)\)$/, "$1")));
+    const bad = new Set(avoided.map(bare));
     const shown = Object.entries(regions).map(([name, region]) => {
       const group = { class: `region ${bad.has(name) ? "avoid" : "visit"}`, "data-name": name };
       return svg("g", group, ...members(region).map((part) => this.shape(part)), this.text(foot(region), name, "foot"));

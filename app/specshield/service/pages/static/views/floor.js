@@ -1,14 +1,15 @@
 // Several robots on one floor: #/floor?sessions=a,b,c
 
 import { ask } from "../lib/api.js";
-import { called, el, onceAFrame, problem, short } from "../lib/dom.js";
-import { Floor } from "../lib/floor.js";
+import { called, el, onceAFrame, percent, problem, short } from "../lib/dom.js";
+import { bare, Floor } from "../lib/floor.js";
 import { follow } from "../lib/live.js";
 import { Mark } from "../lib/mark.js";
 import { passes } from "../lib/patience.js";
 import { Replay } from "./replay.js";
 import { State } from "./state.js";
 
+const JUDGED = 8; // rules of which is asked what they avoid
 const AT_ONCE = 3; // trajectories that are read at once: a browser has six connections to a server
 
 export async function show(place, { query, signal }) {
@@ -28,7 +29,7 @@ export async function show(place, { query, signal }) {
   const robots = sessions.filter((session) => session.map_id === map_id);
   const elsewhere = sessions.filter((session) => session.map_id !== map_id).map(({ id }) => `${id} is on another floor.`);
   const floor = new Floor(map, `Floor with ${robots.length} robots`);
-  floor.regions(Object.assign({}, ...robots.map((session) => session.spec.regions)), await avoided(robots, signal));
+  floor.regions(...(await places(robots, signal)));
   const all = robots.map((session, i) => {
     return { session, items: [], mark: new Mark(floor, session, i), row: row(session, i) };
   });
@@ -99,10 +100,23 @@ async function load(each, signal) {
   each.items = told.items;
 }
 
-async function avoided(robots, signal) {
-  const rules = new Map(robots.map(({ spec, map_id }) => [spec.formula, { ...spec, map_id }]));
-  const told = [...rules.values()].slice(0, 8).map((body) => ask("v1/specs/validate", { json: body, signal }));
-  return (await Promise.allSettled(told)).flatMap(({ value }) => value?.avoided ?? []);
+/** The regions of all rules by name, and the names of those to avoid. A name that another robot's rule has for
+ *  another place already goes with its own robot's. */
+async function places(robots, signal) {
+  const rules = [...Map.groupBy(robots, ({ spec }) => JSON.stringify(spec)).values()].map(([first]) => first);
+  const asked = rules.slice(0, JUDGED).map(({ spec, map_id }) => ask("v1/specs/validate", { json: { ...spec, map_id }, signal }));
+  const told = await Promise.allSettled(asked);
+  const [regions, names, avoided] = [Object.create(null), new Map(), []];
+  rules.forEach(({ id, spec }, i) => {
+    const bad = (told[i]?.value?.avoided ?? []).map(bare);
+    for (const [name, region] of Object.entries(spec.regions)) {
+      const place = JSON.stringify([name, region]);
+      if (!names.has(place)) names.set(place, name in regions ? `${name} (${short(id)})` : name);
+      regions[names.get(place)] = region;
+      if (bad.includes(name)) avoided.push(names.get(place));
+    }
+  });
+  return [regions, avoided];
 }
 
 function row(session, i) {
@@ -125,7 +139,7 @@ function shown({ session, items, mark, row }, t) {
   const mass = decision?.feasible_mass;
   const without = items.some((each) => each?.decision) ? "over" : items.length > 1 ? "not shielded" : "–";
   const status = t >= items.length - 1 ? (decision?.spec_status === "pending" ? session.spec_status : decision?.spec_status ?? session.spec_status) : (decision?.spec_status ?? "pending");
-  const cells = [item.t, decision?.mode ?? without, mass === null || mass === undefined ? "–" : `${(100 * mass).toFixed(0)} %`];
+  const cells = [item.t, decision?.mode ?? without, mass === null || mass === undefined ? "–" : percent(mass)];
   cells.forEach((text, k) => (row.children[k + 1].textContent = text));
   const told = session.erased ? "erased" : status;
   row.children[4].replaceChildren(el("span", { class: `badge ${told}` }, told));
