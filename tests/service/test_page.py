@@ -15,8 +15,8 @@ from specshield.task import POSE_NAMES
 from tests.browsing import needs_chromium
 from tests.houses import HOUSES, needs_houses
 from tests.service.test_switch import CRAWLER, END
-from tests.service.world import ahead, grid_json, send_policy
-from tests.serving import serving
+from tests.service.world import ROBOT, START, ahead, grid_json, send_policy
+from tests.serving import serving, wait_for
 from tests.world.test_procthor import SIZES, house
 
 pytestmark = needs_chromium
@@ -425,6 +425,23 @@ def test_a_floor_with_robots_that_are_over(server, client, begin, step, browse):
         assert seen() == whole
         page.get_by_role("button", name="Closer").click()
         assert seen()[2] < whole[2]
+    assert complaints == []
+
+
+def test_a_floor_that_came_after_the_list_was_opened_is_called_by_its_name(own, browse):
+    sent = grid_json() | {"name": "new-floor"}
+    sent["info"]["resolution"] = 0.12
+    goal = {"type": "circle", "center": [2.0, 1.5], "radius": 0.5}
+    with httpx.Client(base_url=own.url, timeout=None) as client, browse() as (page, complaints):
+        page.goto(own.url)
+        page.get_by_role("heading", name="Robots", exact=True).wait_for()
+        spec = {"formula": "F[0,20] Goal", "regions": {"Goal": goal}}
+        body = {"map_id": client.post("/v1/maps", json=sent).json()["id"], "spec": spec, "robot": ROBOT}
+        path = f"/v1/policies/{client.post('/v1/policies', json=body).json()['id']}"
+        wait_for(lambda: client.get(path).json()["status"] == "ready")
+        begun = {"policy_id": path.split("/")[-1], "initial_pose": START}
+        assert client.post("/v1/sessions", json=begun).status_code == 201
+        page.get_by_role("heading", name="new-floor").wait_for()
     assert complaints == []
 
 

@@ -9,13 +9,16 @@ const EVERY = 2000; // [ms] between two looks at the list
 const MOST = 64; // robots on one picture
 
 export async function show(place, { signal }) {
-  const maps = new Map((await all("v1/maps", { signal })).map((map) => [map.id, map]));
+  const names = new Map(); // of the floors that were seen
   const list = el("div", { class: "stack" });
   let [before, count] = ["", Infinity];
   const look = async (signal) => {
     const sessions = (await all("v1/sessions", { signal })).reverse();
+    const unknown = sessions.filter(({ map_id }) => !names.has(map_id));
+    const maps = unknown.length ? await all("v1/maps", { signal }) : [];
+    for (const { map_id: id } of unknown) names.set(id, called(maps.find((map) => map.id === id) ?? { id })); // it may be deleted
     const now = JSON.stringify(sessions.map(({ expires_at: _, ...rest }) => rest));
-    if (now !== before) paint(list, sessions, maps);
+    if (now !== before) paint(list, sessions, names);
     if (sessions.length > count) say(`${sessions.length} robots`);
     [before, count] = [now, sessions.length];
   };
@@ -24,11 +27,10 @@ export async function show(place, { signal }) {
   again(look, EVERY, place, signal);
 }
 
-function paint(list, sessions, maps) {
+function paint(list, sessions, names) {
   if (!sessions.length) return list.replaceChildren(nobody());
   const floors = [...Map.groupBy(sessions, (session) => session.map_id)];
-  const name = (id) => (maps.has(id) ? called(maps.get(id)) : short(id));
-  keep(list, floors, { key: ([id]) => id, make: ([id]) => floor(name(id)), fill: fillFloor });
+  keep(list, floors, { key: ([id]) => id, make: ([id]) => floor(names.get(id)), fill: fillFloor });
 }
 
 function floor(name) {
