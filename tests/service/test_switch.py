@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -343,3 +344,22 @@ def test_what_the_map_has_learned_goes_on_with_its_age(server, client, begin, st
             assert answer["map_revision"] == [0, 1, 1, 1, 1, 1, 2][t], (clock, t)
         status, said = told(capsys, tmp_path, record_of(client, session), data_dir=server.data_dir)
         assert status == 0, said
+
+
+def test_a_picture_shows_the_present_floor_and_counts_the_session_s_steps(client, begin, step, switch):
+    session, poses = begin(), ahead(6)
+
+    def drawn():
+        picture = client.get(f"/v1/sessions/{session['id']}/image.svg").text
+        return re.findall(r'class="way" points="([^"]*)"', picture)[0].split(), picture
+
+    driven(step, session, poses[:3])
+    assert switch(session, 3, LATER, clock="restart").status_code == 200
+    driven(step, session, poses[3:6], since=3)
+    way, picture = drawn()
+    assert (len(way), "step 5. " in picture, "last step is 11." in picture) == (6, True, True)
+    case1 = {"t": 6, "policy_id": "case1", "poses": [[4.5, 5.0, 0.0]], "clock": "restart"}
+    assert client.post(f"/v1/sessions/{session['id']}/switch", json=case1).status_code == 200
+    assert step(session, 6, [[4.5, 5.0, 0.0]], logits=[0.0] * 20).status_code == 200
+    way, picture = drawn()
+    assert (len(way), "step 6. " in picture, "last step is 146." in picture) == (1, True, True)

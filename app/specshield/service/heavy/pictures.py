@@ -1,7 +1,4 @@
-"""What a child process draws: the floor of a policy, and that of a session.
-
-Every function takes the settings first, and gives an SVG.
-"""
+"""What a child process draws, as SVG: the floor of a policy, and that of a session."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ from specshield.errors import PoseError
 from specshield.policy.notices import may_begin
 from specshield.service.heavy.uploads import policies_of
 from specshield.service.library.policies import Description
-from specshield.service.sessions import record
+from specshield.service.sessions import record, rules
 from specshield.service.settings import Settings
 from specshield.service.storage.keeper import follow_parent
 from specshield.shield.decision import Shield, make_shield
@@ -65,15 +62,14 @@ def draw_policy(settings: Settings, key: str, owner: str) -> tuple[bytes, bool]:
     return plan.svg(), heat is not None
 
 
-def draw_session(settings: Settings, config: dict[str, Any], rows: Floats, last: bytes) -> bytes:
-    """Map, regions, the executed way, and the certified continuation of the last decision.
+def draw_session(settings: Settings, config: dict[str, Any], t: int, rows: Floats, last: bytes) -> bytes:
+    """Map, regions, the way driven on this map, and the certified continuation of the last decision.
 
-    last: the record of the last row, empty where that was not decided.
+    last: the record of step t and of the last row, empty where that was not decided.
     """
-    task = policies_of(settings).task(
-        Description(config["map_id"], config["robot"], config["spec"], "", 0, {})
-    )
-    plan = Plan(task, f"session {config['id']} at step {len(rows) - 1}")
+    about = Description(config["map_id"], config["robot"], config["spec"], "", 0, {})
+    task = policies_of(settings).task(about)
+    plan = Plan(task, f"session {config['id']} at step {t}")
     plan.walls()
     plan.regions()
     decided = record.decode(last) if last else None
@@ -85,8 +81,8 @@ def draw_session(settings: Settings, config: dict[str, Any], rows: Floats, last:
     plan.robot(rows[-1, :3].tolist())
     plan.line(str(task.formula), "ink formula")
     dashed = "" if witness is None else "; dashed: the certified continuation"
-    told = f"{config['id']}, step {len(rows) - 1} of {task.horizon}. The line is the way driven{dashed}."
-    plan.line(told, "faint")
+    plan.line(f"{config['id']}, step {t}. The line is the way driven{dashed}.", "faint")
+    plan.line(f"The rule's last step is {rules.origin(config) + task.horizon}.", "faint")
     return plan.svg()
 
 

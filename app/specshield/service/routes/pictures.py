@@ -56,8 +56,8 @@ async def session(key: SessionKey, request: Request, server: ServerState) -> Res
     """The map, the regions of the rule, the way driven so far, and where the last decision's certified
     continuation leads.
     """
-    config, rows, last = await server.sessions.last(key)
-    return _shown(request, await server.heavy.run(request, "pictures:draw_session", config, rows, last))
+    seen = await server.sessions.last(key)
+    return _shown(request, await server.heavy.run(request, "pictures:draw_session", *seen))
 
 
 def _shown(request: Request, drawn: bytes) -> Response:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import msgspec
@@ -188,15 +189,17 @@ class Sessions:
         found = there(await self._store.dump(id), id)
         return await self._run(chain.pack, found.config, pack(Session.of(found).rows), found.steps)
 
-    async def last(self, id: str) -> tuple[dict[str, Any], Floats, bytes]:
-        """The session's config, its rows, and the record of the last one, empty where that has none, or was
-        decided by another rule than the one in force.
+    async def last(self, id: str) -> tuple[dict[str, Any], int, Floats, bytes]:
+        """The session's config, its last step, its rows since it came to its map, and the record of the last
+        one, empty where that has none, or was decided by another rule than the one in force.
         """
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
         t = len(session.rows) - 1
         decided = rules.begins(session.config) <= t < len(found.steps)
-        return dict(session.config), session.rows, found.steps[t] if decided else b""
+        came = (rules.begins(b) for a, b in pairwise(session.rules) if a["map_id"] != b["map_id"])
+        rows = session.rows[max(came, default=0) :]
+        return dict(session.config), t, rows, found.steps[t] if decided else b""
 
     async def using(self, owner: str, policy_id: str) -> str | None:
         """An owner's session that may still ask this policy, if there is one, archived ones too."""

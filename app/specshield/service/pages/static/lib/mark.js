@@ -26,7 +26,7 @@ export class Mark {
   show(items) {
     const last = items.at(-1);
     if (!last) return;
-    const here = items.filter((item) => sameFloor(this.session, item));
+    const here = items.slice(items.findLastIndex((item) => !sameFloor(this.session, item)) + 1);
     const ahead = here.at(-1) === last && sameRobot(this.session, last) ? continuation(this.robot, last, this.fits) : [];
     this.way.setAttribute("points", this.floor.line(here.map((item) => item.pose)));
     this.next.setAttribute("points", this.floor.line(ahead));
