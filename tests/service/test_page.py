@@ -445,6 +445,24 @@ def test_a_floor_that_came_after_the_list_was_opened_is_called_by_its_name(own, 
     assert complaints == []
 
 
+def test_why_a_start_is_refused_is_told_once_and_in_words(server, client, policy, browse):
+    """The small world's own rule, with a goal that is too far for its window."""
+    goal = {"type": "circle", "center": [3.6, 1.5], "radius": 0.2}
+    spec = {"formula": "F[0,2] Goal and G[0,8] x < 9", "regions": {"Goal": goal}}
+    far = send_policy(client, spec=spec)
+    with browse() as (page, _):
+        page.goto(f"{server.url}/#/try/{far['id']}")
+        page.locator(".walls image").wait_for(state="attached")
+        Floor(page).click(1.0, 1.5)
+        told = page.get_by_text("Set the robot down elsewhere.")
+        told.wait_for()
+        said = told.inner_text()
+    assert said.count("F[0,2] Goal") == 1
+    assert "G[0,8]" not in said
+    assert "allow_infeasible" not in said
+    assert "initial_pose" not in said
+
+
 def test_each_robots_places_are_drawn_also_where_two_rules_call_another_by_one_name(
     server, client, begin, browse
 ):

@@ -60,8 +60,8 @@ export async function show(place, { id, signal }) {
     } catch (error) {
       leave();
       session = null;
-      told.textContent = error.told?.() ?? error.message;
-      for (const { formula, late_by: late } of error.conjuncts ?? []) told.append(` ${formula}${late ? `: ${late} steps late` : ""};`);
+      const refused = error.type === "infeasible-start"; // what it expects, and its parts, are words for a program
+      told.textContent = refused ? `${error.message}. Set the robot down elsewhere.` : (error.told?.() ?? error.message);
     }
     anywhere.disabled = false;
   }
