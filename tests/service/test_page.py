@@ -463,6 +463,15 @@ def test_why_a_start_is_refused_is_told_once_and_in_words(server, client, policy
     assert "initial_pose" not in said
 
 
+def test_a_share_is_called_all_or_none_only_where_it_is(server, browse):
+    written = {0.0: "0.0 %", 4e-4: "<0.1 %", 0.034: "3.4 %", 0.5: "50 %", 0.994: "99 %", 0.9961: "99.6 %"}
+    written |= {0.9998: ">99.9 %", 1.0 - 1e-15: "100 %", 1.0: "100 %"}
+    with browse() as (page, _):
+        page.goto(server.url)
+        script = """async (shares) => shares.map((await import("/page/lib/dom.js")).percent)"""
+        assert page.evaluate(script, list(written)) == list(written.values())
+
+
 def test_each_robots_places_are_drawn_also_where_two_rules_call_another_by_one_name(
     server, client, begin, browse
 ):

@@ -24,8 +24,12 @@ export function say(text) {
 /** An error as the page shows it. */
 export const problem = (error) => el("p", { class: "problem", role: "alert" }, error.told?.() ?? error.message);
 
-export const percent = (share) =>
-  share > 0 && share < 0.001 ? "<0.1 %" : `${(100 * share).toFixed(share > 0.0995 ? 0 : 1)} %`;
+/** A share; 0 % and 100 % are none and all of it, as far as sums of shares are exact. */
+export function percent(share) {
+  if (share > 0 && share < 0.001) return "<0.1 %";
+  if (share >= 0.995 && share < 1 - 1e-9) return share > 0.999 ? ">99.9 %" : `${(100 * share).toFixed(1)} %`;
+  return `${(100 * share).toFixed(share > 0.0995 ? 0 : 1)} %`;
+}
 
 /** A number, in a unit where one is told. */
 export function amount(value, unit = "") {
