@@ -472,6 +472,20 @@ def test_a_share_is_called_all_or_none_only_where_it_is(server, browse):
         assert page.evaluate(script, list(written)) == list(written.values())
 
 
+def test_the_time_line_is_red_for_what_is_avoided_alone(small, browse):
+    with browse() as (page, complaints):
+        page.goto(small)
+        page.locator(".walls image").wait_for(state="attached")
+        draw(page, Floor(page), "Circle", (1.0, 1.0), (1.3, 1.0), "Region1")
+        draw(page, Floor(page), "Circle", (2.0, 1.0), (2.3, 1.0), "Region10")
+        rule = page.get_by_role("textbox", name="Rule")
+        rule.fill("G[0,9] Region10 and G[0,5] not Region1 and G[0,7] not touches(Region1)")
+        page.locator(".timeline li").nth(2).wait_for()
+        bars = [bar.get_attribute("class") for bar in page.locator(".timeline .bar").all()]
+        assert bars == ["bar G", "bar G avoid", "bar G avoid"]
+    assert complaints == []
+
+
 def test_each_robots_places_are_drawn_also_where_two_rules_call_another_by_one_name(
     server, client, begin, browse
 ):
