@@ -67,12 +67,17 @@ def test_an_interrupt_while_a_robots_process_begins_leaves_none_behind(server, m
         begin(pool)
         (id,) = pool._processes
         wait_for(lambda: psutil.Process(id).num_threads() > 1)  # it waits for work: numpy has its threads
-        raise KeyboardInterrupt
+        os.kill(id, signal.SIGINT)  # a terminal interrupts all
+        signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(ProcessPoolExecutor, "_adjust_process_count", begun)
-    before = multiprocessing.active_children()
-    with pytest.raises(KeyboardInterrupt), robots(server.url) as several:
-        run(several, "case1", 1, SEED)
+    before, handler = multiprocessing.active_children(), signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), robots(server.url) as several:
+            run(several, "case1", 1, SEED)
+    finally:
+        signal.signal(signal.SIGINT, handler)
     for left in {*multiprocessing.active_children()}.difference(before):
         left.join(HUNG)
     assert set(multiprocessing.active_children()) <= set(before)
