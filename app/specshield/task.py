@@ -16,6 +16,7 @@ from specshield.arrays import Floats
 from specshield.errors import InputError, MapError, SampleError
 from specshield.robot import Robot, robot_to_json
 from specshield.stl import BODY_WORDS, Formula, body_name, is_name, parse, region_named
+from specshield.world import checks
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Area, Region, area_distance, region_from_json, region_to_json
 
@@ -155,30 +156,28 @@ def names_for(regions: Iterable[str], signals: Iterable[str]) -> list[str]:
 
 def parse_regions(regions: Mapping[str, Any], path: str = "regions") -> dict[str, Region]:
     """Regions by name, from JSON or as they are. path: of the field that they are. Raises MapError."""
-    if len(regions) > MAX_REGIONS:
+    if len(checks.mapping(regions, path)) > MAX_REGIONS:
         raise MapError(f"too many {path}", path=path, got=len(regions), expected=f"at most {MAX_REGIONS}")
     result: dict[str, Region] = {}
     for name, region in regions.items():
         where = f"{path}.{name}"
         _check_name(name, where, MapError)
-        result[name] = region_from_json(region, where) if isinstance(region, dict) else region
+        result[name] = region if isinstance(region, Region) else region_from_json(region, where)
     return result
 
 
 def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dict[str, float]:
     """Signals with their initial values. Raises SampleError with the path of the field."""
+    if not isinstance(signals, Mapping):
+        raise SampleError("not an object", path="signals", got=str(signals)[:80], expected="numbers by name")
     for name, value in signals.items():
-        _check_name(name, f"signals.{name}", SampleError)
+        where = f"signals.{name}"
+        _check_name(name, where, SampleError)
         if name in taken:
-            raise SampleError(
-                "a region has this name", path=f"signals.{name}", got=name, expected="a name of its own"
-            )
+            raise SampleError("a region has this name", path=where, got=name, expected="a name of its own")
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not -LARGEST <= value <= LARGEST:
             raise SampleError(
-                "a signal's initial value has to be a number in range",
-                path=f"signals.{name}",
-                got=value,
-                expected=SIGNAL,
+                "a signal's initial value has to be a number in range", path=where, got=value, expected=SIGNAL
             )
     return {name: float(value) for name, value in signals.items()}
 

@@ -103,3 +103,5 @@ def test_bad_robots_name_the_field(spec, path):
         robot_from_json(spec)
     assert caught.value.path == path
     assert caught.value.expected
+    unit = {"rotate": "radians", "translate": "metres"}.get(str(path).rpartition(".")[2], "")
+    assert str(caught.value.expected).endswith(unit)

@@ -181,10 +181,9 @@ def _action(item: Any, path: str) -> Action:
         raise RobotError(
             "terminal is true or false", path=f"{path}.terminal", got=terminal, expected="a boolean"
         )
-    translate = _number(
-        item.get("translate", 0.0), f"{path}.translate", low=-MAX_TRANSLATE, high=MAX_TRANSLATE
-    )
-    rotate = _number(item.get("rotate", 0.0), f"{path}.rotate", low=-2 * math.pi, high=2 * math.pi)
+    most, turn = MAX_TRANSLATE, 2 * math.pi
+    translate = _number(item.get("translate", 0.0), f"{path}.translate", -most, most)
+    rotate = _number(item.get("rotate", 0.0), f"{path}.rotate", -turn, turn, "radians")
     if terminal and (translate or rotate):
         raise RobotError(
             "a terminal action moves nothing", path=path, got=item, expected="no translate, no rotate"
@@ -205,9 +204,8 @@ def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
         )
 
 
-def _number(value: Any, path: str, low: float, high: float) -> float:
+def _number(value: Any, path: str, low: float, high: float, unit: str = "metres") -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        raise RobotError(
-            "not a number in range", path=path, got=value, expected=f"a number from {low:g} to {high:g}"
-        )
+        expected = f"a number from {low:g} to {high:g} {unit}"
+        raise RobotError("not a number in range", path=path, got=value, expected=expected)
     return float(value)

@@ -45,6 +45,7 @@ from specshield.policy.reachability.walk import FAILED, PHASE_END, SETTLED_ALL, 
 from specshield.policy.tree import Tree, first_slot, make_tree, pop, push, put, trace
 from specshield.policy.undo import IMPOSSIBLE
 from specshield.robot.barred import is_barred
+from specshield.robot.contact import overlap
 from specshield.robot.dynamics import (
     around,
     longest_motions,
@@ -58,6 +59,7 @@ from specshield.robot.dynamics import (
 # Chosen by hand; python -m evaluation worlds says what comes of them.
 POSES = 16_384  # that one search may come to, in some 10 ms
 FEWER = 2_048  # the same, where one decision tries several maps
+INSIDE = 128  # the same, from inside an obstacle or from off the map, where each costs up to 190 us
 ONWARD = 0.3  # [steps] of slack that a step farther on its way is worth
 PLACE_GRAIN = 20.0  # [1/m] places that round to the same multiples of its inverse count once
 HEADING_GRAIN = 60.0 / (2.0 * math.pi)  # [1/rad]
@@ -91,6 +93,8 @@ def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: 
     count, steps = motions.shape
     starts, scratch = begin(guide, past, np.ones(count, np.bool_), motions, poses)
     now, t = starts.now, starts.now.t
+    inside = overlap(guide.body, now.pose[0], now.pose[1], now.pose[2]) >= guide.body.radius
+    most = min(most, INSIDE) if inside else most
     tree = make_tree(most, guide.rules.kind.shape[0])
     way, led = np.empty(steps, np.int64), np.empty((steps, 3))
     copy_progress(now.status, now.run, scratch.status, scratch.run)
