@@ -1,8 +1,8 @@
 """API keys with names. The store holds a hash of each, and what it may use; a key itself is shown once.
 
 They are in one hash of the store, `specshield:keys`, by name; the field "" has another token after each
-change. A server keeps all of them in memory and asks every REFRESH seconds whether they have changed: so a
-request costs no trip to the store, whatever key it shows, and a revoked key is refused that long after.
+change. A server keeps all of them in memory and asks every REFRESH seconds whether they have changed. So a
+request costs no trip to the store, whatever key it shows, and a revoked key works no longer than that.
 """
 
 from __future__ import annotations
