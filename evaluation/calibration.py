@@ -10,6 +10,7 @@ from pathlib import Path
 from evaluation.conformal import conformal_margin
 from evaluation.evaluation import evaluate
 from evaluation.experiment import Experiment
+from specshield.policy.tensors import replace_file
 
 RUNS = 60  # of a calibration campaign; ALPHA asks for 19 at least
 ALPHA = 0.05  # share of the episodes that may hold a surprise larger than the margin
@@ -44,5 +45,5 @@ def calibrated(experiment: Experiment, method: str, folder: Path | None, process
         }
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(found, indent=1) + "\n")
+            replace_file(path, (json.dumps(found, indent=1) + "\n").encode())
     return f"{kind}@{found[name]['rounded']:g}{asked}"

@@ -19,6 +19,7 @@ from evaluation import jobs
 from evaluation.experiment import Experiment
 from evaluation.runs import Record, run
 from specshield.errors import InputError
+from specshield.policy.tensors import replace_file
 from specshield.sim.campaign import each_done
 
 ABOUT = "experiment.json"
@@ -105,11 +106,20 @@ def _open(folder: Path, experiment: Experiment) -> dict[tuple[int, str], Record]
     check(folder, experiment)
     if not about.exists():
         described = {**experiment.to_json(), "made_from": experiment.setting.made_from}
-        about.write_text(json.dumps(described) + "\n")
-    if not written.exists():
-        return {}
-    os.truncate(written, written.read_bytes().rfind(b"\n") + 1)  # a kill may have cut the last line short
-    return {(record.run, record.method): record for record in read(folder)}
+        replace_file(about, (json.dumps(described) + "\n").encode())
+    records = map(Record.from_json, finished(written))
+    return {(record.run, record.method): record for record in records}
+
+
+def finished(file: Path) -> list[Any]:
+    """What the lines of a file hold, as JSON; nothing where there is no file. A last line that a kill has cut
+    short is taken off, so that the next one can be added.
+    """
+    if not file.exists():
+        return []
+    os.truncate(file, file.read_bytes().rfind(b"\n") + 1)
+    with open(file) as lines:
+        return [json.loads(line) for line in lines]
 
 
 def check(folder: Path, experiment: Experiment) -> None:
@@ -138,7 +148,13 @@ def check(folder: Path, experiment: Experiment) -> None:
 
 def read_about(folder: Path) -> tuple[Experiment, dict[str, Any] | None]:
     """The experiment of a folder, and what its records were made from; None if the folder does not say it."""
-    content = json.loads((folder / ABOUT).read_text())
+    try:
+        content = json.loads((folder / ABOUT).read_text())
+    except ValueError:
+        raise InputError(
+            f"{folder / ABOUT} is no description of an experiment", path="out", got=str(folder),
+            expected="a folder that `specshield evaluate --out` has written",
+        ) from None  # fmt: skip
     made_from = content.pop("made_from", None)
     return Experiment.from_json(content), made_from
 

@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from evaluation.evaluation import finished
 from evaluation.experiment import Experiment
 from evaluation.methods import Shielded
 from evaluation.results import markdown
@@ -79,8 +80,7 @@ class Training:
     def records(self, out: Path, runs: int) -> list[Record]:
         """Runs 0 to `runs` - 1 by the paper's decision rule with the network; what `out` holds is kept."""
         file = self.folder(out) / "runs.jsonl"
-        lines = file.read_text().splitlines() if file.exists() else []
-        done = [Record.from_json(json.loads(line)) for line in lines]
+        done = [Record.from_json(each) for each in finished(file)]
         setting, method = Experiment(self.case).setting, Shielded(self.shield(out), carries=False)
         for i in range(len(done), runs):
             done += run_by(setting, i, {"paper": method}, [_keeping(self.case)])

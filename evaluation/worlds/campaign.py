@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from evaluation.evaluation import workers
+from evaluation.evaluation import finished, workers
 from evaluation.statistics import clopper_pearson
 from evaluation.worlds.runs import Outcome, Trial, run
 from specshield.sim.campaign import each_done
@@ -31,10 +31,8 @@ def compare(trials: Sequence[Trial], runs: int, out: Path | None, processes: int
 def outcomes(trial: Trial, runs: int, out: Path | None, processes: int) -> list[Outcome]:
     """Runs 0 to `runs` - 1 of a trial, those that were kept before among them."""
     file = None if out is None else out / f"{'-'.join(_parts(trial))}.jsonl"
-    done: dict[int, Outcome] = {}
-    if file is not None and file.exists():
-        kept = (Outcome(**json.loads(line)) for line in file.read_text().splitlines())
-        done = {outcome.run: outcome for outcome in kept}
+    kept = [] if file is None else [Outcome(**each) for each in finished(file)]
+    done = {outcome.run: outcome for outcome in kept}
     for outcome in _made(trial, [i for i in range(runs) if i not in done], processes):
         done[outcome.run] = outcome
         if file is not None:

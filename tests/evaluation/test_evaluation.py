@@ -110,6 +110,14 @@ def test_a_folder_of_other_records_is_refused_before_anything_is_done(tmp_path):
     assert [path.name for path in tmp_path.rglob("*.json*")] == ["experiment.json"]
 
 
+def test_a_folder_whose_description_is_broken_is_told_in_a_line(tmp_path):
+    kept = tmp_path / "case1" / "none"
+    kept.mkdir(parents=True)
+    (kept / "experiment.json").write_text('{"case": "ca')
+    with pytest.raises(InputError, match=r"experiment\.json is no description of an experiment"):
+        campaigns.evaluate([Experiment("case1")], 1, ["ours"], tmp_path, 1, None, False)
+
+
 @pytest.mark.parametrize("name", ["magic", "magic@conformal", "hcd@conformal/4", "ours@much"])
 def test_a_method_that_is_not_is_told_before_anything_is_done(tmp_path, name):
     with pytest.raises((InputError, NotFound)) as caught:

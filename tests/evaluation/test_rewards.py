@@ -20,7 +20,11 @@ def test_what_was_trained_is_not_trained_again(tmp_path):
     compare(all_of("1", "paper", [0], 2), 1, out, page)
     weights = out / "case1-paper-0-2" / "policy.safetensors"
     written, made = page.read_text(), weights.stat().st_mtime_ns
+    runs = weights.with_name("runs.jsonl")
+    kept = runs.read_text()
+    runs.write_text(kept[:-9])  # killed while it wrote: that run is made again
     compare(all_of("1", "paper", "0", 2), 1, out, page)
+    assert runs.read_text().count("\n") == 1
     assert (page.read_text(), weights.stat().st_mtime_ns) == (written, made)
     (row,) = (line for line in written.splitlines() if line.startswith("| case1 | paper | 0 | 2 |"))
     assert row.count("%") == 4
