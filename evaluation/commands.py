@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from specshield.cores import cores
-from specshield.errors import InputError
+from specshield.errors import InputError, Unsupported
 
 
 def evaluate(
@@ -69,6 +70,8 @@ def mujoco(
     seed: Annotated[int, typer.Option(help="Decides starts, model, draws and wheels.", min=0)] = 0,
 ) -> None:
     """Drive a wheeled base in MuJoCo, of the extra `mujoco`: its residuals, and what is kept."""
+    if find_spec("mujoco") is None:
+        raise Unsupported("this command needs mujoco: pip install -e './evaluation[mujoco]'")
     from evaluation.worlds import physical
 
     typer.echo(physical.report(physical.named_cases(case), runs, seed))

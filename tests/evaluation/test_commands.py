@@ -36,6 +36,17 @@ def test_it_runs_without_being_installed_too():
     assert "one of case1, case2" in refused.stderr
 
 
+def test_without_mujoco_it_is_said_how_to_get_it():
+    hidden = (
+        "import sys; sys.modules['mujoco'] = None; sys.argv = ['evaluation', 'mujoco', '--runs', '1'];"
+        "import runpy; runpy.run_module('evaluation', run_name='__main__')"
+    )
+    refused = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True)
+    assert refused.returncode == 1
+    (line,) = refused.stderr.splitlines()
+    assert "pip install -e './evaluation[mujoco]'" in line
+
+
 def test_evaluate_prints_the_table_keeps_its_results_and_takes_them_up(tmp_path):
     arguments = ["evaluate", "--case", "1", "--runs", "2", "--methods", "unmodified,ours"]
     arguments += ["--processes", "1", "--out", str(tmp_path)]
