@@ -83,7 +83,7 @@ def write_up(folder: Path, page: Path) -> None:
             )
     others = {title: beside / f"{name}.md" for name, title in TITLES.items()}
     others |= {title: page.with_name(f"{name}.md") for name, title in OTHERS.items()}
-    _write(page, summary(parts["cases"], linked(page, others), parts["noise"]))
+    _write(page, summary(parts["cases"], linked(page, others), parts["noise"], parts["tasks"]))
 
 
 def pages_of(results: Results) -> set[str]:

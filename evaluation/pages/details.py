@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation.experiment import CERTIFYING, split
+from evaluation.figures import WAYS
 from evaluation.pages.tables import Found, Results, about, beside_ours, better, summary_table, title
 from evaluation.pages.words import MODELS, NOT_THE_SAME, PAPER, WHY_NEXT_STEP
 from evaluation.results import markdown, share, table
@@ -31,8 +32,9 @@ def one_by_one(found: Found, drawn: Mapping[Path, Sequence[Path]], page: Path) -
     yield models(found)
     yield from better(found)
     yield (
-        "In the pictures of ways, blue runs kept the rule and orange ones did not; what came after the "
-        "rule's horizon is grey."
+        f"In the pictures of ways, which show the first {WAYS} runs, blue runs kept the rule and orange ones "
+        "did not; what came after the rule's horizon is grey. A line is the median of the runs, and the band "
+        "around it the middle 80 %."
     )
     for kept, results in found.items():
         yield f"## {title(results)}"

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from evaluation.pages.tables import Found, Results, better_in_short, title
-from evaluation.pages.words import CAVEATS, HOW, SHORT
+from evaluation.pages.words import CAVEATS, HOW, SHORT, UNDER_NOISE, WITH_200
 from evaluation.results import markdown, share
+from evaluation.statistics import clopper_pearson
 
 FRONT = ("unmodified", "rcd+", "simplex", "rule-first", "paper", "ours", "ours@0/25", "lookahead")
 NOISY = ("ours", "paper", "rule-first", "ours@default", "paper@default")
 
 
-def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found) -> Iterator[str]:
-    """found: the main experiments. elsewhere: other pages, {title: path}. noisy: those of the noise page."""
+def summary(found: Found, elsewhere: Mapping[str, str], noisy: Found, harder: Found) -> Iterator[str]:
+    """found: the main experiments. elsewhere: other pages, {title: path}. noisy, harder: those of the pages
+    of noise and of harder tasks.
+    """
+    gaussian = [each for each in noisy.values() if each["experiment"]["noise"] == "gaussian"]
+    shown = list(found.values()) or gaussian
     yield "# Results"
-    yield HOW
+    if shown:
+        seeds = sorted({each["experiment"]["seed"] for each in shown})
+        runs = sorted({each["runs"] for each in shown})
+        yield HOW.format(seeds=", ".join(map(str, seeds)), runs=" or ".join(map(str, runs)))
     yield SHORT
     for case in dict.fromkeys(results["case"] for results in found.values()):
         yield from _case([results for results in found.values() if results["case"] == case])
-    yield CAVEATS
-    yield _noise([each for each in noisy.values() if each["experiment"]["noise"] == "gaussian"])
+    yield CAVEATS + _with_200(harder, elsewhere) + _under_noise(gaussian)
+    yield _noise(gaussian)
     yield from better_in_short(found)
     yield "## More"
     yield "; ".join(f"[{name}]({path})" for name, path in elsewhere.items()) + "."
@@ -65,6 +74,26 @@ def _figures(one: Mapping[str, Any]) -> list[str]:
 
 def _brief(of: Mapping[str, Any]) -> str:
     return f"{of['count']} ({100 * of['low']:.0f}–{100 * of['high']:.0f} %)"
+
+
+def _with_200(harder: Found, elsewhere: Mapping[str, str]) -> str:
+    """What the limit of 600 steps hides, if the cases were run with one of 200 by all that are compared."""
+    cells = [each for each in harder.values() if re.fullmatch("[^-]+-200", each["case"])]
+    done = {}
+    for method in ("unmodified", "ours", "lookahead"):
+        of = [one["main_done"] for each in cells for one in each["methods"] if one["method"] == method]
+        count, runs = (sum(one[name] for one in of) for name in ("count", "of"))
+        if len(of) < max(len(cells), 1):
+            return ""
+        low, high = clopper_pearson(count, runs)
+        done[method] = share({"count": count, "of": runs, "low": low, "high": high})
+    return WITH_200.format(cells=len(cells), page=elsewhere["Harder main tasks"], **done)
+
+
+def _under_noise(gaussian: Sequence[Results]) -> str:
+    of = [one["satisfied"] for each in gaussian for one in each["methods"] if one["method"] == "ours"]
+    lost = " and ".join(f"{each['of'] - each['count']} of {each['of']}" for each in of)
+    return f"\n{UNDER_NOISE.format(lost=lost)}" if of else ""
 
 
 def _noise(noisy: Sequence[Results]) -> str:

@@ -81,15 +81,15 @@ both did the main task. `uncertainty` is `"none"` and no map is learned, but for
 TIMES = """\
 The p50 and p99 of a decision are over all decisions of all runs, with other work on the machine."""
 HOW = """\
-Written by `specshield report` from what `make results` runs. All methods share starts, model seeds, draws
-and disturbances, run by run (seed 0). The main task is done when the model says `end` within 1 m of its
-target before 600 steps. In the first two tables the robot moves as the shield was told, and each row has 80
-runs of each of two models: in how many the rule was kept, in how many the main task was done, and the means
-of KL and of extra steps. KL: how far the answers were from what the model wanted, in nats, summed over a
-run; 0 is untouched. Extra steps: how much later the model ended than unmodified, over the runs in which
-both did the main task. `uncertainty` is `"none"` and no map is learned, but for **@default**: these are not
-a session's defaults. `ours` and its variants have two policies, reachability and our DQN. In brackets are
-95 % intervals, Clopper-Pearson's of shares, a bootstrap's over runs of means."""
+Written by `specshield report` from what `make results` or `specshield evaluate` has kept. All methods share
+starts, model seeds, draws and disturbances, run by run (seed {seeds}). The main task is done when the model
+says `end` within 1 m of its target before 600 steps. In the tables of the cases the robot moves as the shield
+was told, and each row has {runs} runs of each model: in how many the rule was kept, in how many the main task
+was done, and the means of KL and of extra steps. KL: how far the answers were from what the model wanted, in
+nats, summed over a run; 0 is untouched. Extra steps: how much later the model ended than unmodified, over the
+runs in which both did the main task. `uncertainty` is `"none"` and no map is learned, but for **@default**:
+these are not a session's defaults. `ours` and its variants have two policies, reachability and our DQN. In
+brackets are 95 % intervals, Clopper-Pearson's of shares, a bootstrap's over runs of means."""
 CAVEATS = """\
 What these figures are less than they may sound:
 
@@ -99,13 +99,16 @@ What these figures are less than they may sound:
 - **paper** is the paper's decision rule with our DQN, which learned from another reward than the paper's.
 - Maps were drawn and regions placed so that a robot that only seeks its target breaks the rule.
 - A region holds where the robot's **origin** is in it, as in the paper: the body may reach into Forbidden.
-- The limit of 600 steps is generous. With 200, over both cases and both models (10 runs of each, seed 0), the
-  model alone did its task in 33 of 40 runs (67 to 93 %), under `ours` in 14 (21 to 52 %), and under
-  `lookahead` in 33; the four cells share starts, so these intervals are too narrow
-  ([harder tasks](results/tasks.md)).
+- The limit of 600 steps is generous."""
+WITH_200 = """\
+ With 200, over the runs of {cells} pairs of case and model, the
+  model alone did its task in {unmodified}, under `ours` in {ours}, and under
+  `lookahead` in {lookahead}; the pairs share starts, so these intervals are
+  too narrow ([harder tasks]({page}))."""
+UNDER_NOISE = """\
 - Where each motion ends off by sigma 1 cm along x and y and by sigma 0.5 degrees (next table), `ours`, which
-  has neither margin nor slack, loses the rule in 20 and 22 of 32 runs. **@default** is what a session does
-  where nobody says more."""
+  has neither margin nor slack, loses the rule in {lost} runs. **@default** is what a session
+  does where nobody says more."""
 SHORT = """\
 **unmodified**: the model alone. **rcd+**: our reading of the robust decoding of [SafeDec](related.md),
 which raises logits by the robustness of the next state alone; after the model's `end`, the certified way.
@@ -122,7 +125,7 @@ things are to be found, one after the other. Below 8 pairs of runs no interval i
 NOT_THE_SAME = """\
 The paper's figures are of other models, maps and simulators than these; only the shapes of the rules are the
 same. The cost that the paper reports (99 to 82.5 % of main tasks in case 2) is not reproduced here, where a
-run has 600 steps: `paper` does 80 of 80. With 200 steps there is a cost ([harder tasks](tasks.md))."""
+run has 600 steps. With 200 steps there is a cost ([harder tasks](tasks.md))."""
 WHY_NEXT_STEP = """\
 Next-step methods notice a window at its last step only: when the place to visit is further away than one
 step, no action is left that reaches it in time. HCD keeps a G. What RCD adds to the logits leads straight

@@ -93,6 +93,7 @@ def test_what_the_summary_says_is_in_the_records(tmp_path):
     assert "| gaussian noise, rule kept | ours | paper | rule-first | ours@default | paper@default |" in page
     kept = "5 of 8 (24.5 to 91.5 %) | 8 of 8 (63.1 to 100.0 %) | 8 of 8 (63.1 to 100.0 %)"
     assert f"| case1, learned | {kept} | not run | not run |" in page
+    assert "loses the rule in 3 of 8 runs." in page
     assert (tmp_path / "results" / "learned" / "case1" / "ways.png").is_file()
     assert "](results/cases.md)" in page
     assert "](results/noise.md)" in page
@@ -105,6 +106,32 @@ def test_what_the_summary_says_is_in_the_records(tmp_path):
     assert "| case1, learned | unmodified | 0 % | 93.5 % | 8 of 8" in cases
     assert "KL a run 9.0 and 4.0, difference +5.0 (+5.0 to +5.0), n 8, ratio 2.25 (2.25 to 2.25)" in cases
     assert "](learned/case1/ways.png)" in cases
+
+
+def test_the_summary_says_of_how_many_runs_it_is_and_nothing_of_runs_that_were_not_made(tmp_path):
+    """Its words once told the figures of one campaign, whatever it was written from."""
+    asked = [Experiment("case1", seed=5), Experiment("case1-200", seed=5)]
+    for each in asked:
+        kept = tmp_path / "out" / each.case / each.noise
+        kept.mkdir(parents=True)
+        (kept / "experiment.json").write_text(json.dumps(each.to_json()))
+        records = [
+            record(i, method, main_done=i != 1 or method != "ours")
+            for method in ("unmodified", "ours", "lookahead")
+            for i in range(3)
+        ]
+        (kept / "runs.jsonl").write_text("".join(json.dumps(one.to_json()) + "\n" for one in records))
+        writeup.write_up(tmp_path / "out", tmp_path / "mine.md")
+        page = (tmp_path / "mine.md").read_text()
+        assert "run by run (seed 5)" in page
+        assert "each row has 3 runs of each model" in page
+        assert "loses the rule in" not in page
+        assert ("With 200" in page) == (each.case == "case1-200")
+    assert "in 3 of 3 (29.2 to 100.0 %), under `ours` in 2 of 3 (9.4 to 99.2 %)" in page
+    assert "[harder tasks](mine/tasks.md)" in page
+    cases = (tmp_path / "mine" / "cases.md").read_text()
+    assert "80 of 80" not in cases
+    assert "A line is the median of the runs, and the band around it the middle 80 %." in cases
 
 
 def test_bodies_are_measured_by_the_distance_of_the_footprint(tmp_path):
