@@ -24,10 +24,10 @@ INTRODUCTION = """\
 
 Written by `python -m evaluation curves`. Every row is of {runs} runs of `ours`, reachability and the DQN
 together, seed {seed}; the rows of a case and a model share starts, model seeds and draws. The robot moves
-as the shield was told, and `uncertainty` is `"none"`. The starts are those from which the rule can be kept.
-`unmodified` is the model alone, which stands still after its `end`. With a threshold, the robot completes
-the rule after the model's `end`, as Algorithm 1 says. A threshold of 0 would be `unmodified` with that
-completion.
+as the shield was told, and `uncertainty` is `"none"`. The starts are those from which
+the DQN alone finds a way to keep the rule, and both together do. `unmodified` is the model alone, which
+stands still after its `end`. With a threshold, the robot completes the rule after the model's `end`, as
+Algorithm 1 says. A threshold of 0 would be `unmodified` with that completion.
 
 - **step**: E[J] >= threshold at each step, J binary, as the paper has it (`threshold`).
 - **episode**: the same over the whole episode (`threshold_over: "episode"`).

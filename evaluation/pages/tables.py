@@ -160,7 +160,8 @@ def about(results: Results) -> str:
     return (
         f'`{results["formula"]}`, model {asked["model"]} ("{results["instruction"]}"), '
         f"{results['runs']} runs, seed {asked['seed']}; {results['refused_starts']} more starts were drawn "
-        "and refused, because no future that keeps the rule was found from there."
+        "and refused, because `ours`, or the network alone where a case has one, found no future from there "
+        "that keeps the rule."
     )
 
 

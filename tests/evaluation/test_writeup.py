@@ -42,6 +42,7 @@ def test_methods_of_other_runs_are_compared_over_those_in_common(tmp_path):
     assert "- ours: main task -50.0 points below unmodified.\n" in page
     assert "main task +50.0 points below unmodified over the 2 runs that both have.\n" in page
     assert "unmodified does its task in 5 of 6 runs." in page
+    assert "0 more starts were drawn and refused, because `ours`, or the network alone where" in page
     found = {one["method"]: one for one in json.loads((folder / "results.json").read_text())["methods"]}
     assert (found["ours"]["extra_steps"]["both"], found["ours"]["extra_steps"]["mean"]) == (1, 5.0)
     assert (found["simplex"]["extra_steps"]["both"], found["simplex"]["extra_steps"]["mean"]) == (1, 6.0)
