@@ -83,14 +83,13 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
     name of one that it has.
     """
     path = Path(map)
-    a_file = path.suffix or path.is_file()
-    content = _read(path, "--map") if a_file else {}
-    if assets is not None and "rooms" not in content:
-        raise InputError(
-            "only a ProcTHOR house has furniture", path="--assets", got=str(assets), expected="no --assets"
-        )
-    if not a_file:
+    content = _read(path, "--map") if path.suffix or path.is_file() else None
+    if assets is not None and "rooms" not in (content or {}):
+        raise InputError("only a ProcTHOR house has furniture", path="--assets", expected="no --assets")
+    if content is None:
         return lambda client: client.maps.get(map)
+    if "format" in content:
+        return lambda client: client.maps.create(**{str(name): value for name, value in content.items()})
     if "image" in content:
         image = path.parent / Path(str(content["image"])).name
         if not image.is_file():
@@ -109,7 +108,8 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
         f"{path} is no map of a known form",
         path="--map",
         got=sorted(content)[:8],
-        expected="a ROS map's YAML beside its image, a ProcTHOR house, or a nav_msgs/OccupancyGrid",
+        expected="a ROS map's YAML beside its image, a ProcTHOR house, a nav_msgs/OccupancyGrid, or an "
+        "object with its `format`",
     )
 
 
