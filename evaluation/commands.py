@@ -78,7 +78,7 @@ def mujoco(
 
 
 def worlds(
-    case: Annotated[str, typer.Option(help="Some of case1, case2, drawn_0, drawn_1, ...")] = "case1",
+    case: Annotated[str, typer.Option(help="Cases, as 1 or case1; drawn_N; a house's JSON file.")] = "case1",
     world: Annotated[
         str, typer.Option(help="Some of told, obstacle, shift, collider, person.")
     ] = "obstacle,shift,collider,person",
@@ -95,13 +95,17 @@ def worlds(
     """Measure what a session keeps in worlds that are not as it was told, beside an oracle that was."""
     from evaluation.worlds.campaign import compare
     from evaluation.worlds.robots import ROBOTS
-    from evaluation.worlds.runs import SENSING, Trial
+    from evaluation.worlds.runs import SENSING, Trial, known
     from evaluation.worlds.world import WORLDS
+    from specshield.sim.cases import case_name
 
+    cases = [case_name(each) for each in case.split(",")]
+    for each in cases:
+        known(each)  # or the last of them would be told to be none after hours
     trials = [
         Trial(each, name, senses, seed, slack < 0, max(slack, 0), robot=body)
         for body in _some(robot, ROBOTS, "--robot")
-        for each in case.split(",")
+        for each in cases
         for name in _some(world, WORLDS, "--world")
         for senses in _some(sensing, SENSING, "--sensing")
     ]

@@ -40,7 +40,9 @@ TO_FIND = "remote"  # in a drawn house: it lies beside a sofa, in none of NAMED
 
 def located(house: str | None, folder: Path | None) -> str | None:
     """A house as experiments name it: drawn_N, or the path of its JSON file in `folder`."""
-    return house if house is None or folder is None else str(folder / f"{house}.json")
+    if house is None or folder is None or DRAWN.fullmatch(house):
+        return house
+    return str(folder / f"{house}.json")
 
 
 def houses_in(folder: Path) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from evaluation.disturbance import believed
-from evaluation.houses import load_house_case
+from evaluation.houses import DRAWN, load_house_case
 from evaluation.models import named
 from evaluation.worlds.oracle import Make, can_keep
 from evaluation.worlds.robots import ROBOTS
@@ -23,7 +23,7 @@ from specshield.service.warmup import PARTS, warm_up
 from specshield.shield.decision import Carry, Config
 from specshield.shield.episode import Shield, decide, make_shield, start
 from specshield.shield.uncertainty import Uncertainty
-from specshield.sim.cases import Case, case_names, load_case
+from specshield.sim.cases import Case, load_case
 from specshield.sim.robot import Pose, SimulatedRobot
 from specshield.stl import SATISFIED_ABOVE, conjuncts, robustness
 
@@ -81,12 +81,18 @@ class Outcome:
         return asdict(self)
 
 
+def known(case: str) -> Case:
+    """A case by its name, or a house as in evaluation/houses.py. Raises NotFound where there is none."""
+    house = DRAWN.fullmatch(case) or case.endswith(".json")
+    return load_house_case(case) if house else load_case(case)
+
+
 @lru_cache(maxsize=4)
 def prepared(case: str, collider: bool, robot: str) -> tuple[Case, Shield]:
     """A case, and the shield as it is told, with the paper's settings; kernels are loaded, as in a server."""
     for part in PARTS:
         warm_up(part)
-    found = load_case(case) if case in case_names() else load_house_case(case)
+    found = known(case)
     found = replace(found, task=replace(found.task, robot=ROBOTS[robot]))
     task = believed("collider" if collider else "none", found.task)
     return found, make_shield([synthesise(task)])

@@ -103,6 +103,15 @@ def test_a_mistake_is_told_in_a_line(arguments, said):
     assert said in line
 
 
+def test_a_case_that_is_not_is_told_before_worlds_are_run(tmp_path):
+    """It came after the runs of the cases before it; and 1 was no name of case1, as it is elsewhere."""
+    asked = ("--case", "1,9", "--world", "told", "--sensing", "none", "--runs", "1", "--processes", "1")
+    refused = specshield("worlds", *asked, "--out", str(tmp_path), code=1)
+    assert not refused.stdout
+    (line,) = refused.stderr.splitlines()
+    assert line.startswith("there is no case 'case9'")
+
+
 @pytest.mark.parametrize(
     ("command", "option", "given"),
     [

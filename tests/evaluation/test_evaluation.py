@@ -305,6 +305,7 @@ def test_a_procthor_house_comes_from_a_folder_of_the_users(tmp_path):
     with pytest.raises(NotFound):
         load_house_case(located("row", tmp_path))  # asset-sizes.json is missing
     (tmp_path / "asset-sizes.json").write_text("{}")
+    assert located("drawn_0", tmp_path) == "drawn_0"
     case = Experiment("house", located("row", tmp_path)).setting.case
     assert (case.name, list(case.rooms)) == ("row", ["Kitchen", "LivingRoom", "Bedroom", "Bathroom"])
     assert 6.0 < case.target[0] < 12.0  # in the room that the rule does not name
