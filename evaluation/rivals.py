@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from evaluation.houses import DRAWN
 from evaluation.pages.tables import difference
 from evaluation.results import markdown, share
 from evaluation.runs import Record
-from evaluation.statistics import clopper_pearson, compared, mean_of
+from evaluation.statistics import NOTHING, clopper_pearson, compared, mean_of
 
 FAMILIES = ("bot", "goal-seeker", "jumper", "learned", "rover", "unsteered")
 SLACKS = ("ours", "ours@0/25", "proportional@0/25", "adaptive@0/25")  # ours: a slack of 0, projection alone
@@ -93,25 +94,32 @@ def verdict(found: Found, limit: int) -> list[str]:
     """The rule's three parts, each with its figure, and how much each method costs beside projection."""
     kl, steps = _sums(found, "KL", limit), _sums(found, "steps", limit)
     best_kl, best_steps = min(SLACKS, key=kl.__getitem__), min(SLACKS, key=steps.__getitem__)
-    ratio = kl["lookahead"] / kl[best_kl]
     alone = [pair for each in found.values() for pair in _pairs(each, "lookahead") if pair[1] < HARDLY]
     within = sum(mine <= other + ADDED for mine, other in alone)
     said = _share(within, len(alone))
+    why = "; it could not be otherwise, since look-ahead begins once the rule has cost 1 nat" if alone else ""
     beside = compared([pair for each in found.values() for pair in _pairs(each, "lookahead", best_kl)])
     later = compared(
         [pair for each in found.values() for pair in _pairs(each, "lookahead", best_steps, "steps", limit)]
     )
     parts = [
-        f"- KL in sum: look-ahead's is {ratio:.2f} ({beside['low']:.2f} to {beside['high']:.2f}) of the "
-        f"best slack's, `{best_kl}`; at most {KL_SHARE:g} is asked: {_met(ratio <= KL_SHARE)}.",
-        f"- Steps in sum: look-ahead's are {steps['lookahead'] / steps[best_steps]:.2f} "
-        f"({later['low']:.2f} to {later['high']:.2f}) of those of the best slack, "
+        f"- KL in sum: look-ahead's is {_ratio(kl, best_kl, beside)} of the "
+        f"best slack's, `{best_kl}`; at most {KL_SHARE:g} is asked: "
+        f"{_met(kl['lookahead'] <= KL_SHARE * kl[best_kl] + NOTHING)}.",
+        f"- Steps in sum: look-ahead's are {_ratio(steps, best_steps, later)} of those of the best slack, "
         f"`{best_steps}`; at most 1 is asked: {_met(steps['lookahead'] <= steps[best_steps])}.",
         f"- Single runs in which projection's KL is below {HARDLY:g}: look-ahead's is at most {ADDED:g} nat "
-        f"more in {said}; {100 * SINGLE:g} % is asked: {_met(within >= SINGLE * len(alone) > 0)}; it could "
-        "not be otherwise, since look-ahead begins once the rule has cost 1 nat.",
+        f"more in {said}; {100 * SINGLE:g} % is asked: {_met(within >= SINGLE * len(alone) > 0)}{why}.",
     ]
     return ["## What was asked of look-ahead before these runs", "\n".join(parts)]
+
+
+def _ratio(sums: Mapping[str, float], best: str, beside: Mapping[str, Any]) -> str:
+    """Look-ahead's sum as a share of another's, with its interval as far as there is one."""
+    if sums[best] <= NOTHING:
+        return f"{sums['lookahead']:.2f} beside the {sums[best]:.2f}"
+    within = "not bounded" if beside["low"] is None else f"{beside['low']:.2f} to {beside['high']:.2f}"
+    return f"{sums['lookahead'] / sums[best]:.2f} ({within})"
 
 
 def _met(so: bool) -> str:

@@ -34,6 +34,18 @@ def test_each_part_of_the_rule_is_judged_by_itself(kl, ended_at, met):
     assert tuple("**not met**" in part for part in parts) == tuple(not each for each in met)
 
 
+def test_a_rule_that_costs_hardly_anything_is_judged_without_a_ratio():
+    """As in some houses. It ended in a traceback, after all runs were made."""
+    free = dict.fromkeys(METHODS, 0.0)
+    _, said = verdict(found(free, {}), 600)
+    assert "look-ahead's is 0.00 beside the 0.00 of the best slack's" in said
+    one = found(free, {})
+    for method in METHODS:
+        one["bot", "case1"].append(record(20, method, kl=8.0, ended_at=100))
+    _, said = verdict(one, 600)
+    assert "look-ahead's is 1.00 (not bounded) of the best slack's" in said
+
+
 def test_sums_weigh_models_and_cases_alike():
     both = found({"ours": 4.0}, {"ours": 30}) | {
         ("rover", "case2"): found({"ours": 6.0}, {}, 40)["bot", "case1"]
