@@ -157,9 +157,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     known = {} if asked.write and not FILE.exists() else json.loads(FILE.read_text())
     found, every, differ = dict(known), {}, 0
-    for setting in settings():
-        if asked.only not in setting.name:
-            continue
+    chosen = [setting for setting in settings() if asked.only in setting.name]
+    if not chosen:
+        parser.error(f"no setting has {asked.only!r} in its name")
+    for setting in chosen:
         made = of_setting(setting, asked.seed)
         every[setting.name] = made.pop("steps")
         found[setting.name] = made

@@ -88,6 +88,10 @@ def worlds(data: Path) -> Iterator[World]:
 
 def main() -> None:
     data = Path(sys.argv[1]) if len(sys.argv) > 1 else DATA
+    if not (data / "houses" / "asset-sizes.json").is_file():
+        sys.exit(
+            f"{data} has no houses/asset-sizes.json; evaluation/houses.py says how to get ProcTHOR houses"
+        )
     print("| map | size [m] | formula | time [s] | peak memory [MB] | on disk [MB] ", end="")
     print("| loaded [ms] | feasible starts |")
     print("|---|---|---|---|---|---|---|---|")

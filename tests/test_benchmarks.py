@@ -108,3 +108,17 @@ def test_what_metrics_and_log_cost_a_step_is_measured_on_a_decision():
     command = [sys.executable, "-m", "benchmarks.watch"]
     printed = subprocess.run(command, capture_output=True, text=True, timeout=600, check=True).stdout
     assert len(re.findall(r"^  metrics\.decided +\d+\.\d$", printed, re.MULTILINE)) == 2
+
+
+def test_what_there_is_not_to_measure_is_told_in_a_line(tmp_path):
+    """Decisions that were never made passed for the same; and houses that are not there were a traceback."""
+    for module, asked, said in (
+        ("digests", "--only=planer", "no setting has 'planer' in its name"),
+        ("houses", str(tmp_path), "evaluation/houses.py says how to get ProcTHOR houses"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", f"benchmarks.{module}", asked], capture_output=True, text=True
+        )
+        assert done.returncode != 0
+        assert said in done.stderr.splitlines()[-1]
+        assert "Traceback" not in done.stderr
