@@ -133,7 +133,10 @@ def results(
     from evaluation.plan import carry_out
 
     kinds = _some(only, ("cases", "noise", "bodies", "houses", "models", "tasks"), "--only") if only else []
-    failed = carry_out(out, page, houses_in(houses), kinds, share, processes or cores())
+    found = houses_in(houses)
+    if not found and (not kinds or "houses" in kinds):
+        typer.echo(f"no ProcTHOR houses are in {houses}: they are left out", err=True)
+    failed = carry_out(out, page, found, kinds, share, processes or cores())
     raise typer.Exit(1 if failed else 0)
 
 

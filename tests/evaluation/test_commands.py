@@ -6,8 +6,9 @@ import sys
 from importlib.metadata import entry_points
 
 import pytest
+import typer
 
-from evaluation import commands, jobs
+from evaluation import commands, jobs, plan
 from tests.serving import run_specshield
 
 
@@ -110,6 +111,15 @@ def test_a_case_that_is_not_is_told_before_worlds_are_run(tmp_path):
     assert not refused.stdout
     (line,) = refused.stderr.splitlines()
     assert line.startswith("there is no case 'case9'")
+
+
+def test_results_say_that_there_are_no_houses(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "carry_out", lambda *_: 0)
+    for only, said in (("", True), ("houses", True), ("cases", False)):
+        with pytest.raises(typer.Exit):
+            commands.results(tmp_path, tmp_path / "page.md", tmp_path / "typo", only, 1.0, 1)
+        told = f"no ProcTHOR houses are in {tmp_path / 'typo'}: they are left out\n"
+        assert capsys.readouterr().err == told * said
 
 
 @pytest.mark.parametrize(
