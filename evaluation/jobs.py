@@ -16,7 +16,7 @@ from rq.job import Job, JobStatus
 from rq.serializers import JSONSerializer
 
 from specshield.errors import SpecshieldError, StoreError
-from specshield.sim.service import follow_parent
+from specshield.service.storage.keeper import follow_parent
 
 if TYPE_CHECKING:  # while a worker waits for jobs it loads none of the core
     from evaluation.experiment import Experiment

@@ -32,15 +32,12 @@ class Streams:
     def close_at_stop(self) -> None:
         """Closes them as soon as the server is told to stop. To be called in the server's event loop."""
         loop = asyncio.get_running_loop()
-        for name in (signal.SIGTERM, signal.SIGINT) if _has_signals() else ():
-            stop = signal.getsignal(name)
 
-            def told(signum: int, frame: Any, stop: Any = stop) -> None:
-                loop.call_soon_threadsafe(self.close)
-                if callable(stop):
-                    stop(signum, frame)
+        def told(stop: Callable[[], object]) -> None:
+            loop.call_soon_threadsafe(self.close)
+            stop()
 
-            signal.signal(name, told)  # uvicorn puts its caller's handlers back at the end
+        _tell(told, signal.SIGTERM, signal.SIGINT)
 
 
 def drain_at_sigterm(startup: Startup, seconds: float) -> None:
@@ -48,19 +45,16 @@ def drain_at_sigterm(startup: Startup, seconds: float) -> None:
 
     A second SIGTERM, or SIGINT, stops it at once. To be called in the server's event loop.
     """
-    if not _has_signals():
-        return
-    loop, stop = asyncio.get_running_loop(), signal.getsignal(signal.SIGTERM)
+    loop = asyncio.get_running_loop()
 
-    def told(signum: int, frame: Any) -> None:
+    def told(stop: Callable[[], object]) -> None:
         again, startup.stopping = startup.stopping, True
-        if callable(stop):
-            if again or seconds <= 0:
-                stop(signum, frame)
-            else:
-                loop.call_soon_threadsafe(loop.call_later, seconds, stop, signum, frame)
+        if again or seconds <= 0:
+            stop()
+        else:
+            loop.call_soon_threadsafe(loop.call_later, seconds, stop)
 
-    signal.signal(signal.SIGTERM, told)  # uvicorn puts its caller's handler back at the end
+    _tell(told, signal.SIGTERM)
 
 
 def notice_killed() -> None:
@@ -78,6 +72,10 @@ def notice_killed() -> None:
     Process.start = start_and_close  # type: ignore[assignment, method-assign]
 
 
-def _has_signals() -> bool:
-    """False for a server inside another program, which has signals of its own."""
-    return threading.current_thread() is threading.main_thread()
+def _tell(told: Callable[[Callable[[], object]], None], *numbers: signal.Signals) -> None:
+    """Has `told` called for these signals, with what one did before; uvicorn puts its caller's handlers back
+    at the end. Not for a server inside another program, which has signals of its own.
+    """
+    for number in numbers if threading.current_thread() is threading.main_thread() else ():
+        stop: Any = signal.getsignal(number)
+        signal.signal(number, lambda *about, stop=stop: told(lambda: callable(stop) and stop(*about)))

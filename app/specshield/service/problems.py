@@ -143,10 +143,11 @@ class ProblemResponse(Response):
         await super().__call__(scope, receive, send)
 
 
-def tell(scope: Scope, error: SpecshieldError) -> None:
-    """A line of the log for what is this server's fault, or its store's."""
+def tell(scope: Scope, error: SpecshieldError) -> Response:
+    """The answer, and a line of the log for what is this server's fault, or its store's."""
     if status_of(error) >= 500 and not isinstance(error, errors.Starting | errors.Stopping):
         log.warning("%s %s: %s", scope.get("method", "WEBSOCKET"), scope["path"], error.message)
+    return response(error)
 
 
 def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = "") -> InputError:
@@ -247,8 +248,7 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(SpecshieldError)
     async def known(request: Request, error: SpecshieldError) -> Response:
-        tell(request.scope, error)
-        return response(error)
+        return tell(request.scope, error)
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:

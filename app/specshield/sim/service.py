@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -17,6 +15,7 @@ from pathlib import Path
 import httpx
 
 from specshield.errors import ServerError
+from specshield.service.storage.keeper import follow_parent
 
 
 @contextmanager
@@ -55,12 +54,6 @@ def own_server(
             except subprocess.TimeoutExpired:
                 server.kill()
                 server.wait()
-
-
-def follow_parent() -> None:
-    """Linux: a process that calls this as it begins is told to stop if the one that started it is killed."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _environment(data: Path, worker: bool, key: str | None) -> dict[str, str]:

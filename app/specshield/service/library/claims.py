@@ -139,12 +139,9 @@ class Claims:
         for owner in reached(lambda: self._store().smembers(_key("owners", kind, id))):
             self._run("weigh", kind, id, owner.decode(), "", size)
 
-    def shared(self, kind: str, id: str) -> bool:
-        """Whether several owners hold it."""
-        return bool(reached(lambda: self._store().scard(_key("owners", kind, id))) > 1)
-
-    def unowned(self, kind: str, id: str) -> bool:
-        return not reached(lambda: self._store().exists(_key("owners", kind, id)))
+    def owners(self, kind: str, id: str) -> int:
+        """How many hold it."""
+        return int(reached(lambda: self._store().scard(_key("owners", kind, id))))
 
     def _give_back(self, kind: str, id: str, owner: str, map_id: str) -> None:
         token = secrets.token_hex(8)
@@ -184,7 +181,7 @@ class Claimed:
     def adopt(self) -> None:
         """Gives what nobody has, of a time before owners, to the owner without a name."""
         for id in files.ids(self._folder):
-            if self.claims.unowned(self._kind, id):
+            if not self.claims.owners(self._kind, id):
                 size = files.weight_of(self._folder / id)
                 with self.claims.adding(self._kind, id, OPEN, size, self._map_of(id)):
                     pass

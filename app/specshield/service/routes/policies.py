@@ -167,10 +167,8 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
     if record.name is not None:
         raise undeletable("policy", record.name, policy_id)
     claims, token = server.policies.claims, secrets.token_hex(8)
-    training = await asyncio.to_thread(_training, server, record)
-    if training.status in ("queued", "training") and not await asyncio.to_thread(
-        claims.shared, "policies", record.id
-    ):
+    making = (await asyncio.to_thread(_training, server, record)).status in ("queued", "training")
+    if making and await asyncio.to_thread(claims.owners, "policies", record.id) < 2:
         await asyncio.to_thread(server.jobs.cancel, record.id)
         return Response(status_code=204)
     await asyncio.to_thread(claims.mark, "policies", record.id, owner, token)

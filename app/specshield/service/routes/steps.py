@@ -47,8 +47,7 @@ class StepRoute:
             key = scoped(scope["state"]["owner"], found[1])
             answer = await server.sessions.steps.decide(key, request, scope["state"]["timing"])
         except SpecshieldError as error:
-            problems.tell(scope, error)
-            await problems.response(error)(scope, receive, send)
+            await problems.tell(scope, error)(scope, receive, send)
             return
         packed = accepts(headers.get(b"accept", b"").decode("latin-1"), MSGPACK)
         content = to_msgpack(answer) if packed else to_json(answer)

@@ -52,8 +52,7 @@ class StreamRoute:
         try:
             await server.sessions.read(key)
         except SpecshieldError as error:
-            problems.tell(scope, error)
-            await problems.response(error)(scope, receive, send)
+            await problems.tell(scope, error)(scope, receive, send)
             return
         stream = _Stream(server, key, scope, send)
         server.streams.open.add(stream.stop)

@@ -41,14 +41,12 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
     failed the worker for good.
     """
     logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
-    held = tuple[int, ...]()
-    if settings.redis_url is None:
+    url, held = settings.redis_url, tuple[int, ...]()
+    if url is None:
         embedded = EmbeddedStore(settings.data_dir)
         embedded.join()
-        held = embedded.held
-        os.environ["REDIS_URL"] = embedded.url  # for the runs
-    url = os.environ.get("REDIS_URL") or str(settings.redis_url)
-    os.environ["REDIS_URL"] = url  # for the second process, too
+        url, held = embedded.url, embedded.held
+    os.environ["REDIS_URL"] = url  # for the runs, and for the second process
     with suppress(StoreError):  # rq tells of a store that is away
         check_files(url, settings.files_at, settings.store_timeout)
     jobs = Jobs(url, settings)

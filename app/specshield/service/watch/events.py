@@ -144,7 +144,7 @@ class Watchers:
                     told += [each.whole for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
-                        told.append(feed.last_of_several())
+                        told.append(feed.last(session=shown(feed.id)))
                         del places[feed]
                 if told or time.monotonic() - told_at > HEARTBEAT:
                     told_at = time.monotonic()
@@ -188,7 +188,7 @@ class Watchers:
                 if t < feed.end:
                     continue
                 if feed.over:
-                    yield feed.last_event()
+                    yield b"event: end\n" + feed.last()
                     return
                 try:
                     await asyncio.wait_for(changed.wait(), HEARTBEAT)

@@ -148,13 +148,9 @@ class Feed:
         """Whether the session has had a switch that this does not know of; its rows may be wider since."""
         return len(State.of(new.state).verdicts) >= len(self.rules)
 
-    def last_event(self) -> bytes:
-        told = {"next_t": self.end, "spec_status": self.status, "finished": True}
-        return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
-
-    def last_of_several(self) -> bytes:
-        """In a stream of several sessions."""
-        told = {"session": shown(self.id), "next_t": self.end, "spec_status": self.status, "finished": True}
+    def last(self, **of: str) -> bytes:
+        """The data of the last event. of: in a stream of several sessions, which one."""
+        told = {**of, "next_t": self.end, "spec_status": self.status, "finished": True}
         return b"data: %s\n\n" % json.dumps(told).encode()
 
 
