@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import random
+import shutil
 import subprocess
 import sys
 import threading
@@ -19,10 +20,12 @@ import pytest
 import redis
 
 from specshield.errors import SessionExists, StoreError
+from specshield.service.sessions.mover import Mover
+from specshield.service.settings import Settings
 from specshield.service.storage.archive import Archive, Entry
 from specshield.service.storage.archiving import ArchivingStore
 from specshield.service.storage.embedded import EmbeddedStore
-from specshield.service.storage.objects import open_objects
+from specshield.service.storage.objects import left_out, open_objects
 from specshield.service.storage.store import Change, Dump
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
 from tests.serving import HUNG, serving, wait_for
@@ -343,6 +346,54 @@ def test_a_damaged_file_is_said_to_be_one(url, tmp_path):
         file.write_bytes(whole)
         (file.parent / "notes.txt").write_text("not ours")
         assert len((await store.dump("robot")).steps) == 3
+
+    run(url, archive, story)
+
+
+def test_a_file_that_is_not_whole_or_not_ours_is_left_out_of_lists_and_named_once(url, tmp_path, caplog):
+    archive = Archive(open_objects(str(tmp_path)))
+
+    async def story(store):
+        for id in ("ann@broken", "ann@whole"):
+            await begin(store, id, 3)
+            await move(store, id)
+        (file,) = (tmp_path / "ann@" / "broken").rglob("*,*")
+        whole = file.read_bytes()
+        loop = tmp_path / "ann@" / "loop" / "loop" / file.name
+        loop.parent.mkdir(parents=True)
+        loop.symlink_to(loop)
+        for broken in (b"", whole[:30], b"?" * 100, whole[:40] + b"?" + whole[41:]):
+            file.write_bytes(broken)
+            caplog.clear()
+            left_out.cache_clear()
+            for _ in range(2):
+                page, _ = await store.everything("ann@", None, 10)
+                assert [config for config, _ in page] == [b"config of ann@whole"]
+            assert [file.name in line for line in caplog.messages] == [True]
+            with pytest.raises(StoreError, match=file.name):
+                await store.dump("ann@broken")
+        assert await store.delete("ann@broken")
+
+    run(url, archive, story)
+
+
+def test_links_and_copies_among_the_files_keep_no_sweep_from_its_end(url, tmp_path, caplog):
+    archive = Archive(open_objects(str(tmp_path)))
+    left_out.cache_clear()
+
+    async def story(store):
+        await begin(store, "ann@robot", 3)
+        dump = await move(store, "ann@robot")
+        (tmp_path / "loop").symlink_to("loop")
+        (tmp_path / "ann@" / "up").symlink_to("..")
+        shutil.copytree(tmp_path / "ann@" / "robot", tmp_path / "ann@" / "robot.bak")
+        mover = Mover(store, Settings())
+        for _ in range(2):
+            assert await mover.sweep() == sum(size for _, size in archive.sizes())
+        assert len(list(archive.sizes())) == 1
+        assert await store.dump("ann@robot") == dump
+        for name, told in zip(["ann@/up", "loop"], caplog.messages, strict=True):
+            assert str(tmp_path / name) in told
 
     run(url, archive, story)
 

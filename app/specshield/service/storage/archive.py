@@ -19,7 +19,7 @@ import msgspec
 import zstandard
 
 from specshield.errors import StoreError
-from specshield.service.storage.objects import Objects
+from specshield.service.storage.objects import Objects, left_out
 from specshield.service.storage.store import Dump
 
 MAGIC = b"specshield session 1\n"
@@ -30,6 +30,7 @@ NAME = re.compile(r"([0-9a-f]{8,16}),([0-9a-f]+),([0-9a-f]{9,16})")
 FIRST = 8192  # bytes that are read to see a head, which is one read for most
 HEAD = msgspec.msgpack.Decoder(tuple[bytes, bytes, bytes])
 BODY = msgspec.msgpack.Decoder(tuple[bytes, list[bytes]])
+DAMAGED = (ValueError, zstandard.ZstdError)  # what reading raises of a file that is not whole, or not ours
 
 
 @dataclass(frozen=True, order=True)
@@ -53,10 +54,6 @@ class Entry:
     @property
     def path(self) -> str:
         return f"{_folder(self.key)}/{self.changes:08x},{self.beginning},{self.expires:09x}"
-
-    @property
-    def version(self) -> bytes:
-        return f"{self.beginning}:{self.changes}".encode()
 
 
 class Archive:
@@ -88,18 +85,23 @@ class Archive:
     def read(self, entry: Entry) -> Dump | None:
         """None where it was removed meanwhile. Raises StoreError for a file that is not one of ours."""
         content = self._objects.read(entry.path)
-        return None if content is None else unpack(content)
+        try:
+            return None if content is None else unpack(content)
+        except DAMAGED as error:
+            raise StoreError(_damaged(entry, error)) from error
 
     def head(self, entry: Entry) -> tuple[bytes, bytes] | None:
-        """(config, state) without reading the rest; None where it was removed meanwhile."""
+        """(config, state) without reading the rest; None where it was removed meanwhile, and for a file that
+        is not one of ours: only the log tells of that, since the owner's other sessions can be listed.
+        """
         content = self._objects.read(entry.path, 0, FIRST)
-        if content is None:
+        try:
+            if content is not None and (end := _bounds(content)[1]) > len(content):
+                content += self._objects.read(entry.path, len(content), end) or b""
+            return None if content is None else _head(content)[:2]
+        except DAMAGED as error:
+            left_out(_damaged(entry, error))
             return None
-        _, end = _bounds(content)
-        if end > len(content):
-            content += self._objects.read(entry.path, len(content), end) or b""
-        config, state, _ = _head(content)
-        return config, state
 
     def remove(self, entry: Entry) -> None:
         self._objects.remove(entry.path)
@@ -130,7 +132,7 @@ class Archive:
             owner, *parts = path.split("/")
             key = ("" if owner == PLAIN else owner) + parts[1] if len(parts) == 3 else ""
             entry = Entry.of(key, parts[2]) if key else None
-            if entry is not None:
+            if entry is not None and entry.path == path:
                 yield entry, size
 
 
@@ -141,7 +143,7 @@ def pack(dump: Dump) -> bytes:
 
 
 def unpack(content: bytes) -> Dump:
-    """Raises StoreError where the content is not what `pack` made."""
+    """Raises one of DAMAGED where the content is not what `pack` made."""
     rows, steps = BODY.decode(_decompressed(content[_bounds(content)[1] :]))
     return Dump(*_head(content), rows, steps)
 
@@ -155,7 +157,7 @@ def _bounds(content: bytes) -> tuple[int, int]:
     """Where the head begins and ends."""
     start = len(MAGIC) + 4
     if content[: len(MAGIC)] != MAGIC or len(content) < start:
-        raise StoreError("a file of the archive is not one that this version of specshield wrote")
+        raise ValueError("it is not one that this version of specshield wrote")
     return start, start + int.from_bytes(content[len(MAGIC) : start], "little")
 
 
@@ -165,10 +167,11 @@ def _compressed(value: object) -> bytes:
 
 
 def _decompressed(content: bytes) -> bytes:
-    try:
-        return zstandard.ZstdDecompressor().decompress(content, allow_extra_data=False)
-    except zstandard.ZstdError as error:
-        raise StoreError(f"a file of the archive is damaged: {error}") from error
+    return zstandard.ZstdDecompressor().decompress(content, allow_extra_data=False)
+
+
+def _damaged(entry: Entry, error: Exception) -> str:
+    return f"the file {entry.path} of the archive cannot be read: {error}"
 
 
 def _folder(key: str) -> str:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from functools import wraps
+from errno import ELOOP
+from functools import lru_cache, wraps
 from pathlib import Path
 from stat import S_ISDIR
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 
 from specshield.errors import InputError, StoreError
 
@@ -19,25 +21,8 @@ R = TypeVar("R")
 DRAFT = ".draft-"  # what a file is called until it is whole; names that begin with a dot are not listed
 LEFT = 3600  # [s] after which a draft is one that nobody will finish
 TRIES = 10  # of making a folder that another process removes because it is empty
-
-
-class Objects(Protocol):
-    """Paths are relative, with `/`. Every method raises StoreError where the files cannot be reached."""
-
-    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
-        """The bytes from `start` to before `end`; None where there is no such file."""
-
-    def write(self, path: str, content: bytes) -> None:
-        """Puts the file there, in place of another. When this returns the file outlives a power cut."""
-
-    def remove(self, path: str) -> None:
-        """Removes the file, if it is there."""
-
-    def names(self, folder: str) -> list[str]:
-        """What lies directly in a folder, in order; empty where there is no such folder."""
-
-    def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
-        """Every file below a folder in order of path: (path, bytes)."""
+ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
+log = logging.getLogger("specshield")
 
 
 def open_objects(place: str) -> Objects:
@@ -56,35 +41,47 @@ def open_objects(place: str) -> Objects:
     return Folder(Path(root)) if type(files).__name__ == "LocalFileSystem" else Remote(files, root)
 
 
-def _reaching(method: Callable[P, R]) -> Callable[P, R]:
-    @wraps(method)
-    def reach(*args: P.args, **kwargs: P.kwargs) -> R:
-        try:
-            return method(*args, **kwargs)
-        except OSError as error:
-            reason = error.strerror or type(error).__name__
-            raise StoreError(f"the files of the archive or library cannot be reached: {reason}") from error
+def _reaching(absent: Callable[[], Any] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """absent: makes what is answered where there is no such file or folder; without it, that is an error."""
 
-    return reach
+    def decorate(method: Callable[P, R]) -> Callable[P, R]:
+        @wraps(method)
+        def reach(*args: P.args, **kwargs: P.kwargs) -> R:
+            try:
+                return method(*args, **kwargs)
+            except OSError as error:
+                if absent is not None and (isinstance(error, ABSENT) or error.errno == ELOOP):
+                    return cast(R, absent())
+                raise _unreachable(args[1], error) from error
+
+        return reach
+
+    return decorate
+
+
+def _unreachable(path: object, error: OSError) -> StoreError:
+    reason = error.strerror or type(error).__name__
+    return StoreError(f"the files of the archive or library cannot be reached at {path!r}: {reason}")
 
 
 class Folder:
-    """A folder of this machine, or one that several machines mount."""
+    """A folder of this machine, or one that several machines mount. Paths are relative, with `/`. Every
+    method raises StoreError where the files cannot be reached.
+    """
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
-    @_reaching
+    @_reaching(absent=lambda: None)
     def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
-        try:
-            with open(self.root / path, "rb") as file:
-                file.seek(start)
-                return file.read(-1 if end is None else end - start)
-        except (FileNotFoundError, NotADirectoryError):
-            return None
+        """The bytes from `start` to before `end`; None where there is no such file."""
+        with open(self.root / path, "rb") as file:
+            file.seek(start)
+            return file.read(-1 if end is None else end - start)
 
-    @_reaching
+    @_reaching()
     def write(self, path: str, content: bytes) -> None:
+        """Puts the file there, in place of another. When this returns the file outlives a power cut."""
         target = self.root / path
         draft = target.with_name(f"{DRAFT}{secrets.token_hex(8)}")
         for left in reversed(range(TRIES)):
@@ -102,8 +99,9 @@ class Folder:
             finally:
                 draft.unlink(missing_ok=True)
 
-    @_reaching
+    @_reaching()
     def remove(self, path: str) -> None:
+        """Removes the file, if it is there."""
         target = self.root / path
         target.unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # not empty, or gone already
@@ -112,58 +110,59 @@ class Folder:
                     break
                 folder.rmdir()
 
-    @_reaching
+    @_reaching(absent=list)
     def names(self, folder: str) -> list[str]:
-        try:
-            return sorted(name for name in os.listdir(self.root / folder) if not name.startswith("."))
-        except (FileNotFoundError, NotADirectoryError):
-            return []
+        """What lies directly in a folder, in order; empty where there is no such folder."""
+        return sorted(name for name in os.listdir(self.root / folder) if not name.startswith("."))
 
     def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
-        for found in sorted((self.root / folder).iterdir()) if (self.root / folder).is_dir() else ():
-            with contextlib.suppress(FileNotFoundError):  # it may go at any time
-                path, about = found.relative_to(self.root).as_posix(), found.stat()
-                if found.name.startswith(DRAFT) and about.st_mtime < time.time() - LEFT:
-                    found.unlink()  # by a process that was killed
-                elif S_ISDIR(about.st_mode):
-                    yield from self.sizes(path)
-                elif not found.name.startswith("."):
-                    yield path, about.st_size
+        """Every file below a folder in order of path: (path, bytes)."""
+        here = self.root / folder
+        try:
+            about = here.stat()
+            if here.name.startswith(DRAFT) and about.st_mtime < time.time() - LEFT:
+                here.unlink()  # by a process that was killed
+            elif here.is_symlink() and any(map(here.samefile, here.parents)):
+                left_out(f"{here} is left out: it is a link to a folder that it lies in")
+            elif S_ISDIR(about.st_mode):
+                for found in sorted(here.iterdir()):
+                    yield from self.sizes(found.relative_to(self.root).as_posix())
+            elif not here.name.startswith("."):
+                yield folder, about.st_size
+        except FileNotFoundError:
+            return  # it may go at any time
+        except OSError as error:
+            if not folder:
+                raise _unreachable(folder, error) from error
+            left_out(f"{here} is left out: {error.strerror}")
 
 
 class Remote:
-    """What an fsspec file system keeps. One write of such a store is whole or not there."""
+    """What an fsspec file system keeps, with the methods of `Folder`. Most write a file whole or not."""
 
     def __init__(self, files: Any, root: str) -> None:
         self._files, self._root = files, root.rstrip("/")
 
-    @_reaching
+    @_reaching(absent=lambda: None)
     def read(self, path: str, start: int = 0, end: int | None = None) -> bytes | None:
-        try:
-            return bytes(self._files.cat_file(self._at(path), start=start or None, end=end))
-        except FileNotFoundError:
-            return None
+        return bytes(self._files.cat_file(self._at(path), start=start or None, end=end))
 
-    @_reaching
+    @_reaching()
     def write(self, path: str, content: bytes) -> None:
         place = self._at(path)
         self._files.makedirs(place.rpartition("/")[0], exist_ok=True)
         self._files.pipe_file(place, content)
 
-    @_reaching
+    @_reaching(absent=lambda: None)
     def remove(self, path: str) -> None:
-        with contextlib.suppress(FileNotFoundError):
-            self._files.rm_file(self._at(path))
+        self._files.rm_file(self._at(path))
 
-    @_reaching
+    @_reaching(absent=list)
     def names(self, folder: str) -> list[str]:
-        try:
-            found = self._files.ls(self._at(folder), detail=False)
-        except FileNotFoundError:
-            return []
+        found = self._files.ls(self._at(folder), detail=False)
         return sorted({name.rstrip("/").rpartition("/")[2] for name in found} - {""})
 
-    @_reaching
+    @_reaching()
     def sizes(self, folder: str) -> Iterator[tuple[str, int]]:
         below = self._files.find(self._at(folder), detail=True)
         skipped = len(self._at("")) + 1
@@ -171,6 +170,15 @@ class Remote:
 
     def _at(self, path: str) -> str:
         return f"{self._root}/{path}".rstrip("/")
+
+
+@lru_cache(1000)
+def left_out(told: str) -> None:
+    """A line of the log, but not at each look, for what is passed over among the files."""
+    log.warning("%s", told)
+
+
+Objects = Folder | Remote
 
 
 def write_through(path: Path, content: bytes) -> None:
