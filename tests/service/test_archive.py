@@ -377,6 +377,22 @@ def test_a_file_that_is_not_whole_or_not_ours_is_left_out_of_lists_and_named_onc
     run(url, archive, story)
 
 
+def test_a_file_that_was_left_half_written_does_not_stand_for_the_session(url, archive):
+    """Not every file system puts a file there whole or not at all. The session would be lost with it."""
+
+    async def story(store):
+        await begin(store, "robot", 3)
+        dump, expires = await store.dump("robot"), time.time() + TTL
+        entry, size = archive.put("robot", expires, dump)
+        assert archive.put("robot", expires, dump) == (entry, 0)
+        archive._objects.write(entry.path, archive._objects.read(entry.path)[:-9])
+        assert archive.put("robot", expires, dump) == (entry, size)
+        assert await store.put_away("robot", expires, dump)
+        assert await store.dump("robot") == dump
+
+    run(url, archive, story)
+
+
 def test_links_and_copies_among_the_files_keep_no_sweep_from_its_end(url, tmp_path, caplog):
     archive = Archive(open_objects(str(tmp_path)))
     left_out.cache_clear()

@@ -65,10 +65,9 @@ class Archive:
         written: 0 where it was there before.
         """
         beginning, _, changes = dump.version.decode().partition(":")
-        entry = Entry(key, int(changes), beginning, int(expires) + 1)
-        if entry in self.entries(key):
+        entry, content = Entry(key, int(changes), beginning, int(expires) + 1), pack(dump)
+        if self._objects.read(entry.path) == content:
             return entry, 0
-        content = pack(dump)
         self._objects.write(entry.path, content)
         return entry, len(content)
 
