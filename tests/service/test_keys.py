@@ -1,12 +1,15 @@
 """API keys with names: what each may, what each owns, and what it may use."""
 
 import asyncio
+import json
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 
 import httpx
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from specshield.errors import InputError, NotFound, RateLimited, Unauthorized
 from specshield.service.access.keys import REFRESH, Key, Keys
@@ -15,7 +18,7 @@ from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Store
 from tests.service.test_bad_input import problem
 from tests.service.world import START, grid_json, send_policy
-from tests.serving import run_specshield, serving, wait_for
+from tests.serving import HUNG, run_specshield, serving, wait_for
 
 POSE = [4.5, 5.0, 0.0]  # from which case 1 can be satisfied
 UNTOLD = 12.0  # [s] in which a stream that is open tells nothing, if nothing is decided: less than HEARTBEAT
@@ -139,6 +142,29 @@ def test_a_revoked_key_ends_the_streams_of_events_that_it_opened_and_no_other(ke
         for (client, path), told in lines.items():
             if client is other:
                 assert any(line.startswith("data") for line in told), path
+
+
+def test_a_revoked_key_ends_the_streams_of_steps_that_it_opened_and_no_other(keyed):
+    def stream(client):
+        assert begin(client, id="s", initial_pose=POSE).status_code == 201
+        url = f"ws{keyed.url.removeprefix('http')}/v1/sessions/s/stream"
+        key = {"Authorization": client.headers["Authorization"]}
+        return open.enter_context(connect(url, additional_headers=key, ping_interval=None))
+
+    def decide(stream, t):
+        stream.send(json.dumps({"t": t, "poses": [POSE] * (t + 1), "logits": [0.0] * 20}))
+        return json.loads(stream.recv(HUNG))
+
+    with ExitStack() as open:
+        own, other = (stream(open.enter_context(caller(keyed, name))) for name in ("erin", "frank"))
+        assert decide(own, 0)["t"] == decide(other, 0)["t"] == 0
+        on_keys(keyed, lambda keys: keys.revoke("erin"))
+        on_keys(keyed, lambda keys: keys.create("erin"))
+        with pytest.raises(ConnectionClosed) as closed:
+            own.recv(UNTOLD)
+        assert closed.value.rcvd.code == 1008
+        assert decide(other, 1)["t"] == 1
+    assert "Traceback" not in keyed.log.read_text()
 
 
 def test_what_a_name_may_be(keyed):

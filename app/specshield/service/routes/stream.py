@@ -28,7 +28,7 @@ from specshield.service.watch import logs
 
 PATH = re.compile(rf"/v1/sessions/({ID})/stream")
 ROUTE = "/v1/sessions/{session_id}/stream"
-GOING_AWAY = 1001  # RFC 6455: the server goes down
+GOING_AWAY, REFUSED = 1001, 1008  # RFC 6455: the server goes down; it may not go on by the server's policy
 log = logging.getLogger("specshield")
 
 
@@ -56,6 +56,7 @@ class StreamRoute:
             return
         stream = _Stream(server, key, scope, send)
         server.streams.open.add(stream.stop)
+        refused = asyncio.create_task(stream.stop_when_refused())
         try:
             await send({"type": "websocket.accept"})
             if server.streams.closed:  # the server was told to stop since the handshake
@@ -63,18 +64,20 @@ class StreamRoute:
             await stream.serve(receive)
         finally:
             server.streams.open.discard(stream.stop)
+            refused.cancel()
 
 
 class _Stream:
     def __init__(self, server: Server, key: str, scope: Scope, send: Send) -> None:
         self._server, self._key, self._scope, self._send = server, key, scope, send
         self._authorization = dict(scope["headers"]).get(b"authorization", b"")
-        self._busy = self._stopping = False
-        self._closing: asyncio.Task[None] | None = None
+        self._busy = False
+        self._ending: dict[str, Any] | None = None  # the message that closes it
+        self._closing: asyncio.Future[None] | None = None
 
     async def serve(self, receive: Receive) -> None:
         """Until the caller leaves, or `stop`."""
-        while (message := await receive())["type"] == "websocket.receive":
+        while (message := await receive())["type"] == "websocket.receive" and self._closing is None:
             self._busy = True
             text, content = message.get("text"), message.get("bytes") or b""
             packed = text is None
@@ -84,18 +87,22 @@ class _Stream:
             said: dict[str, Any] = {"bytes": answer} if packed else {"text": answer.decode()}
             await self._send({"type": "websocket.send", **said})
             self._busy = False
-            if self._stopping:
-                await self._close()
+            if self._ending is not None:
+                await self._send(self._ending)
                 return
+        if self._closing is not None:
+            await self._closing
 
-    def stop(self) -> None:
+    def stop(self, code: int = GOING_AWAY, reason: str = "the server stops") -> None:
         """After the step that is being decided, if one is."""
-        self._stopping = True
-        if not self._busy:
-            self._closing = asyncio.get_running_loop().create_task(self._close())
+        if self._ending is None:
+            self._ending = {"type": "websocket.close", "code": code, "reason": reason}
+            if not self._busy:
+                self._closing = asyncio.ensure_future(self._send(self._ending))
 
-    async def _close(self) -> None:
-        await self._send({"type": "websocket.close", "code": GOING_AWAY, "reason": "the server stops"})
+    async def stop_when_refused(self) -> None:
+        await self._server.keys.until_refused(self._authorization)
+        self.stop(REFUSED, "the API key is not one of this server's any more")
 
     async def _answer(self, content: bytes | str, packed: bool) -> tuple[int, bytes]:
         """The status that it has over HTTP, and the message."""
