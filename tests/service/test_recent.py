@@ -12,7 +12,7 @@ import pytest
 from specshield.service.app import create_app
 from specshield.service.library.files import Recent
 from specshield.service.sessions.session import Session
-from specshield.service.sessions.state import State, pack_carry
+from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Record
 from specshield.shield.decision import Carry
@@ -24,7 +24,7 @@ ROUNDS = 8
 
 def session(formula="F[0,6] Goal", motions=4, horizon=8):
     carry = Carry(0, np.zeros((motions, 3)), (bytes(horizon),) * motions)
-    state = State(1, 1, True, "pending", 0.0, b"", carry=pack_carry(carry))
+    state = State(1, 1, True, "pending", 0.0, b"", carry=carry)
     config = {"spec": {"formula": formula, "regions": {}, "signals": {}}, "seed": 0}
     return Session.of(Record(json.dumps(config).encode(), state.packed(), b"1", bytes(24), None))
 

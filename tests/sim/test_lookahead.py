@@ -10,7 +10,7 @@ from specshield.lookahead import lookahead
 from specshield.lookahead.lookahead import FORCED, prepare
 from specshield.policy.dqn.environment import free_poses
 from specshield.portable import exp
-from specshield.service.sessions.state import pack_carry
+from specshield.service.sessions.state import State, own
 from specshield.shield.decision import Config
 from specshield.shield.episode import close, decide, make_shield, start
 from specshield.shield.shaping import log_softmax
@@ -31,6 +31,14 @@ def begin(case, shield, seed):
     return pose
 
 
+def stored(carry):
+    return State(1, 1, True, "pending", 0.0, b"", carry=carry).packed()
+
+
+def loaded(carry):
+    return own(State.of(stored(carry)).carry)
+
+
 def episode(case, shield, seed, each=lambda decision, logits: None):
     """(path KL, verdict) of the stand-in model under the shield."""
     model, robot = GoalSeeker(case.task.robot), SimulatedRobot(case, tuple(begin(case, shield, seed)))
@@ -42,7 +50,7 @@ def episode(case, shield, seed, each=lambda decision, logits: None):
         decision = decide(shield, history, logits, over, carry=carry)
         each(decision, logits)
         paid += decision.kl or 0.0
-        carry = pack_carry(decision.carry).unpacked()
+        carry = loaded(decision.carry)
         over = over or bool(case.task.robot.terminal[decision.action])
         if len(history) <= case.task.horizon:
             robot.execute(
@@ -115,10 +123,10 @@ def test_a_decision_made_again_is_the_same(world):
         if t == 6:  # as in another process
             lookahead._prepare.cache_clear()
             other = replace(ahead, preference=prepare(shield.task, shield.proposers))
-        again = decide(other, history, logits, carry=None if carry is None else pack_carry(carry).unpacked())
+        again = decide(other, history, logits, carry=None if carry is None else loaded(carry))
         assert np.array_equal(decision.distribution, again.distribution)
         assert decision.action == again.action
-        assert pack_carry(decision.carry) == pack_carry(again.carry)
+        assert stored(decision.carry) == stored(again.carry)
         carry = decision.carry
         robot.execute(decision.action)
     assert carry.memory is not None

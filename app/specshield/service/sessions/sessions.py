@@ -42,7 +42,7 @@ from specshield.service.sessions.session import (
     there,
 )
 from specshield.service.sessions.shields import Shields
-from specshield.service.sessions.state import State, pack_carry
+from specshield.service.sessions.state import State, own
 from specshield.service.sessions.steps import Steps, Tell
 from specshield.service.sessions.switch import Switches
 from specshield.service.settings import Settings
@@ -264,7 +264,7 @@ def begin(
         spec_status=status,
         expires_at=0.0,
         head=record.digest(files.to_json(config)),
-        carry=None if carry is None else pack_carry(carry),
+        carry=carry and own(carry),
         any_signal=any_signal(shield, rows[:, :3]),
     )
     return config, state, rows

@@ -24,7 +24,7 @@ from specshield.service.sessions import record
 from specshield.service.sessions.record import StepRecord
 from specshield.service.sessions.session import RACES, Session, asked_of, contended, decide, missing
 from specshield.service.sessions.shields import Shields
-from specshield.service.sessions.state import State, pack_carry
+from specshield.service.sessions.state import State, own
 from specshield.service.storage.store import Change, Store
 from specshield.shield.decision import Decision
 from specshield.shield.taught import Taught, changes_map
@@ -168,7 +168,7 @@ class Steps:
             head=record.digest(content),
             main_task_done=request.main_task_done,
             finished=decision.finished,
-            carry=pack_carry(decision.carry),
+            carry=own(decision.carry),
         )
         return Change(state.packed(), *session.added(session.state.length), request.t, content), state
 
@@ -213,7 +213,7 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     shield, asked, names, state = shields.of(session), asked_of(request), session.signal_names, session.state
     check_signals(names, asked.signals)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
-    carry = None if state.carry is None else state.carry.unpacked()
+    carry = state.carry and own(state.carry)
     tables = None
     if carry is not None and changes_map(carry.learned):
         known = Taught.from_bytes(carry.learned).map
