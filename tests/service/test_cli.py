@@ -67,6 +67,12 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
         ),
         (
             "serve",
+            {"SPECSHIELD_DATA_URL": "memory://files"},
+            "SPECSHIELD_DATA_URL: files in memory are seen by one process alone",
+            "a folder, or a URL that every process reaches",
+        ),
+        (
+            "serve",
             {"SPECSHIELD_STORE_REPLICAS": "1"},
             "SPECSHIELD_STORE_REPLICAS is not valid: '1'",
             "0 unless REDIS_URL is set",

@@ -223,6 +223,12 @@ def read_settings() -> Settings:
             path="SPECSHIELD_API_KEY",
             expected="a key, or the variable not set",
         )
+    if os.environ.get("SPECSHIELD_DATA_URL", "").startswith("memory:"):
+        raise InputError(
+            "files in memory are seen by one process alone, and a server has several",
+            path="SPECSHIELD_DATA_URL",
+            expected="a folder, or a URL that every process reaches",
+        )
     known = [f"SPECSHIELD_{field.upper()}" for field in Settings.model_fields]
     for name in os.environ:  # a setting that is misspelt would be left out without a word
         meant = get_close_matches(name, known, 1, ALIKE)
