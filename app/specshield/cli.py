@@ -187,14 +187,19 @@ def verify(
     """Check a session's record: its chain of hashes, then every decision, made again to the same bytes.
 
     The exit status is 0 where all is as it was, 1 where something differs, 2 where map or policy are not at
-    hand, so that only the chain was checked.
+    hand, so that only the chain was checked, 3 where the file cannot be read, so that nothing was.
     """
     from specshield.service import verify as verifying
     from specshield.service.settings import read_settings
 
     given = {"data_dir": data_dir, "models_dir": models_dir, "maps_dir": maps_dir}
-    settings = read_settings().model_copy(update={k: v for k, v in given.items() if v is not None})
-    raise typer.Exit(verifying.verify(file, settings))
+    try:
+        settings = read_settings().model_copy(update={k: v for k, v in given.items() if v is not None})
+        status = verifying.verify(file, settings)
+    except SpecshieldError as error:
+        print(error, file=sys.stderr)
+        status = 3
+    raise typer.Exit(status)
 
 
 def openapi() -> None:

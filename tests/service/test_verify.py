@@ -18,6 +18,7 @@ from specshield.service.sessions import chain, record
 from specshield.service.settings import Settings
 from specshield.service.verify import verify
 from tests.service.world import ahead
+from tests.serving import run_specshield
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +74,16 @@ def test_what_was_sent_to_a_server_is_found_in_its_data_folder(server, client, b
     status, said = told(capsys, tmp_path, answer.content)
     assert (status, "the chain is whole" in said, "NOT decided again" in said) == (2, True, True)
     assert client.get("/v1/sessions/none/record").json()["type"] == "not-found"
+
+
+def test_a_file_that_cannot_be_read_is_none_that_differs(case1, capsys, tmp_path):
+    for unread in (tmp_path / "none", tmp_path):
+        ended = run_specshield("verify", unread)
+        assert (ended.returncode, ended.stdout) == (3, "")
+        assert f"{unread} cannot be read: " in ended.stderr
+    (tmp_path / "maps").touch()  # where a server would have its maps
+    status, said = told(capsys, tmp_path, case1[0], data_dir=tmp_path)
+    assert (status, "the chain is whole" in said, "NOT decided again" in said) == (2, True, True)
 
 
 @given(st.data())

@@ -55,7 +55,7 @@ def verify(file: Path, settings: Settings) -> int:
     print(f"seal {found.seal}")
     try:
         shields, wrong = _shields(found, settings)
-    except (SpecshieldError, TypeError) as error:  # or a record that no server made
+    except (SpecshieldError, OSError, TypeError) as error:  # or a record that no server made
         print(f"NOT decided again: {error}")
         return 2
     for config, names in zip(found.configs, wrong, strict=True):
