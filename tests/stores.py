@@ -60,7 +60,7 @@ def cluster(folder: Path) -> Iterator[Cluster]:
             options += ("--cluster-node-timeout", "2000", "--repl-diskless-sync-delay", "0", *DURABLE)
             processes.append(stack.enter_context(running(folder / str(port), *options)))
         nodes = [stack.enter_context(redis.Redis(port=port)) for port in ports]
-        wait_for(lambda: all(_answers(node) for node in nodes))
+        wait_for(lambda: all(answers(node) for node in nodes))
         share = 16384 // 3 + 1
         for i, node in enumerate(nodes[:3]):
             last = min((i + 1) * share, 16384) - 1
@@ -110,7 +110,7 @@ def watched(folder: Path) -> Iterator[Watched]:
         follows = ("--replicaof", f"127.0.0.1 {first}", "--repl-diskless-sync-delay", "0")
         stack.enter_context(running(folder / "second", "--port", str(second), *follows, *DURABLE))
         replica = stack.enter_context(redis.Redis(port=second))
-        wait_for(lambda: _answers(replica) and replica.info()["master_link_status"] == "up")
+        wait_for(lambda: answers(replica) and replica.info()["master_link_status"] == "up")
         told = folder / "sentinel.conf"
         told.write_text(
             f"port {port}\nsentinel monitor shield 127.0.0.1 {first} 1\n"
@@ -119,7 +119,7 @@ def watched(folder: Path) -> Iterator[Watched]:
         stack.enter_context(running(folder, str(told), "--sentinel"))
         sentinel = stack.enter_context(redis.Redis(port=port))
         server = stack.enter_context(redis.Redis(port=first))
-        wait_for(lambda: _answers(sentinel) and sentinel.sentinel_slaves("shield"))
+        wait_for(lambda: answers(sentinel) and sentinel.sentinel_slaves("shield"))
         url = f"redis+sentinel://127.0.0.1:{port}/shield"
         yield Watched(url, process, server, replica, sentinel)
 
@@ -142,7 +142,7 @@ def behind_tls(folder: Path) -> Iterator[str]:
     with running(folder, *options):
         url = f"rediss://127.0.0.1:{port}/0?ssl_ca_certs={folder / 'ca.pem'}"
         node = redis.Redis.from_url(url)
-        wait_for(lambda: _answers(node))
+        wait_for(lambda: answers(node))
         yield url
 
 
@@ -153,7 +153,7 @@ def _kill(process: subprocess.Popen[bytes], server: redis.Redis, replica: redis.
     process.wait()
 
 
-def _answers(node: redis.Redis) -> bool:
+def answers(node: redis.Redis) -> bool:
     try:
         return bool(node.ping())
     except redis.ConnectionError:

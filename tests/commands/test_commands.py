@@ -13,6 +13,7 @@ from threading import Thread
 from typing import get_type_hints
 
 import pytest
+import redis
 import yaml
 
 from examples.own_house import HOUSE, REGIONS, ROBOT, RULE, occupancy
@@ -21,7 +22,8 @@ from specshield.client import ShieldClient
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from specshield.shipped import MODELS
-from tests.serving import run_specshield, serving
+from tests.serving import free_port, run_specshield, serving, wait_for
+from tests.stores import answers, running
 
 
 def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
@@ -262,6 +264,31 @@ def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):
         assert there.stdout.splitlines()[-1] == "all is well", there.stdout
     finally:
         store.leave()
+
+
+def test_a_store_that_drops_what_was_answered_is_told_of(tmp_path):
+    """By the doctor, and by a server that starts; not where its memory has no bound, or it does not say."""
+    port = free_port()
+    given = {"SPECSHIELD_DATA_DIR": str(tmp_path / "data"), "REDIS_URL": f"redis://127.0.0.1:{port}/0"}
+    with running(tmp_path / "redis", "--port", str(port), "--save", "") as _, redis.Redis(port=port) as store:
+        wait_for(lambda: answers(store))
+
+        def noted():
+            told = run_specshield("doctor", **given)
+            assert told.returncode == 0, told.stdout
+            return "drops steps that were answered" in told.stdout
+
+        store.config_set("maxmemory-policy", "volatile-lru")
+        assert not noted()
+        store.config_set("maxmemory", 1 << 30)
+        assert noted()
+        with serving(tmp_path / "data", REDIS_URL=given["REDIS_URL"]) as server:
+            assert "drops steps that were answered" in server.log.read_text()
+        store.acl_setuser("default", enabled=True, commands=["-info"])
+        assert not noted()
+        store.acl_setuser("default", enabled=True, commands=["+info"])
+        store.config_set("maxmemory-policy", "noeviction")
+        assert not noted()
 
 
 def test_a_session_is_watched_a_line_a_decision(tmp_path):

@@ -145,7 +145,7 @@ def _disk(settings: Settings) -> Iterator[Finding]:
 
 
 def _store(settings: Settings) -> Iterator[Finding]:
-    from specshield.service.storage.connect import FAILURES, connect
+    from specshield.service.storage.connect import FAILURES, connect, drops
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_first
     from specshield.service.storage.objects import open_objects
@@ -164,6 +164,8 @@ def _store(settings: Settings) -> Iterator[Finding]:
             store.ping()
             took = 1000 * (time.perf_counter() - began)
             yield Finding("ok", f"the store at REDIS_URL answers in {took:.1f} ms")
+            if (told := drops(store)) is not None:
+                yield Finding("note", told, "maxmemory-policy noeviction, at the store (docs/scale.md)")
             check_first(store, settings.files_at)
     except FAILURES as error:
         yield Finding(

@@ -37,6 +37,7 @@ from specshield.service.startup import Startup, complete, prepare
 from specshield.service.state import Server
 from specshield.service.storage.archive import Archive
 from specshield.service.storage.archiving import ArchivingStore
+from specshield.service.storage.connect import drops
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import follow_parent
 from specshield.service.storage.marker import check_files
@@ -120,6 +121,8 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
 
     def check() -> None:
         check_files(url, settings.files_at, settings.store_timeout)
+        if (told := drops(jobs.redis)) is not None:
+            log.warning("%s; docs/scale.md says which it should be", told)
         if worker is not None:  # last of all: it needs a processor for a second
             with contextlib.suppress(OSError):  # `tend` tells, and tries again
                 worker.ensure()

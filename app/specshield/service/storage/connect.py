@@ -11,7 +11,7 @@ which is for the store; options after a ? are redis-py's, as in ?ssl_ca_certs=/e
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
@@ -106,6 +106,18 @@ def connect_to_jobs(url: str, **options: Any) -> Any:
     node = cluster.get_node_from_key(JOBS)
     cluster.close()
     return redis.Redis(host=node.host, port=node.port, **{**options, **_parse(url)[2]})
+
+
+def drops(store: Any) -> str | None:
+    """What is to be told of a store that drops keys once its memory is full; None where it keeps them all, or
+    does not say. store: a blocking client.
+    """
+    with suppress(*FAILURES):  # a managed one may refuse it
+        told = store.info("memory")
+        policy = told.get("maxmemory_policy", "noeviction")
+        if told.get("maxmemory") and policy != "noeviction":
+            return f"the store drops steps that were answered once its memory is full: its policy is {policy}"
+    return None
 
 
 def is_cluster(url: str) -> bool:
