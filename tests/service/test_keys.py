@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from specshield.errors import InputError, NotFound, RateLimited, Unauthorized
-from specshield.service.access.keys import REFRESH, Key, Keys
+from specshield.service.access.keys import MISS_EVERY, REFRESH, Key, Keys
 from specshield.service.access.rates import Rates
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.store import Store
@@ -327,3 +327,20 @@ def test_unknown_keys_do_not_ask_the_store_each():
     asyncio.run(try_many())
     assert asked <= 2
     assert REFRESH <= 2.0  # as the help of `keys revoke` says
+
+
+def test_keys_are_followed_on_when_a_connection_is_lost_at_the_moment_at_which_the_store_is_asked():
+    """uvloop has no OSError for a write to what is closed by then. Keys revoked later went on to be taken."""
+
+    class Closed:
+        async def hget(self, key, field):
+            raise RuntimeError("unable to perform operation on <UnixTransport>; the handler is closed")
+
+    async def follow():
+        keys = Keys(Closed(), "own")
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(keys.follow(), 2 * MISS_EVERY)
+        with pytest.raises(Unauthorized):
+            await keys.check(b"Bearer other")
+
+    asyncio.run(follow())

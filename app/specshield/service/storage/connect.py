@@ -46,7 +46,9 @@ def reaching() -> Iterator[None]:
     """A store that cannot be reached meanwhile is a StoreError."""
     try:
         yield
-    except FAILURES as error:
+    except (*FAILURES, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "handler is closed" not in str(error):
+            raise  # that one is uvloop's word for a connection that the other side has closed
         raise away(error) from error
 
 

@@ -17,7 +17,7 @@ import anyio
 
 from specshield.errors import LimitReached, SessionExists
 from specshield.service.access.owners import between, shown
-from specshield.service.storage.connect import FAILURES, away, connect, is_cluster
+from specshield.service.storage.connect import FAILURES, away, connect, is_cluster, reaching
 from specshield.service.storage.wire import PART, Script, Wire, too_few
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
@@ -91,13 +91,8 @@ class Store:
     @asynccontextmanager
     async def _reaching(self) -> AsyncIterator[None]:
         """One time limit for all of it, with waits for a connection and tries; what fails is a StoreError."""
-        try:
-            with anyio.fail_after(self._timeout):
-                yield
-        except (*FAILURES, RuntimeError) as error:
-            if isinstance(error, RuntimeError) and "handler is closed" not in str(error):
-                raise  # that one is uvloop's word for a connection that the other side has closed
-            raise away(error) from error
+        with reaching(), anyio.fail_after(self._timeout):
+            yield
 
     async def ping(self) -> None:
         """Whether it takes a write: one whose disk is full still answers reads."""
