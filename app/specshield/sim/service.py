@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -15,7 +17,6 @@ from pathlib import Path
 import httpx
 
 from specshield.errors import ServerError
-from specshield.service.storage.keeper import follow_parent
 
 
 @contextmanager
@@ -54,6 +55,12 @@ def own_server(
             except subprocess.TimeoutExpired:
                 server.kill()
                 server.wait()
+
+
+def follow_parent() -> None:
+    """Linux: a process that calls this as it begins is told to stop if the one that started it is killed."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _environment(data: Path, worker: bool, key: str | None) -> dict[str, str]:
