@@ -79,10 +79,8 @@ def way(shield: Shield, history: Floats, signals: Mapping[str, Floats]) -> Ints 
     ground = make_ground(shield.task, shield.body, known.held)
     needed = Reader(known.now, known.constant).alternatives(formula)
     for found in _found(shield, known, ground, needed, ()):
-        if (
-            float(values_of(formula, shield.task.samples(driven(shield, history, found), signals))[0])
-            > SATISFIED_ABOVE
-        ):
+        rho = values_of(formula, shield.task.samples(driven(shield, history, found), signals))
+        if float(rho[0]) > SATISFIED_ABOVE:
             return np.asarray(found[0])
     return None
 

@@ -66,7 +66,6 @@ FIELD_ERRORS: Mapping[str, type[InputError]] = {
     "formula": errors.FormulaError,
 }
 
-
 UNREADABLE: Mapping[type[Any], str] = {  # why a body whose reading failed so is no JSON
     RecursionError: "it is nested too deeply",
     UnicodeDecodeError: "its text is not UTF-8",

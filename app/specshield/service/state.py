@@ -24,12 +24,11 @@ from specshield.service.watch.gauges import Gauges
 
 PICTURES = 32  # kept in memory, of 5 to 500 kB each
 TOO_MUCH = {"_503": "`busy`: too much is asked of the server just now; ask again after `Retry-After`."}
-
-
-RETRY = {"headers": {"Retry-After": {
+RETRY_AFTER = {
     "description": "Seconds after which to ask again: with every 503, and with `rate-limited`.",
     "schema": {"type": "integer", "minimum": 1},
-}}}  # fmt: skip
+}
+RETRY = {"headers": {"Retry-After": RETRY_AFTER}}
 
 
 @dataclass

@@ -17,8 +17,6 @@ RobotChoice = Annotated[
     Annotated[Name, Tag("name")] | Annotated[RobotSpec, Tag("robot")],
     Discriminator(lambda value: "name" if isinstance(value, str) else "robot"),
 ]
-
-
 Options = Annotated[dict[str, bool | int | float | str | list[float]], Field(max_length=64, fail_fast=True)]
 
 
