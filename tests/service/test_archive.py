@@ -473,7 +473,7 @@ def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
         assert client.post("/v1/sessions", json=begun).status_code == 201
 
         def step(t: int) -> httpx.Response:
-            body = {"t": t, "poses": ahead(t)[-1:], "logits": LOGITS}
+            body = {"t": t, "poses": ahead(t)[-1:], "logits": LOGITS, "occupied": [[2.55, 1.05]]}
             return client.post("/v1/sessions/robot/steps", json=body)
 
         def archived() -> bool:
@@ -483,7 +483,10 @@ def test_the_routes_answer_for_archived_sessions_as_for_any(tmp_path):
         answers = [step(t).content for t in range(3)]
         session = client.get("/v1/sessions/robot").json()
         trajectory = client.get("/v1/sessions/robot/trajectory").content
+        learned = client.get("/v1/sessions/robot/learned").json()
+        assert learned["occupied"] == [425]
         wait_for(archived)
+        assert client.get("/v1/sessions/robot/learned").json() == learned
         assert client.get("/v1/sessions/robot").json() == session
         assert client.get("/v1/sessions/robot/trajectory").content == trajectory
         assert [item["id"] for item in client.get("/v1/sessions").json()["items"]] == ["robot"]

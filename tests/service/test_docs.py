@@ -114,6 +114,7 @@ ORDER = [  # as the page shows them: from the top down each example works as it 
     ("post", "/v1/sessions/{session_id}/switch", 200),
     ("post", "/v1/sessions/{session_id}/close", 200),
     ("get", "/v1/sessions/{session_id}/trajectory", 200),
+    ("get", "/v1/sessions/{session_id}/learned", 200),
     ("get", "/v1/sessions/{session_id}/image.svg", 200),
     ("get", "/v1/sessions/{session_id}/events", 204),  # it is over: nothing follows
     ("get", "/v1/sessions/{session_id}/record", 200),

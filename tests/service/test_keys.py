@@ -193,6 +193,7 @@ def test_a_key_owns_its_sessions(keyed):
         for method, path in (
             ("GET", ""),
             ("GET", "/trajectory"),
+            ("GET", "/learned"),
             ("DELETE", ""),
             ("POST", "/close"),
             ("POST", "/steps"),

@@ -522,6 +522,43 @@ def test_a_robot_elsewhere_is_seen_as_it_moves(server, client, begin, step, brow
     assert complaints == []
 
 
+def test_what_a_session_learned_of_its_map_is_drawn_over_it(server, begin, step, browse):
+    """Live, as it changes, and for an earlier step what there is now, which is said; before it, nothing."""
+    session, poses = begin(), ahead(4)
+    with browse() as (page, complaints):
+        page.goto(f"{server.url}/#/sessions/{session['id']}")
+        page.get_by_text("live").wait_for()
+        occupied, free = (page.locator(f".learned path.{kind}") for kind in ("occupied", "free"))
+        key = page.locator(".key.learned")
+
+        def told():
+            assert key.is_visible() == occupied.is_visible()
+            return key.inner_text() if key.is_visible() else None
+
+        assert step(session, 0, [poses[0]]).status_code == 200
+        page.get_by_role("heading", name="Step 0").wait_for()
+        assert told() is None
+        seen = {"occupied": [[2.55, 1.05], [2.55, 1.15], [2.65, 1.15]]}
+        assert step(session, 1, [poses[1]], **seen).status_code == 200
+        key.wait_for()
+        assert told() == "found occupied The map says otherwise."
+        assert occupied.get_attribute("d") == "M25 10h1v1h-1zM25 11h2v1h-2z"
+        box, at = occupied.bounding_box(), Floor(page).at
+        low, high = at(2.5, 1.0), at(2.7, 1.2)
+        assert [box["x"], box["y"]] == pytest.approx([low[0], high[1]], abs=1.0)
+        assert [box["width"], box["height"]] == pytest.approx([high[0] - low[0], low[1] - high[1]], abs=1.0)
+        assert step(session, 2, [poses[2]], free=[[3.15, 2.15]]).status_code == 200
+        page.get_by_text("found free").wait_for()
+        assert free.get_attribute("d") == "M31 21h1v1h-1z"
+        look(page, "learned")
+        page.get_by_label("Step", exact=True).fill("1")
+        page.get_by_text("What is drawn is from step 2.").wait_for()
+        page.get_by_label("Step", exact=True).fill("0")
+        key.wait_for(state="hidden")
+        assert told() is None
+    assert complaints == []
+
+
 def test_steps_before_a_switch_are_told_under_the_rule_that_held_then(server, client, begin, step, browse):
     """What another robot did elsewhere is not told as motions of the present one, nor drawn on its floor."""
     session, poses = begin(), ahead(3)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import threading
 from xml.etree import ElementTree
 
 import httpx
+import numpy as np
+from PIL import Image
 
 from tests.service.world import START, ahead, grid_json, policy_files
 from tests.serving import HUNG
@@ -73,6 +77,62 @@ def test_pictures_stand_alone_and_say_what_is_drawn(client, begin, step):
         assert all(link.startswith("data:image/png;base64,") for link in links)
         again = client.get(path, headers={"If-None-Match": drawn.headers["etag"]})
         assert again.status_code == 304
+
+
+def test_what_a_session_learned_of_its_map_is_told_and_drawn(client, begin, step):
+    """A told point, and one in what the map has occupied; of a session that learned nothing, nothing."""
+    session, cells = begin(id="learns"), {"occupied": [425, 466], "free": [871]}
+    where = {"occupied": [[2.55, 1.05], [2.65, 1.15], [0.05, 0.05]], "free": [[3.15, 2.15], [1.05, 2.05]]}
+
+    def learned():
+        return client.get("/v1/sessions/learns/learned").json()
+
+    def drawn():
+        svg = client.get("/v1/sessions/learns/image.svg").content
+        image = next(ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}image")).get("href")
+        pixels = Image.open(io.BytesIO(base64.b64decode(image.partition(",")[2]))).convert("RGBA")
+        return b"Violet is what it found occupied" in svg, np.asarray(pixels)[::-1].reshape(-1, 4)
+
+    nothing = {"map_id": session["map_id"], "map_revision": 0, "occupied": [], "free": []}
+    assert learned() == {"t": -1, **nothing}
+    assert step(session, 0, [START]).status_code == 200
+    assert learned() == {"t": 0, **nothing}
+    said, pixels = drawn()
+    assert not said
+    walls = pixels[0]
+    assert {tuple(pixel) for pixel in pixels} == {(0, 0, 0, 0), tuple(walls)}
+    assert step(session, 1, ahead(1)[1:], **where).status_code == 200
+    assert learned() == {"t": 1, **nothing, "map_revision": 1, **cells}
+    said, pixels = drawn()
+    assert said
+    free = np.zeros(len(pixels), bool)
+    free[cells["free"]] = True
+    assert (pixels[cells["occupied"]] == pixels[425]).all()
+    assert not (pixels[425] == walls).all()
+    assert ((pixels[:, 3] > 0) & (pixels[:, 3] < 255)).tolist() == free.tolist()  # paler
+    client.post("/v1/sessions/learns/close", json={})
+    assert learned()["occupied"] == cells["occupied"]
+
+
+def test_what_a_robot_ran_into_is_told(client):
+    body = {"policy_id": "case1", "initial_pose": [5.0, 5.0, 0.0], "id": "runs-into"}
+    session, pose = client.post("/v1/sessions", json=body).json(), body["initial_pose"]
+    logits = [0.0 if name == "m" else -9.0 for name in session["actions"]]
+    for t in range(7):
+        asked = {"t": t, "poses": [pose], "logits": logits}
+        told = client.post("/v1/sessions/runs-into/steps", json=asked).json()
+        foreseen = told["next_poses"][told["action"]]
+        pose = [a + (0.3 if t == 4 else 1.0) * (b - a) for a, b in zip(pose, foreseen, strict=True)]
+    learned = client.get("/v1/sessions/runs-into/learned").json()
+    assert (learned["t"], learned["map_revision"], learned["free"]) == (6, 1, [])
+    x, y = 5.0 + 4 * 0.2 + 0.3 * 0.2, 5.0  # where it was stopped
+    shown = client.get(f"/v1/maps/{session['map_id']}").json()
+    assert shown["origin"][2] == 0.0
+    at = np.array(learned["occupied"])
+    xs = shown["origin"][0] + (at % shown["width"] + 0.5) * shown["resolution"]
+    ys = shown["origin"][1] + (at // shown["width"] + 0.5) * shown["resolution"]
+    assert len(at) > 3
+    assert ((xs > x - 0.2) & (xs < x + 0.7) & (abs(ys - y) < 0.5)).all()
 
 
 def test_several_sessions_are_told_in_one_stream(server, client, begin, step):

@@ -20,6 +20,7 @@ from specshield.arrays import Floats
 from specshield.drawing.colors import is_avoided
 from specshield.drawing.outline import outlines
 from specshield.task import Task
+from specshield.world.learned import NONE, LearnedMap
 from specshield.world.regions import Circle, Region, Union
 
 # Widths are in thousandths of the longer side of the map, so that every map looks alike.
@@ -38,6 +39,7 @@ text{font-family:system-ui,sans-serif}.formula{font-family:ui-monospace,monospac
 
 # Of a text below the map, in thousandths of the map's longer side: a letter's height and width, a line's.
 SIZE, LETTER, LINE = 24, 0.62 * 24, 36
+FOUND = 0x70, 0x40, 0xA8  # the colour of cells that were found occupied, and of those found free at a third
 FEWEST = 30  # letters a line: below a narrower map the picture is as wide as its text
 
 
@@ -52,17 +54,20 @@ class Plan:
         self._parts: list[str] = []
         self._lines: list[tuple[str, str]] = []  # (kind, text)
 
-    def walls(self) -> None:
-        """One pixel a cell, turned as the map's origin is."""
+    def walls(self, known: LearnedMap = NONE) -> None:
+        """One pixel a cell, turned as the map's origin is. known: what a session found otherwise."""
         grid = self._task.grid
-        image = Image.fromarray(grid.occupied[::-1].astype(np.uint8))  # one bit each: 16 million in 0.6 s
-        image.putpalette([0, 0, 0, 0x34, 0x38, 0x40])
+        kind = grid.occupied.astype(np.uint8)
+        kind.ravel()[known.cell] = np.where(known.occupied, 2, 3)
+        image = Image.fromarray(kind[::-1])  # 16 million in 0.6 s, as one bit each
+        image.putpalette([0, 0, 0, 0x34, 0x38, 0x40, *FOUND, *FOUND])
         x, y, yaw = grid.origin
         right, down = self._at(x, y)
         wide, high = grid.width * grid.resolution, grid.height * grid.resolution
         turn = f"translate({right:g} {down:g}) rotate({-math.degrees(yaw):g})"
         box = (0.0, -high, wide, high)
-        self._image(image, box, f'class="walls" transform="{turn}"', bits=1, transparency=0)
+        how = f'class="walls" transform="{turn}"'
+        self._image(image, box, how, bits=2 if len(known) else 1, transparency=b"\0\xff\xff\x55")
 
     def heat(self, share: Floats) -> None:
         """share [rows, columns], the first row at the highest y: 0 to 1, NaN where nothing is known."""
@@ -153,7 +158,7 @@ class Plan:
             f'text-anchor="{anchor}">{escape(said)}</text>'
         )
 
-    def _image(self, image: Image.Image, box: Sequence[float], more: str, **png: int) -> None:
+    def _image(self, image: Image.Image, box: Sequence[float], more: str, **png: int | bytes) -> None:
         buffer = io.BytesIO()
         image.save(buffer, "PNG", optimize=True, **png)
         data = base64.b64encode(buffer.getvalue()).decode()
@@ -170,8 +175,5 @@ def _members(region: Region) -> Sequence[Region]:
 
 def _below(region: Region) -> tuple[float, float]:
     """The lowest point of a region's first part, at the middle of its width."""
-    first = _members(region)[0]
-    if isinstance(first, Circle):
-        return first.center[0], first.center[1] - first.radius
-    (left, low), (right, _) = (end(outlines(first)[0], axis=0).tolist() for end in (np.min, np.max))
+    (left, low), (right, _) = (end(outlines(region)[0], axis=0).tolist() for end in (np.min, np.max))
     return (left + right) / 2, low

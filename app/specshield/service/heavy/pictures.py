@@ -23,6 +23,7 @@ from specshield.service.sessions import record, rules
 from specshield.service.settings import Settings
 from specshield.service.storage.keeper import follow_parent
 from specshield.shield.decision import Shield, make_shield
+from specshield.world.learned import LearnedMap, applied
 
 V = TypeVar("V")
 FORK = get_context("fork")
@@ -62,26 +63,30 @@ def draw_policy(settings: Settings, key: str, owner: str) -> tuple[bytes, bool]:
     return plan.svg(), heat is not None
 
 
-def draw_session(settings: Settings, config: dict[str, Any], t: int, rows: Floats, last: bytes) -> bytes:
+def draw_session(
+    settings: Settings, config: dict[str, Any], t: int, rows: Floats, last: bytes, known: LearnedMap
+) -> bytes:
     """Map, regions, the way driven on this map, and the certified continuation of the last decision.
 
-    last: the record of step t and of the last row, empty where that was not decided.
+    last: the record of step t and of the last row, empty where that was not decided. known: of the map.
     """
     about = Description(config["map_id"], config["robot"], config["spec"], "", 0, {})
     task = policies_of(settings).task(about)
     plan = Plan(task, f"session {config['id']} at step {t}")
-    plan.walls()
+    plan.walls(known)
     plan.regions()
     decided = record.decode(last) if last else None
     witness = None if decided is None else decided.witness
     if decided is not None:
         pose, taken = (*rows[-1, :3].tolist(),), (decided.action, decided.completion_action)
-        plan.way(way_ahead(task.grid, task.robot, pose, *taken, witness), "next")
+        plan.way(way_ahead(applied(task.grid, known), task.robot, pose, *taken, witness), "next")
     plan.way(rows[:, :3])
     plan.robot(rows[-1, :3].tolist())
     plan.line(str(task.formula), "ink formula")
     dashed = "" if witness is None else "; dashed: the certified continuation"
     plan.line(f"{config['id']}, step {t}. The line is the way driven{dashed}.", "faint")
+    if len(known):
+        plan.line("Violet is what it found occupied, faint what it found free: not so on the map.", "faint")
     plan.line(f"The rule's last step is {rules.origin(config) + task.horizon}.", "faint")
     return plan.svg()
 

@@ -17,6 +17,7 @@ from specshield.service.schemas.sessions import SessionList, SessionRequest, Ses
 from specshield.service.schemas.steps import (
     CloseRequest,
     CloseResponse,
+    Learned,
     StepRequest,
     StepResponse,
     Trajectory,
@@ -190,6 +191,19 @@ async def trajectory(
     if format == "ndjson" or (format is None and accepts(accept, NDJSON)):
         return StreamingResponse(_each(lines), media_type=NDJSON)
     return StreamingResponse(_listed(lines, rules), media_type="application/json")
+
+
+@router.get(
+    "/{session_id}/learned",
+    response_class=Response,
+    summary="Read what was learned of the map",
+    responses={200: {"model": Learned}, **problems(**GONE)},
+)
+async def learned(key: SessionKey, server: ServerState) -> Response:
+    """The cells that are not as on the map, by `occupied` and `free` points, or contacts. A cell is told as
+    in the `data` of an OccupancyGrid: row by row from the map's origin, `row * width + column`.
+    """
+    return Response(await server.sessions.learned(key), media_type="application/json")
 
 
 async def _each(lines: Iterator[bytes]) -> AsyncIterator[bytes]:

@@ -167,6 +167,14 @@ class CloseResponse(SessionResponse):
     )
 
 
+class Learned(Answer):
+    t: int = Field(description="The step that was decided last; -1: none yet.")
+    map_id: str = Field(description="Id of the map that the cells are of.")
+    map_revision: int = Field(description="How often the session's own map has changed; 0: it is the map.")
+    occupied: list[int] = Field(description="Cells that are free on the map, and were found occupied.")
+    free: list[int] = Field(description="Cells that are occupied on the map, and were found free.")
+
+
 class TrajectoryItem(Answer):
     t: int = Field(description="The step.")
     pose: Pose

@@ -143,6 +143,13 @@ class Session(NamedTuple):
         history.join(self.poses, request.t, np.array(request.poses))
         return record.answer(kept, row, self.rules[ruled.at(self.rules, request.t)]["actions"])
 
+    def learned(self) -> bytes:
+        """The cells that its own map has otherwise than the map, as JSON."""
+        known = self.state.learned
+        about = {"t": self.state.next_t - 1, "map_id": self.config["map_id"], "map_revision": known.revision}
+        occupied, free = (known.cell[known.occupied == held].tolist() for held in (True, False))
+        return files.to_json({**about, "occupied": occupied, "free": free})
+
     def lines(self, steps: Sequence[bytes]) -> Iterator[bytes]:
         """One JSON object a step: t, pose, signals, which rule held, the logits sent, the answer given."""
         for t, row in enumerate(self.rows):

@@ -52,6 +52,7 @@ from specshield.shield import episode
 from specshield.shield.decision import Config, check_preferring
 from specshield.shield.preference import Preference
 from specshield.shield.signals import any_signal
+from specshield.world.learned import LearnedMap
 
 R = TypeVar("R")
 Begun = tuple[dict[str, Any], State, Floats]  # its config, its state without when it expires, its first row
@@ -189,9 +190,14 @@ class Sessions:
         found = there(await self._store.dump(id), id)
         return await self._run(chain.pack, found.config, pack(Session.of(found).rows), found.steps)
 
-    async def last(self, id: str) -> tuple[dict[str, Any], int, Floats, bytes]:
-        """The session's config, its last step, its rows since it came to its map, and the record of the last
-        one, empty where that has none, or was decided by another rule than the one in force.
+    async def learned(self, id: str) -> bytes:
+        """What the session learned of its map, as JSON."""
+        session = Session.of(there(await self._store.load(id), id))
+        return await self._run(session.learned)
+
+    async def last(self, id: str) -> tuple[dict[str, Any], int, Floats, bytes, LearnedMap]:
+        """The session's config, its last step, its rows since it came to its map, the record of the last one,
+        empty where that has none, or was decided by another rule than the one in force, and what was learned.
         """
         found = there(await self._store.dump(id), id)
         session = Session.of(found)
@@ -199,7 +205,7 @@ class Sessions:
         decided = rules.begins(session.config) <= t < len(found.steps)
         came = (rules.begins(b) for a, b in pairwise(session.rules) if a["map_id"] != b["map_id"])
         rows = session.rows[max(came, default=0) :]
-        return dict(session.config), t, rows, found.steps[t] if decided else b""
+        return dict(session.config), t, rows, found.steps[t] if decided else b"", session.state.learned
 
     async def using(self, owner: str, policy_id: str) -> str | None:
         """An owner's session that may still ask this policy, if there is one, archived ones too."""

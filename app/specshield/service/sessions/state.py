@@ -7,6 +7,8 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.shield.decision import Carry
+from specshield.shield.taught import Taught
+from specshield.world.learned import LearnedMap
 
 
 class State(msgspec.Struct, frozen=True, array_like=True):
@@ -38,6 +40,11 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
     def packed(self) -> bytes:
         return _encoder.encode(self)
+
+    @property
+    def learned(self) -> LearnedMap:
+        """As the last decision left it."""
+        return Taught.from_bytes(None if self.carry is None else self.carry.learned).map
 
 
 def own(carry: Carry) -> Carry:

@@ -27,7 +27,7 @@ from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State, own
 from specshield.service.storage.store import Change, Store
 from specshield.shield.decision import Decision
-from specshield.shield.taught import Taught, changes_map
+from specshield.shield.taught import changes_map
 from specshield.task import check_signals
 
 ROOM = 64 << 20  # bytes of sessions kept in memory, some 4,000 of them. Chosen by hand.
@@ -216,7 +216,6 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     carry = state.carry and own(state.carry)
     tables = None
     if carry is not None and changes_map(carry.learned):
-        known = Taught.from_bytes(carry.learned).map
-        shield, tables = shields.tables.of(session.config["nonce"], shield, known)
+        shield, tables = shields.tables.of(session.config["nonce"], shield, state.learned)
     before = record.link(state.head, session.rows[state.next_t :])
     return Decided(session, *decide(shield, asked, request.t, session.since, names, carry, before, tables))

@@ -50,7 +50,7 @@ export class Floor {
     this.rooms = Object.entries(map.rooms).filter(([, room]) => room.type !== "union");
     this.drawn = {}; // the regions, by name
     this.layers = Object.fromEntries(
-      ["walls", "rooms", "regions", "ways", "robots", "marks"].map((name) => [name, svg("g", { class: name })]),
+      ["walls", "learned", "rooms", "regions", "ways", "robots", "marks"].map((name) => [name, svg("g", { class: name })]),
     );
     const keys = `${label}. Plus and minus zoom, arrows move what is seen.`;
     this.element = svg("svg", { class: "floor", role: "img", "aria-label": keys }, ...Object.values(this.layers));
@@ -68,11 +68,15 @@ export class Floor {
     const bitmap = await createImageBitmap(await picture(`v1/maps/${id}/image.png`, { signal }));
     this.occupancy = new Occupancy(this.map, bitmap);
     const [w, h] = [width * resolution, height * resolution];
-    const turned = `translate(${this.at(origin).join(" ")}) rotate(${(-180 * origin[2]) / Math.PI})`;
-    const walls = { href: await this.occupancy.walls(), x: 0, y: -h, width: w, height: h, transform: turned };
+    const walls = { href: await this.occupancy.walls(), x: 0, y: -h, width: w, height: h, transform: this.placed(origin) };
     this.layers.walls.replaceChildren(svg("image", walls));
     this.names();
     return this.occupancy;
+  }
+
+  /** A transform: what is drawn at 0, 0 is then at this pose. */
+  placed(pose) {
+    return `translate(${this.at(pose).join(" ")}) rotate(${(-180 * pose[2]) / Math.PI})`;
   }
 
   /** Writes the names of the rooms, each where it has most space; not of those that are drawn as regions. */

@@ -19,7 +19,8 @@ export class Mark {
     this.body = svg("g", { class: `robot ${color}`, hidden: true }, svg("title", {}, id), this.disc, this.nose);
     floor.layers.ways.append(this.next, this.way);
     floor.layers.robots.append(this.body);
-    this.fits = (point, radius) => !floor.occupancy || floor.occupancy.fits(point, radius);
+    this.occupancy = null; // of its session's own map, where that is another
+    this.fits = (point, radius) => (this.occupancy ?? floor.occupancy)?.fits(point, radius) ?? true;
   }
 
   /** items: of the trajectory up to the one that is shown. What was on another floor, before a switch, is not drawn. */

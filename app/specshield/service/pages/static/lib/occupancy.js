@@ -14,6 +14,16 @@ export class Occupancy {
     for (let i = 0; i < this.occupied.length; i++) this.occupied[i] = data[4 * i] < 128 ? 1 : 0;
   }
 
+  /** The same but for some cells. occupied, free: row * width + column, where row 0 is the lowest. */
+  changed(occupied, free) {
+    const other = Object.assign(Object.create(Occupancy.prototype), this, { occupied: this.occupied.slice() });
+    const { width, height } = this.map;
+    const at = (cell) => (height - 1 - Math.floor(cell / width)) * width + (cell % width);
+    for (const cell of occupied) other.occupied[at(cell)] = 1;
+    for (const cell of free) other.occupied[at(cell)] = 0;
+    return other;
+  }
+
   /** [column, row] of a point; they may lie outside. */
   cell([x, y]) {
     const { origin, resolution, height } = this.map;

@@ -4,6 +4,7 @@ import { ask } from "../lib/api.js";
 import { Chart } from "../lib/chart.js";
 import { el, onceAFrame, percent } from "../lib/dom.js";
 import { Floor } from "../lib/floor.js";
+import { Learned } from "../lib/learned.js";
 import { Mark } from "../lib/mark.js";
 import { measure } from "../lib/rules.js";
 import { Panel } from "./panel.js";
@@ -24,7 +25,8 @@ export class Watch {
     ];
     this.draw = onceAFrame(() => this.show());
     this.replay = new Replay(this.draw);
-    const left = el("div", { class: "stack" }, this.floor.frame, this.replay.element);
+    this.learned = new Learned(this.floor, session, this.mark, this.draw);
+    const left = el("div", { class: "stack" }, this.floor.frame, this.learned.key, this.replay.element);
     this.charted = el("section", { class: "card charts", "aria-label": "Over time" });
     this.charted.append(...this.charts.map(([chart]) => chart.element));
     this.side = el("div", { class: "stack side" }, this.panel.element);
@@ -32,6 +34,7 @@ export class Watch {
   }
 
   async load(signal) {
+    this.signal = signal;
     const { spec, map_id } = this.session;
     const body = { formula: spec.formula, regions: spec.regions, signals: spec.signals, map_id };
     const told = ask("v1/specs/validate", { json: body, signal }).catch(() => ({ avoided: [] }));
@@ -43,6 +46,7 @@ export class Watch {
   push(item) {
     this.items[item.t] = item;
     this.replay.extend(item.t);
+    if (item.decision) this.learned.heard(item, this.signal);
     this.draw();
   }
 
@@ -51,6 +55,7 @@ export class Watch {
     const known = this.items.slice(0, t + 1).filter(Boolean);
     const item = known.at(-1);
     if (!item) return;
+    this.learned.show(known.findLast((each) => each.decision));
     this.mark.show(known);
     this.panel.show(item);
     const decided = this.items.filter((each) => each?.decision);

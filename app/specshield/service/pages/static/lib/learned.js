@@ -1,0 +1,75 @@
+// What a session has learned of its map: the cells that it found otherwise than they are on the map, drawn over it.
+
+import { ask } from "./api.js";
+import { el, svg } from "./dom.js";
+import { patiently, pause } from "./patience.js";
+
+const EVERY = 1000; // [ms] between two reads, at least: a robot with a scanner may change its map at each step
+
+export class Learned {
+  /** session: as the API shows it. mark: of its robot. changed: called when other cells are to be drawn. */
+  constructor(floor, session, mark, changed) {
+    Object.assign(this, { floor, session, mark, changed });
+    const { rules, map_id } = session;
+    this.since = rules[rules.findLastIndex((rule) => rule.map_id !== map_id) + 1].from; // it has been on this map
+    this.known = { t: -1, map_revision: 0, occupied: [], free: [] };
+    this.newest = 0; // revision of the map at the newest decision
+    const { origin, resolution } = floor.map;
+    const transform = `${floor.placed(origin)} scale(${resolution} ${-resolution})`;
+    this.cells = ["occupied", "free"].map((kind) => svg("path", { class: kind, transform }));
+    floor.layers.learned.append(...this.cells);
+    this.key = el("p", { class: "key learned", hidden: true });
+  }
+
+  /** Takes note of a decision, and reads what it has learned; until `signal` ends. */
+  async heard({ t, decision }, signal) {
+    if (t >= this.since) this.newest = decision.map_revision;
+    if (this.reading) return;
+    this.reading = true;
+    try {
+      while (this.known.map_revision < this.newest) {
+        const path = `v1/sessions/${encodeURIComponent(this.session.id)}/learned`;
+        const known = await patiently(() => ask(path, { signal }), signal);
+        if (known.map_id !== this.session.map_id) return; // it has been switched to another, and is shown anew
+        this.take(known);
+        await pause(EVERY);
+      }
+    } catch (error) {
+      if (!signal.aborted && error.status !== 404) throw error; // else it was left, or erased, as others say
+    } finally {
+      this.reading = false;
+    }
+  }
+
+  take(known) {
+    this.known = known;
+    this.own = this.floor.occupancy.changed(known.occupied, known.free);
+    this.cells.forEach((path) => path.setAttribute("d", outline(known[path.getAttribute("class")], this.floor.map.width)));
+    this.changed();
+  }
+
+  /** item: the last one that was decided, up to the step that is shown. */
+  show(item) {
+    const revision = item && item.t >= this.since ? item.decision.map_revision : 0;
+    const { t, occupied, free, map_revision } = this.known;
+    const shown = revision > 0 && occupied.length + free.length > 0;
+    this.floor.layers.learned.toggleAttribute("hidden", !shown);
+    this.key.hidden = !shown;
+    this.mark.occupancy = shown ? this.own : null;
+    const kinds = ["occupied", "free"].filter((kind) => this.known[kind].length);
+    const told = kinds.flatMap((kind) => [el("span", {}, el("i", { class: kind }), `found ${kind}`), " "]);
+    const when = revision === map_revision ? "" : ` What is drawn is from step ${t}.`;
+    this.key.replaceChildren(...told, `The map says otherwise.${when}`);
+  }
+}
+
+/** Cells as a path, in cells from the grid's origin. cells: row * width + column, ascending. */
+function outline(cells, width) {
+  const runs = [];
+  for (let i = 0, n; i < cells.length; i += n) {
+    const first = cells[i];
+    for (n = 1; cells[i + n] === first + n && (first + n) % width; ) n++;
+    runs.push(`M${first % width} ${Math.floor(first / width)}h${n}v1h${-n}z`);
+  }
+  return runs.join("");
+}
