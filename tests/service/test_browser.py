@@ -146,6 +146,27 @@ def test_a_name_that_is_made_to_point_here_is_misdirected(client, tmp_path):
     assert "case1" not in seen
 
 
+def test_its_pages_work_behind_a_proxy_with_a_path_of_its_own(client, browse):
+    elsewhere = []
+
+    def pass_on(route):
+        _, there, path = route.request.url.partition("http://proxy.example/robots/")
+        if not there:
+            elsewhere.append(route.request.url)
+        answer = client.get(f"/{path}")
+        kind = answer.headers["content-type"]
+        route.fulfill(status=answer.status_code, body=answer.content, headers={"content-type": kind})
+
+    with browse() as (page, complaints):
+        page.route("**", pass_on)
+        page.goto("http://proxy.example/robots/docs")
+        page.get_by_text("Is it alive?").click()
+        page.get_by_role("button", name="Execute").click()
+        page.locator(".live-responses-table").wait_for()
+        assert '"status": "ok"' in page.locator(".live-responses-table").inner_text()
+    assert (elsewhere, complaints) == ([], [])
+
+
 def test_the_servers_own_pages_work(client, tmp_path):
     url = f"http://127.0.0.1:{client.base_url.port}/docs"
     assert "Send a map" in see(url, tmp_path, "--virtual-time-budget=20000")

@@ -64,9 +64,8 @@ class Plan:
         x, y, yaw = grid.origin
         right, down = self._at(x, y)
         wide, high = grid.width * grid.resolution, grid.height * grid.resolution
-        turn = f"translate({right:g} {down:g}) rotate({-math.degrees(yaw):g})"
         box = (0.0, -high, wide, high)
-        how = f'class="walls" transform="{turn}"'
+        how = f'class="walls" transform="translate({right:g} {down:g}) rotate({-math.degrees(yaw):g})"'
         self._image(image, box, how, bits=2 if len(known) else 1, transparency=b"\0\xff\xff\x55")
 
     def heat(self, share: Floats) -> None:

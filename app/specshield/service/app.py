@@ -73,6 +73,8 @@ class Application:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         scope["app"] = self.routes
+        if scope.get("path") == "/docs":
+            scope["root_path"] = "."  # what it asks for is beside it, also where a proxy adds a path
         await self._around(scope, receive, send)
 
 
@@ -87,6 +89,7 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
         version=__version__,
         description=DESCRIPTION,
         openapi_tags=TAGS,
+        servers=[{"url": "."}],
         lifespan=lambda app: _life(app, settings, embedded),
         redoc_url=None,
         generate_unique_id_function=lambda route: "_".join([*map(str, route.tags), route.name]),

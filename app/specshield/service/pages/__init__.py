@@ -47,11 +47,8 @@ def files() -> dict[str, File]:
     for path in sorted(FOLDER.rglob("*")):
         if path.suffix in TYPES:
             content = path.read_bytes()
-            tag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
-            kind = TYPES[path.suffix]
-            found[path.relative_to(FOLDER).as_posix()] = File(
-                kind, content, gzip.compress(content, 9, mtime=0), tag
-            )
+            packed, tag = gzip.compress(content, 9, mtime=0), f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+            found[path.relative_to(FOLDER).as_posix()] = File(TYPES[path.suffix], content, packed, tag)
     return found
 
 
