@@ -222,6 +222,43 @@ def test_a_region_takes_any_name_but_a_word_of_the_rules_and_what_is_edited_is_k
     assert complaints == []
 
 
+def test_a_rule_over_a_signal_is_written_and_made(small, browse):
+    """The editor takes its name and first value, says what is no signal, and keeps what was right."""
+    with browse() as (page, complaints):
+        page.goto(small)
+        page.locator(".walls image").wait_for(state="attached")
+        draw(page, Floor(page), "Circle", (1.0, 1.0), (1.5, 1.0), "Dock")
+        rule, signals = page.get_by_role("textbox", name="Rule"), page.get_by_label("Signals")
+        rule.fill("F[0,20] Dock and G[0,20] battery > 10")
+        page.get_by_text("nothing declares 'battery'").wait_for()
+        signals.fill("battery = 9e1; call=0")
+        signals.press("Enter")
+        page.get_by_text("steps 0 to 20").first.wait_for()
+        wrong = page.locator(".signals .wrong")
+        for text, why in (
+            ("battery", '"battery" is not a name, = and a number'),
+            ("battery = much", '"battery = much" is not a name, = and a number'),
+            ("Dock = 1", '"Dock" is the name of another place or signal'),
+            ("a = 1, a = 2", '"a" is the name of another place or signal'),
+            ("x = 1", '"x" stands for the robot\'s own pose'),
+        ):
+            signals.fill(text)
+            signals.press("Enter")
+            assert wrong.inner_text().startswith(why)
+            assert wrong.inner_text().endswith("The rule still has the signals battery = 90, call = 0.")
+        page.reload()
+        assert signals.input_value() == "battery = 90, call = 0"
+        page.get_by_text("steps 0 to 20").first.wait_for()
+        look(page, "signals")
+        with page.expect_request(
+            lambda request: request.method == "POST" and "policies" in request.url
+        ) as sent:
+            page.get_by_role("button", name="Make it").click()
+        assert sent.value.post_data_json["spec"]["signals"] == {"battery": 90, "call": 0}
+        page.locator(".badge.ready").wait_for()
+    assert [each for each in complaints if "422" not in each] == []  # what the rule was refused with
+
+
 def test_regions_are_made_with_a_keyboard_alone(small, browse):
     with browse() as (page, complaints):
         page.goto(small)

@@ -6,15 +6,17 @@ const BODY = ["touches", "inside"]; // operators where a parenthesis follows; el
 const POSE = ["x", "y", "theta"];
 const WORDS = /(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[A-Za-z_]\w*/g; // the numbers and words of a rule
 
-/** Why this cannot be the name of a region, as the end of a sentence; empty where it can. taken: by others. */
-export function unfit(name, taken) {
+/** Why this cannot be the name of a region, or of a signal, as the end of a sentence; empty where it can.
+ *  taken: by others, which are `what`.
+ */
+export function unfit(name, taken, what = "region") {
   if (name === "") return "is empty: write at least one letter";
   if (name.length > LONGEST) return `has ${name.length} characters: at most ${LONGEST} are allowed`;
   if (!/^\w+$/.test(name)) return "cannot be a name: only letters a to z or A to Z, digits and _ are allowed";
   if (/^\d/.test(name)) return "cannot be a name: it begins with a digit; begin with a letter or _";
   if (OPERATORS.includes(name) || BODY.includes(name)) return "is a word of the language of rules: choose another name";
   if (POSE.includes(name)) return "stands for the robot's own pose in rules: choose another name";
-  return taken.includes(name) ? "is the name of another region: choose another name" : "";
+  return taken.includes(name) ? `is the name of another ${what}: choose another name` : "";
 }
 
 /** The text of a rule in which a region has another name. Operators and numbers stay as they are. */

@@ -3,6 +3,7 @@
 import { ask } from "../lib/api.js";
 import { button, el, later } from "../lib/dom.js";
 import { renamed } from "./names.js";
+import { Signals } from "./signals.js";
 import { timeline } from "./timeline.js";
 
 const PATTERNS = [
@@ -15,8 +16,10 @@ export class Rule {
   /** edited: called with the text at each change. told: called with the server's answer for a rule that is right,
    *  with null for one that is not.
    */
-  constructor(text, map, regions, edited, told) {
-    Object.assign(this, { map, regions, edited, told });
+  constructor(text, map, regions, signals, edited, told) {
+    Object.assign(this, { map, regions, signals, edited, told });
+    const places = () => [...Object.keys(regions), ...Object.keys(map.rooms)];
+    this.declared = new Signals(signals, places, () => this.changed());
     this.under = el("pre", { "aria-hidden": "true", class: "under" });
     this.input = el("textarea", {
       id: "rule", rows: 4, spellcheck: "false", autocomplete: "off", autocapitalize: "off", "aria-describedby": "rule-said",
@@ -34,6 +37,7 @@ export class Rule {
       el("div", { class: "text" }, this.under, this.input),
       this.said,
       this.lines,
+      this.declared.element,
       el("details", { class: "help" }, el("summary", {}, "How rules are written"), help()),
     );
     this.check = later(() => this.checkNow(), 200);
@@ -79,7 +83,7 @@ export class Rule {
     this.asked?.abort();
     this.asked = new AbortController();
     if (!text) return this.tell("Draw a region, then say when the robot has to be where.", null);
-    const body = { formula: this.input.value, regions: this.regions, map_id: this.map.id };
+    const body = { formula: this.input.value, regions: this.regions, signals: this.signals, map_id: this.map.id };
     try {
       const answer = await ask("v1/specs/validate", { json: body, signal: this.asked.signal });
       const only = answer.methods.length === 1 ? ` Of the methods only ${answer.methods[0]} takes such a rule.` : "";
@@ -115,6 +119,7 @@ function help() {
     ["G[0,120] not touches(Stairs)", "at no step up to 120 does its body touch Stairs"],
     ["inside(Dock)", "all of its body is in Dock"],
     ["F[0,60] G[0,5] Dock", "it gets there by step 60, and stays for five more"],
+    ["G[0,120] battery > 20", "at no step up to 120 is the signal battery at 20 or below"],
     ["A U[0,30] B", "it is in A until it is in B, by step 30"],
     ["and   or   not   implies", "join parts; a step is one decision"],
   ];

@@ -14,8 +14,8 @@ export async function show(place, { id, signal }) {
   const draft = restored(map.id);
   const rooms = Object.keys(map.rooms);
   let drawn = null; // what the constructors below call before it is there
-  const keep = (formula) => sessionStorage.setItem(`draft-${map.id}`, JSON.stringify({ formula, regions: draft.regions }));
-  const rule = new Rule(draft.formula, map, draft.regions, keep, (answer) => {
+  const keep = (formula) => sessionStorage.setItem(`draft-${map.id}`, JSON.stringify({ ...draft, formula }));
+  const rule = new Rule(draft.formula, map, draft.regions, draft.signals, keep, (answer) => {
     form?.allow(answer !== null);
     if (drawn) {
       drawn.avoided = answer?.avoided ?? [];
@@ -28,7 +28,7 @@ export async function show(place, { id, signal }) {
     rule.changed();
   });
   drawn = regions;
-  const spec = () => ({ map_id: map.id, spec: { formula: rule.text, regions: draft.regions } });
+  const spec = () => ({ map_id: map.id, spec: { formula: rule.text, regions: draft.regions, signals: draft.signals } });
   const form = makeForm(robots, spec);
   place.append(
     el("h1", {}, called(map)),
@@ -42,7 +42,7 @@ export async function show(place, { id, signal }) {
   await floor.load(signal);
 }
 
-/** The draft that this tab keeps of a map. Its regions inherit nothing, so that any name can be one. */
+/** The draft that this tab keeps of a map. Its regions and signals inherit nothing, so that any name can be one. */
 function restored(id) {
   let kept = null;
   try {
@@ -50,7 +50,8 @@ function restored(id) {
   } catch {
     // a draft that cannot be read is none
   }
-  return { formula: kept?.formula ?? "", regions: Object.assign(Object.create(null), kept?.regions) };
+  const [regions, signals] = [kept?.regions, kept?.signals].map((named) => Object.assign(Object.create(null), named));
+  return { formula: kept?.formula ?? "", regions, signals };
 }
 
 function about(map, rooms) {
