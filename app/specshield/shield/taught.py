@@ -198,11 +198,6 @@ def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
     return Care(care.margin, least, care.noise, care.stride, care.chance, barred, on_way and uncertain, room)
 
 
-def changes_map(learned: bytes | None) -> bool:
-    """Whether a session's map has ever changed. learned: as the carry has it."""
-    return learned is not None and len(learned) > HEAD.size
-
-
 def doubtful(
     told: Shield, taught: Taught, prefix: Prefix, nexts: Floats, left_out: Bools
 ) -> tuple[Bools, Bools]:

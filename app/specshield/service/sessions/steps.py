@@ -27,7 +27,6 @@ from specshield.service.sessions.shields import Shields
 from specshield.service.sessions.state import State, own
 from specshield.service.storage.store import Change, Store
 from specshield.shield.decision import Decision
-from specshield.shield.taught import changes_map
 from specshield.task import check_signals
 
 ROOM = 64 << 20  # bytes of sessions kept in memory, some 4,000 of them. Chosen by hand.
@@ -180,9 +179,7 @@ class Steps:
             timing["rollout"] += seconds
             return made
         # A step may take long where the map is no longer as the policies were made for.
-        carry = session.state.carry
-        changed = carry is not None and changes_map(carry.learned)
-        learns = changed or bool(request.occupied) or bool(request.free)
+        learns = bool(request.occupied or request.free or session.state.learned.revision)
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
         cpu: float | None = None
         if learns or not pace.short:
@@ -214,8 +211,6 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     check_signals(names, asked.signals)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
     carry = state.carry and own(state.carry)
-    tables = None
-    if carry is not None and changes_map(carry.learned):
-        shield, tables = shields.tables.of(session.config["nonce"], shield, state.learned)
+    shield, tables = shields.tables.of(session.config["nonce"], shield, state.learned)
     before = record.link(state.head, session.rows[state.next_t :])
     return Decided(session, *decide(shield, asked, request.t, session.since, names, carry, before, tables))
