@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from specshield.errors import InfeasibleStart, PolicyError
 from specshield.policy.methods import Run, load_policy
+from specshield.policy.planner import first_motions
+from specshield.policy.planner import policy as planner
 from specshield.policy.planner.policy import Settings, synthesise
 from specshield.robot import STRETCH, robot_from_json
 from specshield.robot.barred import in_vain
@@ -335,3 +337,26 @@ def test_a_way_is_found_without_the_motions_that_led_nowhere(x):
     free = ~in_vain(barred, history[0], ways, poses, True)
     driven = [task.samples(np.concatenate([history, led])) for led in poses[free]]
     assert any(robustness(task.formula, each) > 0.0 for each in driven)
+
+
+def test_a_robot_of_many_motions_does_not_plan_after_each_of_them_in_vain(monkeypatch):
+    """A wall has no way through: each search costs what it may, and there are as many as the budget has."""
+    occupied = np.zeros((40, 40), np.bool_)
+    occupied[:, 20] = True
+    turns = [{"name": f"turn{k}", "rotate": 0.05 * k} for k in range(1, 60)]
+    actions = [{"name": "wait"}, {"name": "go", "translate": 0.1}, *turns]
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": actions})
+    place = {"A": {"type": "circle", "center": [1.5, 1.0], "radius": 0.2}}
+    task = make_task(OccupancyGrid(occupied, 0.05), robot, "F[0,60] A or F[0,60] A", place)
+    policy, searches = synthesise(task), []
+
+    def search(world, way, nodes, n, effort):
+        searches.append(n)
+        way.spent[0] += effort
+        return False
+
+    monkeypatch.setattr(first_motions, "search", search)
+    monkeypatch.setattr(first_motions, "search_exactly", lambda *_: False)
+    monkeypatch.setattr(planner, "plan_all", first_motions.plan_all.py_func)
+    policy.propose(np.array([[0.5, 1.0, 0.0]]), {}, 0.0)
+    assert 3 <= len(searches) <= 7

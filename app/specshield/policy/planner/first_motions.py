@@ -18,9 +18,9 @@ from specshield.robot.dynamics import motion_count
 from specshield.rule.values import REGIONS
 from specshield.stl.program import STACK_SIZE
 
-# The share of one plan's effort that a first motion may cost which the plan does not begin with; chosen by
-# hand, nothing measured.
-SHARE = 0.25
+# Shares of one plan's effort: of a first motion that the plan does not begin with; and of all searches in
+# vain after these, where they are more than a Stretch has, for which costs are told. By hand, not measured.
+SHARE, IN_VAIN, USUAL_MOTIONS = 0.25, 4.0, 7
 
 
 @kernel
@@ -94,7 +94,7 @@ def plan_all(
     count, steps = motions.shape
     way = make_way(world, t, steps, signals)
     nodes = make_nodes(world.literals.literal.shape[0], count)
-    base = -1
+    base, left = -1, IN_VAIN * effort if count > USUAL_MOTIONS else np.inf
     # First x_t itself (-2); then staying (-1), which others can fall back on; then every other motion.
     for root in range(-2, count):
         m = world.pad if root < 0 else root
@@ -112,14 +112,14 @@ def plan_all(
                 found = _rejoin(world, way, motions[base])
         read_at(world, way, n)
         foresee(world.literals, t + n, way.known, way.held, way.bounds)
-        if not found and is_open(world.literals, way.bounds):
+        if not found and left > 0.0 and is_open(world.literals, way.bounds):
             found = search(world, way, nodes, n, effort * (1.0 if n == 0 else SHARE))
             if not found and root == -2:
                 found = search_exactly(world, way, nodes, effort, most)
+        left -= 0.0 if root < 0 or found else way.spent[0] * count / USUAL_MOTIONS
         if root == -2 and not found:
             continue
-        if root == -2:
-            m = way.motions[0]
+        m = way.motions[0] if root == -2 else m
         if found and base < 0:
             base = m
         if not found:
