@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 
 from specshield.reasons.explanation import explanations
+from specshield.robot import robot_from_json
 from specshield.shield.decision import Config
 from specshield.shield.episode import decide, make_shield
+from specshield.shield.proposal import Proposal
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import FORWARD, MOTIONS, WAIT, Cells, Exhaustive, Scripted
 from tests.reasons.rules_on_cells import dwells, until, visits
 
@@ -227,3 +231,36 @@ def test_what_lacks_the_margin_is_named_and_not_what_was_near_an_edge_before(sla
     assert (decision.j_values[0], decision.j_values[WAIT]) == (1.0, 0.0)
     assert decision.explanations[WAIT].conjunct == "F[0,3] x > 0.4"
     assert "leaves as much of 'F[0,3] x > 0.4'" in decision.explanations[WAIT].detail
+
+
+@pytest.mark.parametrize(("turns", "asked"), [(2, 5 * 6), (60, 42)])
+def test_of_many_forbidden_actions_no_more_ways_are_asked_for_than_of_a_few(turns, asked):
+    angles = (math.pi * k / turns for k in range(1, turns + 1))
+    moves = [{"name": "wait"}, {"name": "go", "translate": 0.2}, {"name": "back", "translate": -0.2}]
+    actions = [*moves, *({"name": f"turn{k}", "rotate": angle} for k, angle in enumerate(angles))]
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": actions})
+    grid, place = OccupancyGrid(np.zeros((99, 99)), 0.05), {"type": "circle", "center": [4, 4], "radius": 0.1}
+    policy = Counted(make_task(grid, robot, "F[0,60] A", {"A": place}))
+    history = np.tile([1.0, 1.0, 0.0], (58, 1))  # too late for all
+    shield, logits = make_shield([policy]), np.zeros(len(actions))
+    decide(shield, history, logits)
+    before = policy.asked
+    found = decide(shield, history, logits, explain=explanations).explanations
+    assert None not in found
+    assert policy.asked - 2 * before == asked
+
+
+class Counted:
+    """Proposes to stand, and counts how often it is asked."""
+
+    id, asked = "counted", 0
+
+    def __init__(self, task):
+        self.task = task
+
+    def propose(self, history, signals, margin):
+        self.asked += 1
+        count = len(self.task.robot.motions)
+        motions = np.zeros((count, self.task.horizon + 1 - len(history)), np.int64)
+        motions[:, 0] = np.arange(count)
+        return Proposal(motions, 0)

@@ -52,7 +52,8 @@ def doctor(
 
 def _checks(url: str | None, port: int) -> Iterator[Callable[[], Iterator[Finding]]]:
     """Each imports its part of a server when it is due. A setting that is not valid is told once."""
-    yield from (_python, _parts, _kernels)
+    yield partial(iter, [Finding("ok", f"Python {sys.version.split()[0]}, specshield {__version__}")])
+    yield from (_parts, _kernels)
     from specshield.service.settings import read_settings
 
     try:
@@ -78,10 +79,6 @@ def _shown(check: Callable[[], Iterator[Finding]]) -> int:
         print(f"wrong  {error}")
         return wrong + 1
     return wrong
-
-
-def _python() -> Iterator[Finding]:
-    yield Finding("ok", f"Python {sys.version.split()[0]}, specshield {__version__}")
 
 
 def _parts() -> Iterator[Finding]:

@@ -13,25 +13,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 
 from specshield.arrays import Bools, Floats, Ints
 from specshield.reasons.lateness import driven, in_words, late_by, later, steps, values_of, when
-from specshield.robot.dynamics import motion_count, step
+from specshield.robot.dynamics import motion_count
 from specshield.robot.room import ROOM
 from specshield.rule.early import conjunction_of, find_open, rate_open
 from specshield.rule.residual import again, left_over
 from specshield.shield.decision import Explanation, Shield
 from specshield.shield.feasibility import Prefix, rho_of
 from specshield.shield.judgement import Judged
-from specshield.shield.proposal import ask
+from specshield.shield.proposal import adapted, ask
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
-# Chosen by hand; an explanation costs some 10 ms.
+# Chosen by hand; the seven motions of a Stretch have all that they can have of what the last three limit.
 DEPTH = 2  # motions after which a witness is met again
 EARLIER = (1, 2, 4, 8, 16, 32)  # steps by which the proposers' clock is put back
+ASKED, WITNESSES, MET = 42, 7, 49  # times that it is in one decision; ways to meet; places to meet them from
 SAME = 1e-6  # [m] and [rad]: poses this near are one pose
 
 Rank = tuple[int, float]
@@ -50,21 +52,24 @@ def explanations(
     robot = shield.task.robot
     if judged is None or not prefix.formula.names:
         return (None,) * len(robot.actions)
-    found: dict[int, Explanation] = {}
-    for motion in np.flatnonzero(~judged.feasible_motion).tolist():
-        found[motion] = _Motion(shield, prefix, judged, motion, bool(doubtful[motion])).explained()
+    shield = replace(shield, proposers=tuple(adapted(each, "briefly") for each in shield.proposers))
+    found, forbidden = dict[int, Explanation](), np.flatnonzero(~judged.feasible_motion).tolist()
+    for n, motion in enumerate(forbidden):
+        most = ASKED * (n + 1) // len(forbidden) - ASKED * n // len(forbidden)
+        found[motion] = _Motion(shield, prefix, judged, motion, bool(doubtful[motion]), most).explained()
     return tuple(found.get(motion) for motion in robot.motion_of.tolist())
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """A motion from x_t that is forbidden."""
+    """A motion from x_t that is forbidden. most: how often the clock is put back for it."""
 
     shield: Shield
     prefix: Prefix
     judged: Judged
     motion: int
     doubtful: bool
+    most: int
 
     def explained(self) -> Explanation:
         """By its most telling future: one that keeps all conjuncts, best with less to spare than J asks for;
@@ -82,9 +87,8 @@ class _Motion:
             asked = self.asked(parts, rho, poses)
             for n in range(len(rows)):
                 row = {name: values[n] for name, values in samples.items()}
-                order, told = self.shows(parts, rho[:, n], asked[:, n], row)
-                if order < rank:
-                    best, rank = told, order
+                told = self.shows(parts, rho[:, n], asked[:, n], row)
+                rank, best = min((rank, best), told, key=itemgetter(0))
         return best
 
     def parts(self) -> list[Formula]:
@@ -196,13 +200,11 @@ class _Motion:
         shield, prefix, tried = self.shield, self.prefix, self.judged.tried
         own = tried.motions[tried.motions[:, 0] == self.motion]
         yield 0, own if len(own) else np.full((1, prefix.steps), self.motion)
-        x_next = _after(shield, prefix.poses[-1], self.motion)
+        x_next = driven(shield, prefix.poses[-1:], np.array([[self.motion]]))[0, -1]
         for ways in self.rejoined(x_next).values():
             yield 0, np.array(ways)
-        before = 0
-        for earlier in EARLIER:
-            if earlier > prefix.t + 1:
-                return
+        before, possible = 0, [each for each in EARLIER if each <= prefix.t + 1]
+        for earlier in possible[max(len(possible) - self.most, 0) :]:
             # As though x_{t+1} were reached `earlier` steps sooner than it is.
             upto = prefix.t + 1 - earlier
             history = np.concatenate([prefix.poses[:upto], x_next[None]])
@@ -217,11 +219,11 @@ class _Motion:
 
     def rejoined(self, x_next: Floats) -> dict[int, list[Ints]]:
         """Goes on by another action's witness from where that is met again: ways by the steps they lose."""
-        shield, tried, found = self.shield, self.judged.tried, dict[int, list[Ints]]()
-        x_t, rows = self.prefix.poses[-1:], self.judged.aimed.best.row[self.judged.feasible_motion].tolist()
+        shield, tried, x_t = self.shield, self.judged.tried, self.prefix.poses[-1:]
+        rows = self.judged.aimed.best.row[self.judged.feasible_motion][:WITNESSES]
         ways = [(tried.motions[row], np.concatenate([x_t, tried.poses[row]])) for row in rows]
-        front = [(x_next, [self.motion])]
-        for depth in range(DEPTH + 1 if ways else 0):
+        front, found = [(x_next, [self.motion])], dict[int, list[Ints]]()
+        for _ in range(DEPTH + 1 if ways else 0):
             for pose, taken in front:
                 for motions, poses in ways:
                     off = np.abs(poses[: len(taken)] - pose)
@@ -230,17 +232,12 @@ class _Motion:
                     if len(met):
                         way = np.append(taken, motions[met[-1] :])
                         found.setdefault(len(taken) - int(met[-1]), []).append(way)
-            if found:
+            if found or len(front) * motion_count(shield.body) > MET:
                 break
-            if depth < DEPTH:
-                front = [
-                    (_after(shield, pose, m), [*taken, m])
-                    for pose, taken in front
-                    for m in range(motion_count(shield.body))
-                ]
+            each = np.arange(motion_count(shield.body))[:, None]
+            front = [
+                (end, [*taken, m])
+                for pose, taken in front
+                for m, end in enumerate(driven(shield, pose[None], each)[:, -1])
+            ]
         return dict(sorted(found.items()))
-
-
-def _after(shield: Shield, pose: Floats, motion: int) -> Floats:
-    x, y, theta = pose.tolist()
-    return np.array(step(shield.body, x, y, theta, motion), np.float64)

@@ -113,18 +113,15 @@ class _Gathered:
 
     def judge(self, motions: Ints) -> None:
         """motions [n, m]: from x_t to the horizon, or to some steps after it."""
-        samples = self.shield.task.samples(
-            driven(self.shield, self.known.history, motions), self.known.signals
-        )
+        task, known = self.shield.task, self.known
+        samples = task.samples(driven(self.shield, known.history, motions), known.signals)
         rows = [{name: values[n] for name, values in samples.items()} for n in range(len(motions))]
         rho = np.array([values_of(part, samples) for part in self.parts])
         keeps = np.flatnonzero((rho > SATISFIED_ABOVE).all(axis=0))
         if self.way is None and len(keeps):
-            steps = self.shield.task.horizon - self.known.now
-            self.way = motions[keeps[0], : max(steps, 0)].astype(np.uint8).tobytes()
+            self.way = motions[keeps[0], : max(task.horizon - known.now, 0)].astype(np.uint8).tobytes()
         self.rho.append(rho)
-        now = self.known.now
-        self.late.append(np.array([[_late(part, row, now) for row in rows] for part in self.parts]))
+        self.late.append(np.array([[_late(part, row, known.now) for row in rows] for part in self.parts]))
 
     def kept(self, i: int) -> bool:
         return any(bool((rho[i] > SATISFIED_ABOVE).any()) for rho in self.rho)

@@ -87,6 +87,9 @@ class PlannerPolicy(Carded):
         """The policy on another map: its fields lead as they did, its ways are those that there are."""
         return replace(self, share=GUESSED if guess else 1.0)._in(self._world._replace(body=body))
 
+    def briefly(self) -> PlannerPolicy:  # as reachability's
+        return self.on_body(self._world.body, guess=True)
+
     def avoiding(self, barred: Floats) -> PlannerPolicy:
         """The policy for a robot that some motions led nowhere (robot/barred.py)."""
         return self._in(self._world._replace(barred=barred))

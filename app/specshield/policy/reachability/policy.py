@@ -69,6 +69,7 @@ class ReachabilityPolicy(Carded):
     barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
     early: int = 0  # [steps] as `hurried` has it
     wanted: Bools | None = None  # [M] the first motions to propose ways after; None: all of them
+    most: int = POSES  # of a search around; with fewer only the way that it would go itself is looked for
 
     @cached_property
     def _rules(self) -> Rules:
@@ -91,6 +92,9 @@ class ReachabilityPolicy(Carded):
         proposes nothing to a robot that cannot wait, nor where its tables say that it would come too late.
         """
         return self._but(self._body, early=steps, wanted=wanted)
+
+    def briefly(self) -> ReachabilityPolicy:  # for an explanation, which asks for many ways and goes none
+        return self._but(self._body, most=FEWER)
 
     def keeping_clear(self) -> ReachabilityPolicy:
         """The policy for ways with room beside them (robot/room.py); itself where it has no such tables."""
@@ -123,8 +127,7 @@ class ReachabilityPolicy(Carded):
     @cached_property
     def _top(self) -> Floats:
         """The latest feasible time of each table [steps]."""
-        code = self.tables.code
-        highest = np.where(code == INVALID, 0, code).max(axis=(1, 2), initial=0)
+        highest = np.where(self.tables.code == INVALID, 0, self.tables.code).max(axis=(1, 2), initial=0)
         return np.asarray((highest - 1.0) / STEP_CODES, np.float64)
 
     def remade(self, grid: OccupancyGrid) -> ReachabilityPolicy:
@@ -144,7 +147,7 @@ class ReachabilityPolicy(Carded):
         rows = signal_rows(self.task, signals, len(history))
         shape = len(self.task.robot.motions), self.task.horizon + 1 - len(history)
         chosen, least = (slice(None), -np.inf) if self.wanted is None else (self.wanted, HURRIED)
-        wanted = np.full(shape[0], True) if self.wanted is None else self.wanted.copy()
+        wanted = np.full(shape[0], self.most == POSES) if self.wanted is None else self.wanted.copy()
         proposals = []
         for past in pasts(rules, history, rows):
             guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
@@ -173,7 +176,7 @@ class ReachabilityPolicy(Carded):
             if not self.guess and self.wanted is None and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
                 if not is_known(guide, past, free):
-                    around = go_around(guide, past, self._fields, poses, ways, POSES)
+                    around = go_around(guide, past, self._fields, poses, ways, self.most)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))
         return joined(*proposals or [Proposal(np.empty((0, shape[1]), np.int64), 0)])

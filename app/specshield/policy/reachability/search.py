@@ -63,8 +63,8 @@ class Starts(NamedTuple):
 
 @kernel
 def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats) -> tuple[Starts, Scratch]:
-    """Makes every motion once from x_t. Twins are wanted together. The arguments are those of
-    `continue_all`.
+    """Makes every motion once from x_t. Twins are wanted together; if none is, the one of most slack. The
+    arguments are those of `continue_all`.
     """
     body, rules, (count, _) = guide.body, guide.rules, motions.shape
     now, k_count = resume(rules, past), rules.kind.shape[0]
@@ -84,9 +84,12 @@ def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats)
         copy_progress(scratch.status, scratch.run, status[m], run[m])
         slacks[m] = slack(guide, x, y, theta, now.t + 1, scratch)
     find_twins(poses, twin)
+    order, settled = np.argsort(-slacks, kind="mergesort"), np.zeros(count, np.bool_)
+    if not np.any(wanted):
+        waits = guide.wait >= 0 and slacks[guide.wait] == slacks[order[0]]
+        wanted[guide.wait if waits else order[0]] = True
     for m in range(count):
         wanted[twin[m]] |= wanted[m]
-    order, settled = np.argsort(-slacks, kind="mergesort"), np.zeros(count, np.bool_)
     sibling = np.empty(3, np.int64)
     starts = Starts(
         now, motions, poses, status, run, slacks, turn, move, settled, twin, order, wanted, sibling
