@@ -246,6 +246,11 @@ def test_a_rule_over_a_signal_is_written_and_made(small, browse):
             signals.press("Enter")
             assert wrong.inner_text().startswith(why)
             assert wrong.inner_text().endswith("The rule still has the signals battery = 90, call = 0.")
+        name = page.get_by_label("Name of the region")
+        name.fill("battery")
+        name.press("Enter")
+        page.get_by_text('"battery" is the name of another region or signal').wait_for()
+        assert rule.input_value() == "F[0,20] Dock and G[0,20] battery > 10"
         page.reload()
         assert signals.input_value() == "battery = 90, call = 0"
         page.get_by_text("steps 0 to 20").first.wait_for()

@@ -9,7 +9,7 @@ const WORDS = /(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[A-Za-z_]\w*/g; // the numbe
 /** Why this cannot be the name of a region, or of a signal, as the end of a sentence; empty where it can.
  *  taken: by others, which are `what`.
  */
-export function unfit(name, taken, what = "region") {
+export function unfit(name, taken, what) {
   if (name === "") return "is empty: write at least one letter";
   if (name.length > LONGEST) return `has ${name.length} characters: at most ${LONGEST} are allowed`;
   if (!/^\w+$/.test(name)) return "cannot be a name: only letters a to z or A to Z, digits and _ are allowed";

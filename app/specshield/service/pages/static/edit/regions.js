@@ -6,9 +6,9 @@ import { unfit } from "./names.js";
 import { numbers } from "./numbers.js";
 
 export class Regions {
-  /** regions: by name; changed: called when they are others. taken: names that rooms have. */
-  constructor(floor, regions, taken, changed) {
-    Object.assign(this, { floor, regions, taken, changed });
+  /** regions, signals: by name; changed: called when the regions are others. rooms: the names of the map's rooms. */
+  constructor(floor, regions, signals, rooms, changed) {
+    Object.assign(this, { floor, regions, signals, rooms, changed });
     this.drawing = new Drawing(floor, (region) => this.add(region));
     this.list = el("ul", { class: "regions" }, Object.keys(regions).map((name) => this.row(name)));
     this.element = el("section", { class: "card", "aria-label": "Regions" }, el("h2", {}, "Regions"), this.drawing.elements, this.list);
@@ -16,8 +16,9 @@ export class Regions {
   }
 
   add(region) {
+    const taken = [...this.taken(), ...this.rooms];
     let n = 1;
-    while (Object.hasOwn(this.regions, `Region${n}`) || this.taken.includes(`Region${n}`)) n++;
+    while (taken.includes(`Region${n}`)) n++;
     const name = `Region${n}`;
     this.regions[name] = region;
     const row = this.row(name);
@@ -28,6 +29,11 @@ export class Regions {
     row.querySelector("input").select();
   }
 
+  /** The names that no further region can have. It can have that of a room, which it then stands for. */
+  taken() {
+    return [...Object.keys(this.regions), ...Object.keys(this.signals)];
+  }
+
   row(name) {
     const wrong = el("p", { class: "wrong", role: "alert" });
     const tell = (text) => (wrong.textContent = text);
@@ -36,7 +42,7 @@ export class Regions {
     const row = el("li", {}, field, el("span", { class: "numbers" }, numbers(this.regions[name], () => this.redraw(), tell)), away, wrong);
     const named = () => {
       const to = field.value.trim();
-      const why = to === name ? "" : unfit(to, Object.keys(this.regions));
+      const why = to === name ? "" : unfit(to, this.taken(), "region or signal");
       field.setAttribute("aria-invalid", String(why !== ""));
       tell(why && `"${to}" ${why}. The region is still called ${name}.`);
       if (why) return;

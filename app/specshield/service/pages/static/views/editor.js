@@ -22,7 +22,7 @@ export async function show(place, { id, signal }) {
       drawn.redraw(false);
     }
   });
-  const regions = new Regions(floor, draft.regions, rooms, (name, renamed) => {
+  const regions = new Regions(floor, draft.regions, draft.signals, rooms, (name, renamed) => {
     if (renamed) rule.renamed(...renamed);
     rule.show(renamed ? renamed[1] : name);
     rule.changed();
