@@ -8,6 +8,7 @@ import asyncio
 import signal
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from uvicorn.supervisors.multiprocess import Process
@@ -76,6 +77,11 @@ def _tell(told: Callable[[Callable[[], object]], None], *numbers: signal.Signals
     """Has `told` called for these signals, with what one did before; uvicorn puts its caller's handlers back
     at the end. Not for a server inside another program, which has signals of its own.
     """
-    for number in numbers if threading.current_thread() is threading.main_thread() else ():
-        stop: Any = signal.getsignal(number)
-        signal.signal(number, lambda *about, stop=stop: told(lambda: callable(stop) and stop(*about)))
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for number in numbers:
+        signal.signal(number, partial(_handle, told, signal.getsignal(number)))
+
+
+def _handle(told: Callable[[Callable[[], object]], None], before: Any, number: int, frame: Any) -> None:
+    told(partial(before, number, frame) if callable(before) else lambda: None)

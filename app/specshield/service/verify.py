@@ -112,7 +112,7 @@ def differences(found: Chain, shields: Sequence[Shield]) -> Iterator[tuple[int, 
 
 def _again(
     found: Chain, shield: Shield, t: int, kept: StepRecord, carry: Carry | None
-) -> tuple[StepRecord, Carry]:
+) -> tuple[StepRecord, Carry | None]:
     rule = found.rule_at(t)
     config, names = found.configs[rule], found.names[rule]
     rows = found.rows[config.origin : t + 1, : 3 + len(names)]

@@ -102,7 +102,9 @@ class Keys:
             await asyncio.sleep(max(0.0, self._tried_at + MISS_EVERY - time.monotonic()))
             began = time.monotonic()
             try:
-                version = await _reached(self._store.hget(KEYS, "")) or (self._version and b"")  # emptied
+                version = await _reached(self._store.hget(KEYS, ""))
+                if version is None and self._version is not None:
+                    version = b""  # the store was emptied
                 if version is not None and version != self._version:
                     listed = {key.digest: key for key in await self.listed()}
                     self._known, self._version = {**self._own, **listed}, version

@@ -175,13 +175,9 @@ async def delete(policy_id: PolicyId, server: ServerState, owner: Owner) -> Resp
     try:
         session = await server.sessions.using(owner, record.id)
         if session is not None:
-            raise InUse(
-                f"session {session!r} still uses this policy",
-                path="policy_id",
-                got=policy_id,
-                expected="a policy that no session uses: close the session first",
-                session_id=session,
-            )
+            told = f"session {session!r} still uses this policy"
+            expected = "a policy that no session uses: close the session first"
+            raise InUse(told, path="policy_id", got=policy_id, expected=expected, session_id=session)
         if await asyncio.to_thread(server.policies.delete, record, owner, token):
             await asyncio.to_thread(server.jobs.forget, record.id)
     finally:

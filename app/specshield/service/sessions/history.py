@@ -30,13 +30,8 @@ def join(stored: Floats, t: int, poses: Floats) -> Floats:
             expected=f"1 to {t + 1} poses, the last of them x_{t}",
         )
     if first > length:
-        raise HistoryGap(
-            f"the poses begin at step {first}; the server has those before step {length}",
-            path="poses",
-            got=first,
-            expected=f"poses from step {length} or earlier up to step {t}",
-            expected_t=length,
-        )
+        told = f"the poses begin at step {first}; the server has those before step {length}"
+        raise gap(told, first, length, t)
     overlap = min(length, t + 1) - first
     if overlap == 0:
         return poses
@@ -52,6 +47,12 @@ def join(stored: Floats, t: int, poses: Floats) -> Floats:
             stored=stored[first + row].tolist(),
         )
     return poses[overlap:]
+
+
+def gap(told: str, got: int | None, length: int, t: int) -> HistoryGap:
+    """The error where the server has poses up to before step `length`, and those up to t do not follow."""
+    expected = f"poses from step {length} or earlier up to step {t}"
+    return HistoryGap(told, path="poses", got=got, expected=expected, expected_t=length)
 
 
 def agree(a: Floats, b: Floats) -> Bools:

@@ -132,14 +132,10 @@ class Session(NamedTuple):
             and _equal(asked.occupied, before.occupied)
             and _equal(asked.free, before.free)
         ):
-            raise StepConflict(
-                f"step {request.t} was decided for another x_t, logits, signals, main_task_done, occupied or "
-                "free",
-                path="t",
-                got=request.t,
-                expected=f"the same request again, or step {self.state.next_t}",
-                expected_t=self.state.next_t,
-            )
+            t, ahead = request.t, self.state.next_t
+            told = f"step {t} was decided for another x_t, logits, signals, main_task_done, occupied or free"
+            expected = f"the same request again, or step {ahead}"
+            raise StepConflict(told, path="t", got=t, expected=expected, expected_t=ahead)
         history.join(self.poses, request.t, np.array(request.poses))
         return record.answer(kept, row, self.rules[ruled.at(self.rules, request.t)]["actions"])
 

@@ -222,10 +222,9 @@ class Sessions:
     async def _check_room(self, key: Key) -> list[Limit]:
         """A caller's limits. Raises LimitReached where one is reached."""
         if self._store.full:
-            raise LimitReached(
-                f"the archive holds {self._settings.archive_bytes} bytes, and takes no more sessions",
-                expected="room: delete sessions; the server's operator can raise SPECSHIELD_ARCHIVE_BYTES",
-            )
+            told = f"the archive holds {self._settings.archive_bytes} bytes, and takes no more sessions"
+            expected = "room: delete sessions; the server's operator can raise SPECSHIELD_ARCHIVE_BYTES"
+            raise LimitReached(told, expected=expected)
         both = ((None, self._settings.max_sessions), (key.name, key.sessions))
         limits: list[Limit] = [(owner, most) for owner, most in both if most is not None]
         for owner, most in limits:
@@ -270,7 +269,7 @@ def begin(
         spec_status=status,
         expires_at=0.0,
         head=record.digest(files.to_json(config)),
-        carry=carry and own(carry),
+        carry=own(carry),
         any_signal=any_signal(shield, rows[:, :3]),
     )
     return config, state, rows

@@ -47,9 +47,9 @@ class State(msgspec.Struct, frozen=True, array_like=True):
         return Taught.from_bytes(None if self.carry is None else self.carry.learned).map
 
 
-def own(carry: Carry) -> Carry:
+def own(carry: Carry | None) -> Carry | None:
     """The same with poses that nothing else holds, and that are writable: kernels were compiled for that."""
-    return carry._replace(next_poses=carry.next_poses.copy())
+    return None if carry is None else carry._replace(next_poses=carry.next_poses.copy())
 
 
 def _poses(_: type, stored: bytes) -> Floats:

@@ -210,7 +210,7 @@ def decided(shields: Shields, session: Session, request: StepBody) -> Decided:
     shield, asked, names, state = shields.of(session), asked_of(request), session.signal_names, session.state
     check_signals(names, asked.signals)
     session = shields.settled(session.extended(request.t, np.array(request.poses, np.float64), asked.signals))
-    carry = state.carry and own(state.carry)
+    carry = own(state.carry)
     shield, tables = shields.tables.of(session.config["nonce"], shield, state.learned)
     before = record.link(state.head, session.rows[state.next_t :])
     return Decided(session, *decide(shield, asked, request.t, session.since, names, carry, before, tables))

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from specshield.arrays import Floats
-from specshield.errors import HistoryGap, InputError, LimitReached, SpecshieldError
+from specshield.errors import InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION
 from specshield.reasons import refusal
 from specshield.service.heavy.heavy import Heavy
@@ -113,21 +113,15 @@ def _wanted(
     t = request.t
     session.check_ahead(t, f"step {t} is decided, or was passed over: no other rule can hold there")
     if len(session.rules) >= rules.MOST_RULES:
-        raise LimitReached(
-            f"a session has at most {rules.MOST_RULES} rules", expected="a new session for what follows"
-        )
+        told = f"a session has at most {rules.MOST_RULES} rules"
+        raise LimitReached(told, expected="a new session for what follows")
     if request.poses is not None:
         session = session.extended(t, np.array(request.poses), {})
     if len(session.rows) > t:
         return Wanted(session, t, policy_ids, request.clock, session.rows[t])
     if len(session.rows) < t or step is None:
-        raise HistoryGap(
-            f"the server does not know where the robot is at step {t}",
-            path="poses",
-            got=None,
-            expected=f"poses from step {len(session.rows)} or earlier up to step {t}",
-            expected_t=len(session.rows),
-        )
+        told = f"the server does not know where the robot is at step {t}"
+        raise history.gap(told, None, len(session.rows), t)
     row = session.rows[-1].copy()
     row[:3] = _foreseen(session, step)
     return Wanted(session, t, policy_ids, request.clock, row)
@@ -161,12 +155,9 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
     signals = task.signals
     names = [*session.signal_names, *rules.added(session.signal_names, signals)]
     if len(names) > record.MOST_SIGNALS:
-        raise InputError(
-            "the session's rules have too many signals together",
-            path="policy_id",
-            got=len(names),
-            expected=f"at most {record.MOST_SIGNALS}; or a new session for this rule",
-        )
+        told = "the session's rules have too many signals together"
+        expected = f"at most {record.MOST_SIGNALS}; or a new session for this rule"
+        raise InputError(told, path="policy_id", got=len(names), expected=expected)
     before = record.link(session.state.head, session.rows[session.state.next_t : t])
     config = {
         **old,
@@ -185,7 +176,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         rows=rules.widened(session.rows, session.signal_names, signals),
         signal_names=names,
     )
-    carry = session.state.carry and own(session.state.carry)
+    carry = own(session.state.carry)
     known = rules.carried_over(carry, old, config)
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
@@ -202,7 +193,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         feasible=True,
         spec_status=status,
         head=record.digest(files.to_json(config)),
-        carry=carry and own(carry),
+        carry=own(carry),
         verdicts=(*session.state.verdicts, verdict),
         any_signal=any_signal(shield, seen[:, :3], rules.signals_in(seen, names)),
     )
