@@ -16,7 +16,9 @@ from specshield.service.sessions.state import State
 from specshield.service.settings import Settings
 from specshield.service.storage.store import Record
 from specshield.shield.decision import Carry
+from specshield.shield.taught import Taught
 from specshield.task import Task
+from specshield.world.learned import LearnedMap
 from tests.service.world import LOGITS, START, grid_json, policy_files
 
 ROUNDS = 8
@@ -49,6 +51,16 @@ def test_a_session_of_a_large_rule_takes_the_place_of_many(large):
     recent.drop("large")
     recent.put("small", session())
     assert recent.peek("small") is not None
+
+
+def test_whether_a_session_has_learned_is_known_without_unpacking_what():
+    """It is asked at each step, on the event loop; what was learned may take milliseconds to unpack."""
+    carry = Carry(0, np.zeros((4, 3)), (None,) * 4)
+    known = [Taught().to_bytes(), Taught(LearnedMap(revision=1)).to_bytes()]
+    carries = [None, carry, *(carry._replace(learned=each) for each in known)]
+    states = [State(1, 1, True, "pending", 0.0, b"", carry=each) for each in carries]
+    assert [state.has_learned for state in states] == [False, False, False, True]
+    assert [state.learned.revision for state in states] == [0, 0, 0, 1]
 
 
 async def _held(many):

@@ -7,7 +7,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.shield.decision import Carry
-from specshield.shield.taught import Taught
+from specshield.shield.taught import HEAD, Taught
 from specshield.world.learned import LearnedMap
 
 
@@ -40,6 +40,11 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
     def packed(self) -> bytes:
         return _encoder.encode(self)
+
+    @property
+    def has_learned(self) -> bool:
+        """Whether the session's map has ever changed, without unpacking it."""
+        return self.carry is not None and len(self.carry.learned or b"") > HEAD.size
 
     @property
     def learned(self) -> LearnedMap:

@@ -179,7 +179,7 @@ class Steps:
             timing["rollout"] += seconds
             return made
         # A step may take long where the map is no longer as the policies were made for.
-        learns = bool(request.occupied or request.free or session.state.learned.revision)
+        learns = bool(request.occupied or request.free or session.state.has_learned)
         pace = self._paces.get((session.config["shaping"], *ids), Pace)
         cpu: float | None = None
         if learns or not pace.short:
