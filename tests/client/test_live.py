@@ -169,6 +169,8 @@ def test_the_trajectory_stays_until_the_session_is_deleted(client):
         session.step(pose, model(session, 5))
         decision = session.step(pose, model(session, 5))
         verdict = session.close(decision.next_poses[decision.execute])
+    known = session.learned()
+    assert (known.t, known.map_id, known.occupied, known.free) == (1, session.info.map_id, (), ())
     items = session.trajectory()
     assert [item.t for item in items] == [0, 1, 2]
     assert items[0].pose == pytest.approx(pose)

@@ -8,7 +8,7 @@ from client_script import SESSION, answer, drive, lost, problem
 
 from specshield import errors
 from specshield.client import wire
-from specshield.client.models import SessionInfo, build
+from specshield.client.models import Learned, SessionInfo, build
 from specshield.client.state import SessionState
 
 M, B, END = 0, 1, 2
@@ -246,6 +246,13 @@ def test_the_trajectory_is_typed():
     trajectory, _, _ = drive(session()._trajectory(), answer({"items": items, "next": None}))
     assert [item.pose[0] for item in trajectory] == [0, 1]
     assert (trajectory[0].decision["mode"], trajectory[1].decision) == ("shaped", None)
+
+
+def test_what_was_learned_is_typed():
+    told = {"t": 2, "map_id": "m", "map_revision": 1, "occupied": [425, 466], "free": []}
+    learned, (request,), _ = drive(session()._learned(), answer(told))
+    assert request.path.endswith("/learned")
+    assert learned == Learned(2, "m", 1, (425, 466), ())
 
 
 VERDICT = answer({"id": "s", "spec_status": "violated", "robustness_bounds": [None, -0.5]})

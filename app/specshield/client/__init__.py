@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from specshield.client.models import (
         Decision,
         Explanation,
+        Learned,
         LocalDecision,
         Map,
         Policy,
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
     from specshield.client.sync import Session, ShieldClient
 
 __all__ = [
-    "AsyncSession", "AsyncShieldClient", "Decision", "Explanation", "LocalDecision", "Map", "Policy",
-    "Residual", "Session", "SessionInfo", "ShieldClient", "Spec", "TrajectoryItem", "Verdict",
+    "AsyncSession", "AsyncShieldClient", "Decision", "Explanation", "Learned", "LocalDecision", "Map",
+    "Policy", "Residual", "Session", "SessionInfo", "ShieldClient", "Spec", "TrajectoryItem", "Verdict",
 ]  # fmt: skip
 
 _SHELLS = {"AsyncSession": "aio", "AsyncShieldClient": "aio", "Session": "sync", "ShieldClient": "sync"}

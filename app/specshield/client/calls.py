@@ -202,9 +202,8 @@ def wait_policy(
                     log.warning("policy %s: %s", id, warning)
                 return policy
         if seconds >= timeout:
-            raise TransportTimeout(
-                f"policy {id} is {policy.status} ({policy.progress:.0%}) after {seconds:.1f} s", policy=policy
-            )
+            told = f"policy {id} is {policy.status} ({policy.progress:.0%}) after {seconds:.1f} s"
+            raise TransportTimeout(told, policy=policy)
         pause = min(interval, timeout - seconds)
         yield Wait(pause)
         seconds += pause

@@ -69,9 +69,8 @@ class Events:
         self._rest.clear()
         self._event.clear()
         if not self._over and not reply.headers.get("content-type", "").startswith("text/event-stream"):
-            raise ServerError(
-                "the answer is not a stream of events; is this a specshield server?", status=reply.status
-            )
+            told = "the answer is not a stream of events; is this a specshield server?"
+            raise ServerError(told, status=reply.status)
 
     def _lines(self, piece: bytes) -> list[bytes]:
         """The lines that are whole now. Raises ServerError for one that is too long."""
@@ -99,9 +98,8 @@ class Events:
                 return
             decision = self._decided(json.loads(data))
         except (ValueError, RecursionError, AttributeError, KeyError, TypeError) as error:
-            raise ServerError(
-                f"the server told an event that this client does not understand: {error}"
-            ) from error
+            told = f"the server told an event that this client does not understand: {error}"
+            raise ServerError(told) from error
         if decision.t > self._after:
             self._found.append(decision)
             self._after = decision.t

@@ -209,12 +209,8 @@ class Decision:
         i: Any = self.action_names.index(action) if action in self.action_names else action
         if not hasattr(i, "__index__") or not 0 <= i < count:
             names = ", ".join(self.action_names)
-            raise InputError(
-                "there is no such action",
-                path="action",
-                got=action,
-                expected=f"an index from 0 to {count - 1}, or one of {names}",
-            )
+            expected = f"an index from 0 to {count - 1}, or one of {names}"
+            raise InputError("there is no such action", path="action", got=action, expected=expected)
         name = self.action_names[i] if self.action_names else f"action {i}"
         if self.explanations is None:
             return f"{name}: the step was not asked to explain (explain=True)"
@@ -268,6 +264,17 @@ class TrajectoryItem:
 
 
 @dataclass(frozen=True)
+class Learned:
+    """What a session knew of its map at step `t`: cells `row * width + column`, row 0 the lowest."""
+
+    t: int
+    map_id: str
+    map_revision: int
+    occupied: tuple[int, ...]
+    free: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Page(Generic[T]):
     """One page of a list; `next` asks for the following one."""
 
@@ -281,10 +288,8 @@ def build(cls: type[T], body: Mapping[str, Any], **more: Any) -> T:
     try:
         return cls(**{name: _tuples(value) for name, value in body.items() if name in known}, **more)
     except (AttributeError, TypeError) as error:
-        raise ServerError(
-            f"the server answered a {cls.__name__.lower()} that this client does not understand: {error}",
-            got=body,
-        ) from error
+        told = f"the server answered a {cls.__name__.lower()} that this client does not understand: {error}"
+        raise ServerError(told, got=body) from error
 
 
 def _tuples(value: Any) -> Any:

@@ -15,6 +15,7 @@ from specshield.client.core import Flow, Within, call, deliver, fetch
 from specshield.client.events import Events
 from specshield.client.models import (
     Decision,
+    Learned,
     LocalDecision,
     Page,
     Pose,
@@ -282,6 +283,10 @@ class SessionState:
         raw: Page[Any] = build(Page, body)
         return tuple(build(TrajectoryItem, item) for item in raw.items)
 
+    def _learned(self) -> Flow[Learned]:
+        """The cells that the session found occupied or free though the map says otherwise."""
+        return build(Learned, (yield from call(wire.get("sessions", self.id, "learned", slow=True))))
+
     def _save_record(self, path: str | os.PathLike[str]) -> Flow[str]:
         """Write the session's record to a file, for `specshield verify`; the answer is its seal.
 
@@ -294,6 +299,7 @@ class SessionState:
     step = deciding(_step)
     switch = stepping(_switch)
     trajectory = stepping(_trajectory)
+    learned = stepping(_learned)
     save_record = stepping(_save_record)
     close = stepping(_end)
 
@@ -311,15 +317,9 @@ class SessionState:
         """
         poses, start, gaps, joined = dict(poses), min(self._stored, t), 0, -1
         while True:
-            request = wire.post(
-                "sessions",
-                self.id,
-                action,
-                body={"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body},
-                slow=slow,
-                tries=tries,
-                t=t if action == "steps" else None,
-            )
+            sent = {"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body}
+            step = t if action == "steps" else None
+            request = wire.post("sessions", self.id, action, body=sent, slow=slow, tries=tries, t=step)
             reply = (yield from deliver(request)).reply
             try:
                 wire.check(reply)

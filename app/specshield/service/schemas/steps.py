@@ -168,7 +168,7 @@ class CloseResponse(SessionResponse):
 
 
 class Learned(Answer):
-    t: int = Field(description="The step that was decided last; -1: none yet.")
+    t: int = Field(description="The step before `next_t`, up to which this was learned; -1: none yet.")
     map_id: str = Field(description="Id of the map that the cells are of.")
     map_revision: int = Field(description="How often the session's own map has changed; 0: it is the map.")
     occupied: list[int] = Field(description="Cells that are free on the map, and were found occupied.")
