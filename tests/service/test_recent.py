@@ -6,6 +6,7 @@ import json
 from operator import attrgetter
 
 import httpx
+import msgspec
 import numpy as np
 import pytest
 
@@ -51,6 +52,17 @@ def test_a_session_of_a_large_rule_takes_the_place_of_many(large):
     recent.drop("large")
     recent.put("small", session())
     assert recent.peek("small") is not None
+
+
+def test_the_state_that_an_older_server_stored_is_read():
+    """Its carry had fewer fields, those of one that was kept field by field."""
+    poses = np.arange(6.0).reshape(2, 3)
+    carry = [4, poses.tobytes(), [b"\1\2", None], None]
+    stored = msgspec.msgpack.encode([5, 5, True, "pending", 0.0, b"head", False, False, False, carry])
+    state = State.of(stored)
+    assert (state.carry.t, state.carry.witnesses, state.carry.learned) == (4, (b"\1\2", None), None)
+    assert state.carry.next_poses.tolist() == poses.tolist()
+    assert State.of(state.packed()).carry.next_poses.tolist() == poses.tolist()
 
 
 def test_whether_a_session_has_learned_is_known_without_unpacking_what():
