@@ -18,9 +18,9 @@ from specshield.robot.dynamics import motion_count
 from specshield.rule.values import REGIONS
 from specshield.stl.program import STACK_SIZE
 
-# Shares of one plan's effort: of a first motion that the plan does not begin with; and of all searches in
-# vain after these, where they are more than a Stretch has, for which costs are told. By hand, not measured.
-SHARE, IN_VAIN, USUAL_MOTIONS = 0.25, 4.0, 7
+# Shares of one plan's effort: what a search after a first motion may cost with which the plan does not begin,
+# and what all of these that find nothing may cost where a robot has unusually many motions. Chosen by hand.
+SHARE, IN_VAIN, USUAL_MOTIONS, GOLDEN = 0.25, 16.0, 7, 0.618
 
 
 @kernel
@@ -94,10 +94,12 @@ def plan_all(
     count, steps = motions.shape
     way = make_way(world, t, steps, signals)
     nodes = make_nodes(world.literals.literal.shape[0], count)
-    base, left = -1, IN_VAIN * effort if count > USUAL_MOTIONS else np.inf
+    base, left, order = -1, np.inf, np.arange(count)
+    if count > USUAL_MOTIONS:  # neighbours in the robot's list often fail alike, so others come in between
+        left, order = IN_VAIN * effort, np.argsort(order * GOLDEN % 1.0)
     # First x_t itself (-2); then staying (-1), which others can fall back on; then every other motion.
     for root in range(-2, count):
-        m = world.pad if root < 0 else root
+        m = world.pad if root < 0 else order[root]
         if root >= -1 and (m == base or (root >= 0 and m == world.pad)):
             continue
         way.known[:] = prefix
