@@ -52,15 +52,13 @@ def doctor(
 
 def _checks(url: str | None, port: int) -> Iterator[Callable[[], Iterator[Finding]]]:
     """Each imports its part of a server when it is due. A setting that is not valid is told once."""
-    yield partial(iter, [Finding("ok", f"Python {sys.version.split()[0]}, specshield {__version__}")])
     yield from (_parts, _kernels)
     from specshield.service.settings import read_settings
 
     try:
         settings = read_settings()
     except SpecshieldError as error:
-        invalid = Finding("wrong", str(error))
-        yield lambda: iter([invalid])
+        yield partial(iter, [Finding("wrong", str(error))])
     else:
         yield from (partial(check, settings) for check in (_disk, _store))
     yield partial(_port, port) if url is None else partial(_server, url)
@@ -82,6 +80,7 @@ def _shown(check: Callable[[], Iterator[Finding]]) -> int:
 
 
 def _parts() -> Iterator[Finding]:
+    yield Finding("ok", f"Python {sys.version.split()[0]}, specshield {__version__}")
     missing = [name for name in SERVER_PARTS if find_spec(name) is None]
     if missing:
         yield Finding(
@@ -190,17 +189,16 @@ def _server(url: str) -> Iterator[Finding]:
     from specshield.client.transport import address
 
     began, at = time.time(), str(address(url)).rstrip("/")
+    elsewhere = "specshield serve, or another --url"
     try:
         ready = httpx.get(f"{at}/readyz", timeout=10.0)
         told = httpx.get(f"{at}/openapi.json", timeout=10.0)
     except httpx.HTTPError as error:
-        yield Finding("wrong", f"no server answers at {url}: {error}", "specshield serve, or another --url")
+        yield Finding("wrong", f"no server answers at {url}: {error}", elsewhere)
         return
     said = _object(ready)
     if said.get("status") != "ok" and "type" not in said:  # what /readyz answers, or a problem (RFC 9457)
-        yield Finding(
-            "wrong", f"what answers at {url} is no specshield server", "specshield serve, or another --url"
-        )
+        yield Finding("wrong", f"what answers at {url} is no specshield server", elsewhere)
         return
     if ready.status_code == 200:
         yield Finding("ok", f"the server at {url} is ready")

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 
 import numpy as np
 
@@ -30,10 +29,10 @@ from specshield.shield.judgement import Judged
 from specshield.shield.proposal import adapted, ask
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
 
-# Chosen by hand; the seven motions of a Stretch have all that they can have of what the last three limit.
+# Chosen by hand. The last three bound a robot of many motions; the seven of a Stretch never come to more.
 DEPTH = 2  # motions after which a witness is met again
 EARLIER = (1, 2, 4, 8, 16, 32)  # steps by which the proposers' clock is put back
-ASKED, WITNESSES, MET = 42, 7, 49  # times that it is in one decision; ways to meet; places to meet them from
+ASKED, WITNESSES, MET = 42, 7, 49  # how often it is, in a decision; witnesses to meet; places to do so from
 SAME = 1e-6  # [m] and [rad]: poses this near are one pose
 
 Rank = tuple[int, float]
@@ -87,8 +86,9 @@ class _Motion:
             asked = self.asked(parts, rho, poses)
             for n in range(len(rows)):
                 row = {name: values[n] for name, values in samples.items()}
-                told = self.shows(parts, rho[:, n], asked[:, n], row)
-                rank, best = min((rank, best), told, key=itemgetter(0))
+                order, told = self.shows(parts, rho[:, n], asked[:, n], row)
+                if order < rank:
+                    best, rank = told, order
         return best
 
     def parts(self) -> list[Formula]:

@@ -113,7 +113,7 @@ def decide(
     """One decision of Algorithm 1, at t = len(history) - 1.
 
     history [t + 1, 3]: x_0..x_t; logits [A], -inf where the model rules an action out, None once the main
-    task is over; signals {name: [t + 1]}; carry: what the decision at t - 1 handed on; witnesses: give every
+    task is over; signals {name: [t + 1]}; carry: what the last decision handed on; witnesses: give every
     action's; occupied, free [n, 2]: what the robot's sensors see of the map now; explain: what says of each
     action that is forbidden why it is (reasons/explanation.py). Raises LogitsError for logits that are
     missing, NaN, +inf, all -inf or of the wrong number.
@@ -264,7 +264,8 @@ def _follow(
         way = None
     if carry is None or not 0 <= carry.t <= len(poses) - 2:
         return way, None
-    alone, gap = len(poses) - 2 - carry.t, np.empty(len(carry.next_poses))  # alone: steps without a decision
+    alone = len(poses) - 2 - carry.t  # steps without a decision
+    gap = np.empty(len(carry.next_poses))
     off = _gaps(carry.next_poses, poses[carry.t + 1], gap)
     ways = [w for w, far in zip(carry.witnesses, gap, strict=True) if w and far <= sum(off) + SAME_POSE]
     if alone > 0 and len(ways) > 1:  # a blocked move leads where waiting does

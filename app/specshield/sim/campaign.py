@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from multiprocessing import get_context, parent_process
 from queue import SimpleQueue
@@ -155,9 +155,7 @@ def begin(
     starts = free_poses(case.task, case.body, DRAWS, np.random.default_rng([seed, 2]))
     for refused, (x, y, theta) in enumerate(starts.tolist()):
         start = (x, y, theta)
-        try:
+        with suppress(InfeasibleStart):
             session = client.sessions.create(policy_id=policy_id, initial_pose=start, seed=seed, id=id)
             return session, start, refused
-        except InfeasibleStart:
-            continue
     raise InfeasibleStart(f"none of {DRAWS} starts in {case.name} can satisfy the rule", path="initial_pose")

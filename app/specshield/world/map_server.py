@@ -7,6 +7,7 @@ publishes it; FREE_AT_MOST then says which cells are free. Everything else, the 
 from __future__ import annotations
 
 import io
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -117,10 +118,8 @@ def _scalar(document: dict[str, Any], key: str, low: float, high: float) -> floa
 def _number(value: Any, path: str, low: float = -checks.LIMIT, high: float = checks.LIMIT) -> float:
     """`value` as a number. YAML 1.1 reads 5e-2 as text, but ROS reads it as a number."""
     if isinstance(value, str):
-        try:
+        with suppress(ValueError):
             return checks.number(float(value), path, low, high)
-        except ValueError:
-            pass
     return checks.number(value, path, low, high)
 
 

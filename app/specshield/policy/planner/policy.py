@@ -87,7 +87,8 @@ class PlannerPolicy(Carded):
         """The policy on another map: its fields lead as they did, its ways are those that there are."""
         return replace(self, share=GUESSED if guess else 1.0)._in(self._world._replace(body=body))
 
-    def briefly(self) -> PlannerPolicy:  # as reachability's
+    def briefly(self) -> PlannerPolicy:
+        """The policy with less effort a plan, for an explanation, which asks for many ways and goes none."""
         return self.on_body(self._world.body, guess=True)
 
     def avoiding(self, barred: Floats) -> PlannerPolicy:
@@ -122,7 +123,7 @@ class PlannerPolicy(Carded):
         ways, found = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
         if found or len(self._world.barred) == 0 or self.share < 1.0:
             return ways
-        quick = replace(self, share=GUESSED)._in(self._world._replace(barred=NOTHING_BARRED))
+        quick = self.briefly().avoiding(NOTHING_BARRED)
         return joined(ways, quick.propose(history, signals, margin))
 
     def _plan(

@@ -93,7 +93,8 @@ class ReachabilityPolicy(Carded):
         """
         return self._but(self._body, early=steps, wanted=wanted)
 
-    def briefly(self) -> ReachabilityPolicy:  # for an explanation, which asks for many ways and goes none
+    def briefly(self) -> ReachabilityPolicy:
+        """The policy with a smaller search around, and one way alone: for an explanation, which goes none."""
         return self._but(self._body, most=FEWER)
 
     def keeping_clear(self) -> ReachabilityPolicy:
