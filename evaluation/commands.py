@@ -99,9 +99,9 @@ def worlds(
     from evaluation.worlds.world import WORLDS
     from specshield.sim.cases import case_name
 
-    cases = [case_name(each) for each in case.split(",")]
-    for each in cases:
-        known(each)  # or the last of them would be told to be none after hours
+    cases = [each if each.endswith(".json") else case_name(each) for each in case.split(",")]
+    for each in cases:  # one that does not exist is refused now, and not after hours of runs
+        known(each)
     trials = [
         Trial(each, name, senses, seed, slack < 0, max(slack, 0), robot=body)
         for body in _some(robot, ROBOTS, "--robot")

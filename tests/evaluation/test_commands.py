@@ -111,6 +111,9 @@ def test_a_case_that_is_not_is_told_before_worlds_are_run(tmp_path):
     assert not refused.stdout
     (line,) = refused.stderr.splitlines()
     assert line.startswith("there is no case 'case9'")
+    house = ("--case", "0-house.json", "--world", "told", "--sensing", "none", "--runs", "1")
+    (line,) = specshield("worlds", *house, "--out", str(tmp_path), code=1).stderr.splitlines()
+    assert line.startswith("there is no house '0-house.json'")  # a number at its beginning is no case's
 
 
 def test_results_say_that_there_are_no_houses(tmp_path, monkeypatch, capsys):
