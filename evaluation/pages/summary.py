@@ -87,7 +87,10 @@ def _with_200(harder: Found, elsewhere: Mapping[str, str]) -> str:
             return ""
         low, high = clopper_pearson(count, runs)
         done[method] = share({"count": count, "of": runs, "low": low, "high": high})
-    return WITH_200.format(cells=len(cells), page=elsewhere["Harder main tasks"], **done)
+    several = len(cells) > 1
+    over = f"{len(cells)} pairs of case and model" if several else "one case and model"
+    shared = "; the pairs share starts, so these intervals are\n  too narrow" if several else ""
+    return WITH_200.format(cells=over, shared=shared, page=elsewhere["Harder main tasks"], **done)
 
 
 def _under_noise(gaussian: Sequence[Results]) -> str:

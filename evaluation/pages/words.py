@@ -101,10 +101,9 @@ What these figures are less than they may sound:
 - A region holds where the robot's **origin** is in it, as in the paper: the body may reach into Forbidden.
 - The limit of 600 steps is generous."""
 WITH_200 = """\
- With 200, over the runs of {cells} pairs of case and model, the
+ With 200, over the runs of {cells}, the
   model alone did its task in {unmodified}, under `ours` in {ours}, and under
-  `lookahead` in {lookahead}; the pairs share starts, so these intervals are
-  too narrow ([harder tasks]({page}))."""
+  `lookahead` in {lookahead}{shared} ([harder tasks]({page}))."""
 UNDER_NOISE = """\
 - Where each motion ends off by sigma 1 cm along x and y and by sigma 0.5 degrees (next table), `ours`, which
   has neither margin nor slack, loses the rule in {lost} runs. **@default** is what a session

@@ -129,7 +129,9 @@ def test_the_summary_says_of_how_many_runs_it_is_and_nothing_of_runs_that_were_n
         assert "loses the rule in" not in page
         assert ("With 200" in page) == (each.case == "case1-200")
     assert "in 3 of 3 (29.2 to 100.0 %), under `ours` in 2 of 3 (9.4 to 99.2 %)" in page
+    assert "over the runs of one case and model, " in page
     assert "[harder tasks](mine/tasks.md)" in page
+    assert "the pairs share starts" not in page
     cases = (tmp_path / "mine" / "cases.md").read_text()
     assert "80 of 80" not in cases
     assert "A line is the median of the runs, and the band around it the middle 80 %." in cases
