@@ -69,7 +69,7 @@ class ReachabilityPolicy(Carded):
     barred: Floats = field(default_factory=lambda: NOTHING_BARRED)  # as `Guide` has it
     early: int = 0  # [steps] as `hurried` has it
     wanted: Bools | None = None  # [M] the first motions to propose ways after; None: all of them
-    most: int = POSES  # of a search around; with fewer only the way that it would go itself is looked for
+    brief: bool = False  # whether only the way that it would go itself is looked for, by a short search
 
     @cached_property
     def _rules(self) -> Rules:
@@ -95,7 +95,7 @@ class ReachabilityPolicy(Carded):
 
     def briefly(self) -> ReachabilityPolicy:
         """The policy with a smaller search around, and one way alone: for an explanation, which goes none."""
-        return self._but(self._body, most=FEWER)
+        return self._but(self._body, brief=True)
 
     def keeping_clear(self) -> ReachabilityPolicy:
         """The policy for ways with room beside them (robot/room.py); itself where it has no such tables."""
@@ -148,7 +148,7 @@ class ReachabilityPolicy(Carded):
         rows = signal_rows(self.task, signals, len(history))
         shape = len(self.task.robot.motions), self.task.horizon + 1 - len(history)
         chosen, least = (slice(None), -np.inf) if self.wanted is None else (self.wanted, HURRIED)
-        wanted = np.full(shape[0], self.most == POSES) if self.wanted is None else self.wanted.copy()
+        wanted = np.full(shape[0], not self.brief) if self.wanted is None else self.wanted.copy()
         proposals = []
         for past in pasts(rules, history, rows):
             guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
@@ -170,14 +170,14 @@ class ReachabilityPolicy(Carded):
                 of_narrow = self.narrow, self._top, effort
                 preferred = continue_narrow(guide, *of_narrow, past, wanted, least, motions, poses)
             else:
-                beam = self.settings.beam
-                preferred = continue_all(guide, beam, past, wanted, least, motions, poses)
+                preferred = continue_all(guide, self.settings.beam, past, wanted, least, motions, poses)
             if preferred >= 0:
                 proposals.append(Proposal(motions[chosen], int(preferred)))
             if not self.guess and self.wanted is None and (len(self.barred) or not self.told):
                 free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
                 if not is_known(guide, past, free):
-                    around = go_around(guide, past, self._fields, poses, ways, self.most)
+                    most = FEWER if self.brief else POSES
+                    around = go_around(guide, past, self._fields, poses, ways, most)
             if around >= 0:
                 proposals.append(Proposal(ways, int(around)))
         return joined(*proposals or [Proposal(np.empty((0, shape[1]), np.int64), 0)])
