@@ -261,17 +261,17 @@ class Best(NamedTuple):
 
 def best_of(tried: Futures, values: Floats, motions: int) -> Best:
     """The future of each motion with the highest of `values` (N,), the lowest row on ties."""
-    rows, robustness = np.empty(motions, np.int64), np.empty(motions)
-    best_rows(tried.motions, values, rows, robustness)
-    return Best(robustness, rows)
+    best = Best(np.empty(motions), np.empty(motions, np.int64))
+    best_rows(tried.motions, values, best)
+    return best
 
 
 @kernel
-def best_rows(motions: Ints, values: Floats, rows: Ints, robustness: Floats) -> None:
-    """`best_of`, into rows and robustness (M,)."""
-    rows[:] = -1
-    robustness[:] = -np.inf
+def best_rows(motions: Ints, values: Floats, best: Best) -> None:
+    """Writes `best_of`."""
+    best.row[:] = -1
+    best.robustness[:] = -np.inf
     for f in range(motions.shape[0]):
         m = motions[f, 0]
-        if rows[m] < 0 or values[f] > robustness[m]:
-            rows[m], robustness[m] = f, values[f]
+        if best.row[m] < 0 or values[f] > best.robustness[m]:
+            best.row[m], best.robustness[m] = f, values[f]

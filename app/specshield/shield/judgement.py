@@ -102,12 +102,9 @@ def judge(shield: Shield, now: Situation) -> Judged:
         by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
         most = aimed.slack or int(aimed.early.max(initial=0))
         if (by_chance or (most > 0 and care.on_way)) and not violated and True in left.tolist():
-            known, wanted, more = len(tried.rho), left | by_chance, [most]
-            before: Aimed | None = aimed
-            if by_chance:
-                more = [*range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)]
-                before = None
-            for steps in more:
+            known, wanted, before = len(tried.rho), left | by_chance, None if by_chance else aimed
+            chancy = *range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)
+            for steps in chancy if by_chance else (most,):
                 tried = _in_time(shield, prefix, tried, asked, steps, wanted)
             if len(tried.rho) > known:
                 kept = tried.rho

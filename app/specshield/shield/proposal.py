@@ -120,11 +120,8 @@ def _checked(given: object, count: int, steps: int, least: int) -> tuple[Ints, i
     wrong = _first_outside(own, count)
     if wrong is not None:
         raise _Refused(f"it names motion {wrong}; the robot has motions 0 to {count - 1}")
-    if (
-        isinstance(preferred, bool)
-        or not isinstance(preferred, (int, np.integer))
-        or not 0 <= preferred < count
-    ):
+    whole = isinstance(preferred, (int, np.integer)) and not isinstance(preferred, bool)
+    if not (whole and 0 <= preferred < count):
         raise _Refused(f"it prefers motion {preferred!r:.40}; the robot has motions 0 to {count - 1}")
     return own, int(preferred)
 

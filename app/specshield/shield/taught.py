@@ -277,7 +277,7 @@ def handed_on(
         return None
     followed = taught.followed._replace(drawn=drawn)
     if followed.follows and followed.by_chance >= SELDOM:
-        chance = partial(chance_of, shield, distribution, moved, nexts)
+        chance = partial(chance_of, shield.task.robot.motion_of, distribution, moved, nexts)
         going, standing = chance(nexts[drawn] if drawn >= 0 else pose), chance(pose)
         followed = followed._replace(going=going, standing=standing)
     return Taught(taught.map, followed).to_bytes()

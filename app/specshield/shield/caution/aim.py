@@ -63,20 +63,20 @@ def aim(
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
     count, motions = len(parts.kind), len(task.robot.motions)
-    now = Open._make((parts, np.empty(count, np.bool_), *np.zeros((2, count), np.int64), prefix.t))
-    _ask(now, prefix.known, care.noise, care.stride, care.least, care.chance)
+    early, due = np.zeros((2, count), np.int64)
+    still, best = np.empty(count, np.bool_), Best(np.empty(motions), np.empty(motions, np.int64))
+    now = Open(parts, still, early, due, prefix.t, leaves, whole, tried.motions, follows)
+    asking = care.noise, care.stride, care.least, care.chance
+    had = _best_asked(now, prefix.known, asking, margin, best) > margin
 
     def at(early: Ints) -> tuple[Best, bool]:
-        rows, robustness = np.empty(motions, np.int64), np.empty(motions)
-        highest = _best_open(now, early, leaves, whole, tried.motions, follows, margin, rows, robustness)
-        return Best(robustness, rows), highest > margin
+        best = Best(np.empty(motions), np.empty(motions, np.int64))
+        return best, _best_open(now, early, margin, best) > margin
 
     if before is not None:
         margin = min(margin, SATISFIED_ABOVE + before.margin)
         best, _ = at(before.early)
         return before._replace(best=best, kept=best.robustness > margin)
-    early = now.asked
-    best, had = at(early)
     if not had:
         early = np.zeros(count, np.int64)
         best, had = at(early)
@@ -90,15 +90,15 @@ def aim(
                 tighter, had = at(more)
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
-    margin_had, slack = margin - SATISFIED_ABOVE, int(early[np.argmin(now.due)])
-    less = (early < np.minimum(now.asked, shield.config.slack)).any()
+    margin_had, slack = margin - SATISFIED_ABOVE, int(early[now.due.argmin()])
+    less = early is not now.asked and (early < np.minimum(now.asked, shield.config.slack)).any()
     lowered = bool(less or margin_had < shield.config.margin)
     return Aimed(best, best.robustness > margin, margin_had, slack, lowered, early)
 
 
 class Open(NamedTuple):
     """The conjuncts at step t: which are still open (K,), how early each is asked for (K,), and in how many
-    steps it is due (K,), NEVER where it is not.
+    steps it is due (K,), NEVER where it is not. The rest is as in `aim`.
     """
 
     parts: Conjuncts
@@ -106,12 +106,21 @@ class Open(NamedTuple):
     asked: Ints
     due: Ints
     t: int
+    leaves: Floats
+    whole: Floats
+    motions: Ints
+    follows: bool
 
 
 @kernel
-def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chance: float) -> None:
-    """Fills in `still`, `asked` and `due` of `now`, whose `asked` is 0. A window keeps half its length."""
-    parts, still, asked, due, t = now
+def _best_asked(
+    now: Open, known: Floats, care: tuple[Noise, float, int, float], margin: float, best: Best
+) -> float:
+    """Fills in `still`, `asked` and `due` of `now`, whose `asked` is 0, and then writes as `_best_open` does
+    for what is asked. care: its noise, stride, least and chance. A window keeps half its length.
+    """
+    parts, still, asked, due, t = now[:5]
+    noise, stride, least, chance = care
     find_open(parts, known, t, still)
     for k in range(still.shape[0]):
         half, due[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER
@@ -121,29 +130,20 @@ def _ask(now: Open, known: Floats, noise: Noise, stride: float, least: int, chan
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             due[k] = left
+    return _best_open(now, asked, margin, best)
 
 
 @kernel
-def _best_open(
-    now: Open,
-    early: Ints,
-    leaves: Floats,
-    whole: Floats,
-    motions: Ints,
-    follows: bool,
-    margin: float,
-    rows: Ints,
-    robustness: Floats,
-) -> float:
+def _best_open(now: Open, early: Ints, margin: float, best: Best) -> float:
     """Writes the best future of each motion by what is open, and its robustness; the highest of them.
 
-    The way that the robot is on stays its motion's future (`rows`) where it keeps enough, though another may
+    The way that the robot is on stays its motion's future (`row`) where it keeps enough, though another may
     be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
     """
-    rho = np.empty(whole.shape[0])
-    rate_open(now.parts, now.still, now.t, early, leaves, rho)
-    rho[~(whole > SATISFIED_ABOVE)] = -np.inf
-    best_rows(motions, rho, rows, robustness)
-    if follows and rho[0] > margin:
-        rows[motions[0, 0]] = 0
-    return float(robustness.max())
+    rho = np.empty(now.whole.shape[0])
+    rate_open(now.parts, now.still, now.t, early, now.leaves, rho)
+    rho[~(now.whole > SATISFIED_ABOVE)] = -np.inf
+    best_rows(now.motions, rho, best)
+    if now.follows and rho[0] > margin:
+        best.row[now.motions[0, 0]] = 0
+    return float(best.robustness.max())

@@ -15,7 +15,8 @@ import numpy as np
 
 from specshield.arrays import Floats, Ints
 from specshield.compiled import kernel, leaf
-from specshield.robot.dynamics import Body, in_collision, unhindered, wrap
+from specshield.robot.body import centre
+from specshield.robot.dynamics import TOUCH, Body, free_distance, unhindered, wrap
 from specshield.rule.early import conjunction_of
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.uncertainty import CHANCE, Care, Noise, Uncertainty, margin_for
@@ -36,7 +37,6 @@ MOST_ODDS = 1e6  # so that what changes late is still noticed
 TINY = 1e-9  # [motions]
 BESIDE = 0.2  # [m] from the footprint, which may be told wrong: what is so near may be met. By hand.
 FAR = 5.0  # [sigma] what noise does: one motion in 270,000 ends farther off
-
 SELDOM = 1e-3  # what slips alone do not do so often is done by something else; chosen by hand
 
 FORMAT = struct.Struct("<9d")
@@ -76,13 +76,10 @@ def learn(
     told = _told(known)
     seen = Seen() if carry is None or carry.residuals is None else Seen(*FORMAT.unpack(carry.residuals))
     if carry is not None and carry.t == t - 1 and not contact:
-        found = Seen(*observe(told, seen, poses[-2], carry.next_poses, poses[-1]))
-        beside = shield.body._replace(radius=shield.body.radius + BESIDE)
-        if config.learn_map and found.moved > seen.moved and in_collision(beside, *poses[-2]):
-            # It may have met what it stood beside: there, neither what failed nor what worked counts.
-            found = found._replace(moved=seen.moved, lost=seen.lost, odds=seen.odds)
-        seen = found
-    noise = noise_of(told, seen)
+        nexts = carry.next_poses
+        seen, noise = _weighed(shield.body, config.learn_map, told, seen, poses[-2], nexts, poses[-1])
+    else:
+        noise = noise_of(told, seen)
     stride, deadlines = _measures(shield.task)
     margin = margin_for(noise, stride, shield.task.horizon - t)
     return seen, Care(max(config.margin, margin), config.slack, noise, stride, 0.5 * CHANCE / deadlines)
@@ -136,21 +133,16 @@ def remember(
     """What is handed on. distribution [A]: of what the robot does, as far as that is known; moved: what is
     executed for a terminal action; nexts [M, 3]: where f leads from the pose (3,).
     """
-    return FORMAT.pack(*seen._replace(standing=chance_of(shield, distribution, moved, nexts, pose)))
-
-
-def chance_of(shield: Shield, distribution: Floats, moved: int, nexts: Floats, there: Floats) -> float:
-    """The probability that what is done leads to a pose (3,); the rest is as in `remember`."""
     motion_of = shield.task.robot.motion_of
-    return _leading(motion_of, distribution, int(motion_of[moved]), nexts, there)
+    return FORMAT.pack(*seen._replace(standing=chance_of(motion_of, distribution, moved, nexts, pose)))
 
 
 @kernel
-def _leading(motion_of: Ints, distribution: Floats, ending: int, nexts: Floats, pose: Floats) -> float:
-    """The probability of actions that lead to a pose (3,). ending: what a terminal action is followed by."""
+def chance_of(motion_of: Ints, distribution: Floats, moved: int, nexts: Floats, pose: Floats) -> float:
+    """The probability that what is done leads to a pose (3,); motion_of [A], the rest is as in `remember`."""
     total = 0.0
     for a in range(motion_of.shape[0]):
-        m = motion_of[a] if motion_of[a] >= 0 else ending
+        m = motion_of[a] if motion_of[a] >= 0 else motion_of[moved]
         if distribution[a] > 0.0 and (m < 0 or _gap(nexts[m], pose) <= EXACT):
             total += distribution[a]
     return total
@@ -239,6 +231,19 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
         seen.standing,
         1.0,
     )
+
+
+@kernel
+def _weighed(
+    body: Body, beside: bool, told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floats
+) -> tuple[Seen, Noise]:
+    """`observe`, and the noise by it. beside: whether the robot may have met what it stands beside."""
+    found, near = observe(told, seen, before, foreseen, pose), body.radius + BESIDE
+    u, v = centre(body, before[0], before[1], before[2])
+    if beside and found.moved > seen.moved and near - free_distance(body, u, v, near) > TOUCH:
+        # There, neither what failed nor what worked counts.
+        found = Seen(seen.moved, seen.lost, seen.odds, *found[3:])
+    return found, noise_of(told, found)
 
 
 @leaf
