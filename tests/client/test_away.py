@@ -44,7 +44,7 @@ def step(state, x, *outcomes, y=0.0, logits=LOGITS, main_task_done=None):
     return result, [json.loads(request.body) for request in sent]
 
 
-AWAY = [lost(0.0)] * 5
+AWAY = [lost(0.0)] * TRIES
 
 
 def test_the_certified_continuation_is_followed_and_the_service_told_later():
@@ -55,7 +55,7 @@ def test_the_certified_continuation_is_followed_and_the_service_told_later():
     assert (first.source, first.t, first.execute, first.witness) == ("witness", 1, M, (B, M))
     assert first.next_pose == pytest.approx((0.4, 0, 0))
     assert isinstance(first.error, errors.TransportTimeout)
-    assert len(bodies) == 5
+    assert len(bodies) == TRIES
     second, bodies = step(state, 0.4)
     assert (second.source, second.t, second.execute, bodies) == ("witness", 2, B, [])
     assert second.error is None, "a moment ago it was away: it is not asked"
@@ -136,7 +136,9 @@ def test_a_step_that_says_to_stop_costs_nothing_while_it_is_away(on_failure):
         due = state._circuit.due
         stopped, bodies = step(state, 9.0, *(() if not due else AWAY if number == 0 else AWAY[:1]))
         assert (stopped.source, stopped.execute, stopped.t, state.t) == ("stop", None, 1, 1)
-        assert (len(bodies), stopped.error is None) == ((0, True) if not due else (1 if number else 5, False))
+        assert (len(bodies), stopped.error is None) == (
+            (0, True) if not due else (1 if number else TRIES, False)
+        )
         asked += [clock.now] * due
         clock.now += 0.1
     pauses = [b - a for a, b in itertools.pairwise(asked)]
@@ -144,7 +146,7 @@ def test_a_step_that_says_to_stop_costs_nothing_while_it_is_away(on_failure):
     assert max(pauses) <= LONGEST_PAUSE + 0.11
     clock.now += LONGEST_PAUSE
     assert step(state, 9.0, decided(1, M))[0].source == "service"
-    assert len(step(state, 9.0, *AWAY)[1]) == 5, "away anew: what is known of before counts no longer"
+    assert len(step(state, 9.0, *AWAY)[1]) == TRIES, "away anew: what is known of before counts no longer"
 
 
 def test_the_main_task_may_end_at_a_step_that_is_not_asked_for():
@@ -195,7 +197,7 @@ def test_both_clients_stop_at_once_while_the_service_is_known_to_be_away(asynchr
 def test_a_service_that_cannot_answer_now_is_away(outcome):
     state = robust()
     step(state, 0.0, decided(0, M, witness=[M, M]))
-    tries = 1 if getattr(outcome, "status", 0) in (500, 429, 507) else 5
+    tries = 1 if getattr(outcome, "status", 0) in (500, 429, 507) else TRIES
     assert step(state, 0.2, *[outcome] * tries)[0].source == "witness"
 
 
@@ -260,7 +262,7 @@ def test_after_a_step_is_passed_over_the_continuation_that_began_before_it_is_no
     [next(cancelled) for _ in range(2)]
     decision, bodies = step(state, 0.2, problem(409, "step-conflict", expected_t=2), *AWAY)
     assert (decision.source, decision.execute, decision.t) == ("stop", None, 2)
-    assert [body["t"] for body in bodies] == [1, *[2] * 5]
+    assert [body["t"] for body in bodies] == [1, *[2] * TRIES]
 
 
 def test_a_session_that_was_over_by_an_answer_that_nobody_heard_ends_the_loop():

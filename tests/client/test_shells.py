@@ -98,13 +98,13 @@ def test_a_passing_failure_is_not_noticed(use, fault):
     ],
 )
 def test_a_lasting_failure_is_a_transport_error_with_its_cause(use, fault, cls):
-    handler, seen = failing(*[fault] * 5)
+    handler, seen = failing(*[fault] * 6)
     with pytest.raises(errors.TransportError) as caught:
         use(handler, validate)
     assert type(caught.value) is cls
     assert caught.value.__cause__ is fault
     assert "POST http://robot.test/prefix/v1/specs/validate" in caught.value.message
-    assert len(seen) == 5
+    assert len(seen) == 6
 
 
 def test_a_server_that_never_answers_costs_a_bounded_time(use):

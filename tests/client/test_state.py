@@ -110,7 +110,7 @@ def test_what_came_with_a_lost_answer_stands_whatever_was_recorded_of_that_step(
     state = session()
     step(state, 0, decided(0, M))
     for x in (1, 2):
-        assert type(step(state, x, *[lost(0.0)] * 5)[0]) is errors.TransportTimeout
+        assert type(step(state, x, *[lost(0.0)] * 6)[0]) is errors.TransportTimeout
         state.record((x + 0.125, 0, 0))  # the robot has drifted
     _, bodies = step(state, 3, differs(1, 1), differs(2, 2), decided(3, M))
     assert [sent_poses(body) for body in bodies] == [(3, [1.125, 2.125, 3]), (3, [1, 2.125, 3]), (3, [2, 3])]
@@ -151,9 +151,9 @@ def test_a_failed_step_changes_nothing_and_recorded_poses_follow_with_the_next()
     state = session()
     step(state, 0, decided(0, M))
     before = dict(vars(state))
-    error, bodies = step(state, 1, *[lost(0.0)] * 5, main_task_done=True)
+    error, bodies = step(state, 1, *[lost(0.0)] * 6, main_task_done=True)
     assert type(error) is errors.TransportTimeout
-    assert bodies == [bodies[0]] * 5
+    assert bodies == [bodies[0]] * 6
     assert vars(state) == before
     state.record((1, 0, 0))
     state.record((2, 0, 0))
@@ -233,7 +233,7 @@ def test_terminal_actions_are_those_the_server_names():
     assert decision.execute == END
 
 
-def close(state, pose, *outcomes, tries=5):
+def close(state, pose, *outcomes, tries=6):
     result, sent, _ = drive(state._close(pose, tries), *outcomes)
     return result, [json.loads(request.body) for request in sent]
 

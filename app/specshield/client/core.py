@@ -4,11 +4,10 @@ A shell (sync.py, aio.py) performs a `Request` and sends its `Reply` or `Failure
 `Wait`; it reads `More` of an answer that is read while it comes (events.py). The generator's return value is
 the call's. So requests, parsing and retries exist once.
 
-Retries: a lost answer, 502, 503 or 504 is followed by the same bytes again, at most `tries` times,
-after 0.05 s, 0.1 s, 0.2 s, ..., and no try starts later than four timeouts after the first, nor after the
-deadline of the call. All that
-is repeated is safe to repeat: steps are locked by t and content, maps and policies are addressed by
-content, and a session is created under an id the client chose. A server that says it is starting has
+Retries: a lost answer, 502, 503 or 504 is followed by the same bytes again, at most `tries` times, after
+0.05 s, 0.1 s, then every 0.2 s. No try starts later than four timeouts after the first, nor after the
+deadline of the call. All that is repeated is safe to repeat: steps are locked by t and content, maps and
+policies are addressed by content, and a session is created under an id the client chose. A server that says it is starting has
 done nothing yet: it is asked again when it says so (Retry-After), within the same four timeouts, and such
 an answer is not counted as a try.
 """
@@ -36,7 +35,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 BACKOFF = 0.05  # s before the second try, doubled for each that follows
-LONGEST_WAIT = 2.0  # s before another try
+LONGEST_WAIT = 0.2  # s before another try: a step takes a robot about as long. Chosen by hand.
+LONGEST_REST = 2.0  # s before another try to listen, which nothing waits for
 PATIENCE = 4  # timeouts after which no further try starts
 LISTENING = 120.0  # s after which none does to listen again: longer than a server takes to come back
 
@@ -97,7 +97,7 @@ def deliver(request: Request) -> Flow[Delivery]:
             wait = _asked_for(outcome)
         else:
             tries += 1
-            wait = min(BACKOFF * 2 ** (tries - 1), LONGEST_WAIT)
+            wait = min(BACKOFF * 2 ** (tries - 1), LONGEST_REST if request.listens else LONGEST_WAIT)
         patience = max(PATIENCE * outcome.timeout, LISTENING if request.listens else 0.0)
         late = seconds + wait > patience or wait >= outcome.left
         passing = error is not None and not isinstance(error, TrainingUnavailable)  # it may go in a moment

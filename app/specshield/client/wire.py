@@ -43,7 +43,7 @@ class Array(Protocol):
 Numbers = Iterable[float] | Array
 Logits = Iterable[float | None] | Array
 Points = Iterable[Numbers] | Array
-TRIES = 5
+TRIES = 6
 FARTHEST = 1e8  # m, rad; beyond it a server takes no pose and no point
 LONGEST = 1e6  # s; a socket takes no timeout of more than 2**31 ms
 Content = bytes | str | os.PathLike[str]
