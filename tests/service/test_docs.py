@@ -198,6 +198,14 @@ def test_every_answer_has_an_example_of_its_own_kind(told):
                     assert set(wanted) <= set(form["example"]), (path, method, status)
 
 
+def test_the_page_asks_for_answers_in_json(told):
+    """It asks for the type that is listed first; MessagePack is nothing that a reader could read."""
+    for path, method, operation in operations(told):
+        for response in operation["responses"].values():
+            kinds = list(response.get("content", {}))
+            assert "application/json" not in kinds[1:], (path, method, kinds)
+
+
 def examples_of(operation, place="path"):
     """Of the parameters in the path, or of those of a query that have some."""
     return {

@@ -7,9 +7,9 @@ the call's. So requests, parsing and retries exist once.
 Retries: a lost answer, 502, 503 or 504 is followed by the same bytes again, at most `tries` times, after
 0.05 s, 0.1 s, then every 0.2 s. No try starts later than four timeouts after the first, nor after the
 deadline of the call. All that is repeated is safe to repeat: steps are locked by t and content, maps and
-policies are addressed by content, and a session is created under an id the client chose. A server that says it is starting has
-done nothing yet: it is asked again when it says so (Retry-After), within the same four timeouts, and such
-an answer is not counted as a try.
+policies are addressed by content, and a session is created under an id the client chose. A server that
+says it is starting has done nothing yet: it is asked again when it says so (Retry-After), within the same
+four timeouts, and such an answer is not counted as a try.
 """
 
 from __future__ import annotations

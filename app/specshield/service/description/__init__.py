@@ -115,7 +115,8 @@ def _show(operation: dict[str, Any], answered: Any) -> None:
             form = content["application/problem+json"]  # one for all statuses, as it comes
             response["content"] = {"application/problem+json": {**form, "examples": shown}}
         elif answered is not None:
-            for kind, form in content.items():
+            for kind in sorted(content, key="application/json".__ne__):  # /docs asks for the first of them
+                content[kind] = form = content.pop(kind)
                 if kind in answered:
                     form["example"] = answered[kind]
 
