@@ -105,3 +105,20 @@ def test_bad_robots_name_the_field(spec, path):
     assert caught.value.expected
     unit = {"rotate": "radians", "translate": "metres"}.get(str(path).rpartition(".")[2], "")
     assert str(caught.value.expected).endswith(unit)
+
+
+@pytest.mark.parametrize(
+    ("spec", "told"),
+    [
+        ([], "the robot is not an object"),
+        ({}, "the robot lacks ['actions', 'footprint']"),
+        ({**CUSTOM, "wheels": 4}, "the robot has unknown fields ['wheels']"),
+        (changed(("footprint", "radius"), None), "footprint lacks ['radius']"),
+        (changed(("actions", 1), "left"), "actions[1] is not an object"),
+    ],
+)
+def test_what_is_wrong_is_said_of_the_robot_or_of_a_part_of_it(spec, told):
+    """In process nothing else names it: the ROS node says that the map cannot be used."""
+    with pytest.raises(RobotError) as caught:
+        robot_from_json(spec)
+    assert str(caught.value).startswith(told)

@@ -192,16 +192,16 @@ def _action(item: Any, path: str) -> Action:
 
 
 def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
+    which = path or "the robot"
     if not isinstance(item, dict):
-        raise RobotError(
-            "not an object", path=path or None, got=shown(item), expected=f"an object with {sorted(required)}"
-        )
+        told, expected = f"{which} is not an object", f"an object with {sorted(required)}"
+        raise RobotError(told, path=path or None, got=shown(item), expected=expected)
     missing, unknown = required - item.keys(), item.keys() - required - optional
     if missing or unknown:
         said = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(map(str, unknown))}"
-        raise RobotError(
-            said, path=path or None, got=sorted(map(str, item)), expected=f"{sorted(required | optional)}"
-        )
+        told = f"{which} {said}"
+        expected = f"{sorted(required | optional)}"
+        raise RobotError(told, path=path or None, got=sorted(map(str, item)), expected=expected)
 
 
 def _number(value: Any, path: str, low: float, high: float, unit: str = "metres") -> float:
