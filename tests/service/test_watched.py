@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import threading
+from pathlib import Path
 from xml.etree import ElementTree
 
 import httpx
@@ -14,6 +15,18 @@ from PIL import Image
 
 from tests.service.world import START, ahead, grid_json, policy_files
 from tests.serving import HUNG
+
+
+def test_a_map_that_came_with_the_server_keeps_its_name_and_that_is_said(client):
+    maps = Path(__file__).parents[2] / "maps"
+    files = {"metadata": (maps / "case2.yaml").read_bytes(), "image": (maps / "case2.pgm").read_bytes()}
+    for name, status in (("mine", 422), ("case2", 201)):
+        sent = client.post("/v1/maps", files=files, data={"name": name})
+        assert sent.status_code == status, sent.text
+        if status == 422:
+            told = sent.json()
+            assert told["detail"] == "what came with the server keeps its name"
+            assert told["expected"] == "'case2', or no name"
 
 
 def test_maps_and_policies_have_names_that_are_accepted_wherever_their_ids_are(client):

@@ -195,13 +195,12 @@ class Claimed:
         can have.
         """
         shipped = {each: known.id for each, known in self._named.items()}
-        if files.HASH.fullmatch(name) or (id in shipped.values() and shipped.get(name) != id):
-            raise InputError(
-                "this cannot be named so",
-                path="name",
-                got=name,
-                expected="a name that does not look like an id, for what did not come with the server",
-            )
+        if files.HASH.fullmatch(name):
+            raise InputError("this is the form of an id", path="name", got=name, expected="another name")
+        own = [each for each, its in shipped.items() if its == id]
+        if own and name not in own:
+            told, expected = "what came with the server keeps its name", f"'{own[0]}', or no name"
+            raise InputError(told, path="name", got=name, expected=expected)
         bearer = shipped.get(name) or self.claims.named(self._kind, name, owner)
         if bearer not in (None, id):
             raise taken(name, str(bearer))
