@@ -143,6 +143,15 @@ def test_bad_signals_name_the_signal(bad):
     assert caught.value.path == "signals.battery"
 
 
+def test_what_is_none_is_told_as_none():
+    """Minus infinity, which None stands for among logits, is nothing that the caller has sent."""
+    with pytest.raises(errors.PoseError) as pose:
+        wire.pose_values((None, 0, 0))
+    with pytest.raises(errors.SampleError) as signal:
+        wire.signal_values({"battery": None})
+    assert (pose.value.got, signal.value.got) == ("(None, 0, 0)", "[None]")
+
+
 @pytest.mark.parametrize("seconds", [2, 2.0, np.float32(2.0), np.int64(2)])
 def test_seconds_may_be_any_real_number(seconds):
     assert wire.seconds_value(seconds, "deadline") == 2.0

@@ -216,12 +216,12 @@ def seconds_value(seconds: object, name: str) -> float:
 
 
 def _floats(values: Any, error: type[InputError], where: str, expected: str) -> list[float]:
-    """None is minus infinity, which only a logit may be."""
+    """None is minus infinity, of a logit; nothing else may be None."""
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(values, str | Mapping | Set):  # these could be gone through, but not as numbers in order
         listed = [values]
     try:
-        return [-math.inf if value is None else float(value) for value in listed]
+        return [-math.inf if value is None and error is LogitsError else float(value) for value in listed]
     except (TypeError, ValueError, OverflowError) as cause:
         raise error("these are not numbers", path=where, got=f"{listed!r:.80}", expected=expected) from cause
 
