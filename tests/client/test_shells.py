@@ -317,6 +317,14 @@ def test_the_shells_mirror_each_other(name):
     assert surface(getattr(sync, name)) == surface(getattr(aio, f"Async{name}"))
 
 
+@pytest.mark.parametrize("client", [ShieldClient, AsyncShieldClient])
+def test_help_says_that_sessions_are_given_and_not_what_is_known_of_one(client):
+    sessions = client("http://127.0.0.1:1").sessions
+    for method in (sessions.create, sessions.get):
+        assert inspect.signature(method).return_annotation == "Session"
+    assert sessions.list.__name__ == "list"
+
+
 def test_the_public_names():
     assert specshield.client.__all__ == [
         "AsyncSession",

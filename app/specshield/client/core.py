@@ -150,16 +150,16 @@ def page_of(cls: type[T], resource: str, cursor: str | None) -> Flow[Page[T]]:
     return Page(tuple(build(cls, item) for item in raw.items), raw.next)
 
 
-def looks_like(flow: Callable[..., Any]) -> Callable[[F], F]:
-    """Gives a method of a shell the name, the docstring and the parameters of the call that it makes."""
+def looks_like(flow: Callable[..., Any], result: str = "") -> Callable[[F], F]:
+    """Gives a shell's method the name, docstring and parameters of its call. result: if not the call's."""
 
     def dress(method: F) -> F:
         given = inspect.signature(flow)
         parameters = [p for p in given.parameters.values() if p.name != "self"]
         own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        result = str(given.return_annotation).removeprefix("Flow[").removesuffix("]")
+        gives = result or str(given.return_annotation).removeprefix("Flow[").removesuffix("]")
         method.__name__, method.__doc__ = flow.__name__.lstrip("_"), flow.__doc__
-        vars(method)["__signature__"] = given.replace(parameters=[own, *parameters], return_annotation=result)
+        vars(method)["__signature__"] = given.replace(parameters=[own, *parameters], return_annotation=gives)
         return method
 
     return dress

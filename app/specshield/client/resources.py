@@ -93,6 +93,7 @@ def listing(cls: type[T], resource: str) -> Listing[T]:
         """All of them, in the order of the server's pages."""
         return self._client._listed(cls, resource)
 
+    method.__name__ = "list"
     return cast("Listing[T]", method)
 
 
@@ -108,7 +109,7 @@ def opening(flow: Callable[..., Flow[SessionInfo]]) -> Any:
         yield from begun._recall()
         return begun
 
-    @looks_like(flow)
+    @looks_like(flow, "Session")
     def method(self: Any, /, *args: Any, **kwargs: Any) -> Any:
         return self._run(opened(self._client, args, kwargs))
 
