@@ -99,7 +99,7 @@ def _named(name: str | None) -> dict[str, str]:
 
 
 def get_map(id: str) -> Flow[Map]:
-    """A map by its id, or by its name if it came with the server."""
+    """A map by its id or its name."""
     return build(Map, (yield from call(wire.get("maps", id))))
 
 
@@ -160,7 +160,7 @@ def policy_image(id: str) -> Flow[bytes]:
 
 
 def get_policy(id: str) -> Flow[Policy]:
-    """A policy by its id, or by its name if it came with the server: how far it is, what was measured."""
+    """A policy by its id or its name: how far it is, and what was measured."""
     return build(Policy, (yield from call(wire.get("policies", id))))
 
 
