@@ -291,6 +291,11 @@ def test_a_store_that_drops_what_was_answered_is_told_of(tmp_path):
         assert not noted()
 
 
+@pytest.mark.parametrize("command", ["watch", "policy", "export"])
+def test_help_says_where_the_key_of_a_server_comes_from(command):
+    assert "SPECSHIELD_API_KEY" in run_specshield(command, "--help").stdout
+
+
 def test_a_session_is_watched_a_line_a_decision(tmp_path):
     key = {"SPECSHIELD_API_KEY": "a-secret-key"}
     with serving(tmp_path, **key) as server, ShieldClient(server.url, "a-secret-key", timeout=60.0) as client:

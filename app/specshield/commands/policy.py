@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # every command line reads this module
     from specshield.client import Map, Policy, ShieldClient
     from specshield.sim.progress import StatusLine
 
-URL_HELP = "A server that runs already; without it, one of its own on SPECSHIELD_DATA_DIR."
+URL_HELP = "A server that runs already, with the key SPECSHIELD_API_KEY; else one on SPECSHIELD_DATA_DIR."
 LARGEST = 64 << 20  # [bytes] of a file; a server's own limit for a map
 
 

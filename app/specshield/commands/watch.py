@@ -15,7 +15,7 @@ HEAD = "    t mode           action       rule  feasible      KL   rho m   off b
 
 def watch(
     session: Annotated[str, typer.Argument(help="Id of a session.")],
-    url: Annotated[str, typer.Option(help="The server.")] = "http://127.0.0.1:8000",
+    url: Annotated[str, typer.Option(help="The server (key: SPECSHIELD_API_KEY).")] = "http://127.0.0.1:8000",
     after: Annotated[int, typer.Option(help="Begin after this step; -1: from the first.", min=-1)] = -1,
     limit: Annotated[int | None, typer.Option(help="Stop after so many decisions.", min=1)] = None,
 ) -> None:
