@@ -141,3 +141,28 @@ def pop(heap: Heap, size: int) -> int:
         at = child
     heap.row[at], heap.rank[at] = row, rank
     return size
+
+
+@inlined
+def sink(heap: Heap, hole: int, size: int, row: int, rank: float) -> None:
+    """Puts a row into heap[:size] at `hole` or below, the lowest row first on ties. The hole goes down to the
+    end first and the row up from there, where it mostly belongs: fewer branches that cannot be foreseen.
+    """
+    at = hole
+    while 2 * at + 1 < size:
+        child = 2 * at + 1
+        if child + 1 < size:
+            child += _is_before(heap, child + 1, heap.row[child], heap.rank[child])
+        heap.row[at], heap.rank[at] = heap.row[child], heap.rank[child]
+        at = child
+    while at > hole and not _is_before(heap, (at - 1) // 2, row, rank):
+        heap.row[at], heap.rank[at] = heap.row[(at - 1) // 2], heap.rank[(at - 1) // 2]
+        at = (at - 1) // 2
+    heap.row[at], heap.rank[at] = row, rank
+
+
+@inlined
+def _is_before(heap: Heap, at: int, row: int, rank: float) -> bool:
+    """Whether what is at a place of the heap comes before a row of this rank."""
+    other = heap.rank[at]
+    return bool((other < rank) | ((other == rank) & (heap.row[at] < row)))

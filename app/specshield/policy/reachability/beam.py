@@ -17,7 +17,7 @@ from specshield.policy.lattice import reads_heading
 from specshield.policy.progress import advance
 from specshield.policy.reachability.guide import copy_progress, read_due
 from specshield.policy.reachability.tables import SAFE, UNKNOWN, Guide, Scratch, is_broken, score, slack_at
-from specshield.policy.tree import table_size
+from specshield.policy.tree import Heap, sink, table_size
 from specshield.robot.dynamics import around, motion_count, step_from
 
 MAX_ROOTS = 62  # bits of a tag, which is an int64
@@ -25,6 +25,7 @@ MAX_ROOTS = 62  # bits of a tag, which is an int64
 # Chosen by hand; nothing measured.
 MAX_KEPT = 128  # poses kept at a step, unless one root alone has a larger share
 MAX_TRIED = 16  # motions from a pose; of more, only those with nearly the best score are tried
+MAX_SCORED = 64  # motions from a pose that are looked at; of more, others at other poses
 WIDEST_GAP, NARROWEST_GAP = 4.0, 0.1  # [steps] how far below the best score such a motion may be
 EASY = 8.0  # [steps] of slack after a goal was settled: from there the tables can be followed again
 POSE_GRAIN = 1e3  # [1/m, 1/rad] poses that round to the same multiples of its inverse count once
@@ -53,19 +54,13 @@ class Edges(NamedTuple):
     tag: Ints
 
 
-class Heap(NamedTuple):
-    """Rows of `Poses` and their slack [steps], as a binary heap."""
-
-    row: Ints
-    slack: Floats
-
-
 class Beam(NamedTuple):
     """What one beam works on.
 
     here: the poses kept at a step; new: those that their motions lead to. begun [R, K]: the roots' status at
     the beginning. table: where the poses of `new` are looked up; place [N]: the row that each has in `here`;
-    kept [R]: how many poses each root has there; heap: of the rows of `new`.
+    kept [R]: how many poses each root has there; heap: of the rows of `new`, the most slack first. every: one
+    motion in so many is looked at from a pose.
     """
 
     here: Poses
@@ -76,6 +71,7 @@ class Beam(NamedTuple):
     place: Ints
     kept: Ints
     heap: Heap
+    every: int
 
 
 @kernel
@@ -88,6 +84,7 @@ def beam_search(
     share: int,
     band: float,
     target: float,
+    few: bool,
     scratch: Scratch,
     motions: Ints,
     taken: Ints,
@@ -97,10 +94,11 @@ def beam_search(
     pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. share: the poses kept for each root.
     band: a pose with less slack [steps] is given up. A way ends where every goal is settled, where one more
     goal is settled and EASY steps are to spare, or where the latest feasible time [steps] is above `target`.
+    few: whether only some motions are looked at from each pose, others from others.
     Writes each root's way into motions (R, n) and its length into taken (R,), 0 where none was found.
     """
     roots, k_count = status.shape
-    steps = motions.shape[1]
+    steps, most = motions.shape[1], most_looked_at(guide)
     width = max(min(share * roots, MAX_KEPT), share)
     room = width * motion_count(guide.body)
     edges = Edges(
@@ -118,7 +116,8 @@ def beam_search(
         table=np.empty(table_size(room), np.int32),
         place=np.empty(room, np.int64),
         kept=np.empty(roots, np.int64),
-        heap=Heap(np.empty(room, np.int64), np.empty(room)),
+        heap=Heap(np.empty(room, np.int32), np.empty(room)),
+        every=(motion_count(guide.body) + most - 1) // most if few else 1,
     )
     for r in range(roots):
         _put(beam.here, r, pose[r, 0], pose[r, 1], pose[r, 2], status[r], run[r])
@@ -133,6 +132,14 @@ def beam_search(
         count = _select(found, n, open_roots, width, share, band, beam)
         if count == 0:
             return
+
+
+@inlined
+def most_looked_at(guide: Guide) -> int:
+    """How many motions are looked at from a pose where there are many. The tables of a robot that cannot wait
+    do not tell which of these lead on best.
+    """
+    return MAX_TRIED if guide.tables.bits.shape[0] > 0 else MAX_SCORED
 
 
 @kernel
@@ -151,7 +158,7 @@ def _put(to: Poses, i: int, x: float, y: float, theta: float, status: Int8s, run
 def _expand(
     guide: Guide, t: int, n: int, count: int, open_roots: int, band: float, beam: Beam, scratch: Scratch
 ) -> int:
-    """Makes every motion from the first `count` poses of `here`; each new pose is written once. How many."""
+    """Makes motions from the first `count` poses of `here`; each new pose is written once. How many."""
     body, rules, tables, _, _ = guide
     here, new, edges = beam.here, beam.new, beam.edges
     found, joined, turns_matter = 0, 0, reads_heading(rules.programs, rules.regions)
@@ -162,11 +169,12 @@ def _expand(
             continue
         before_x, before_y, before = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
         copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
-        corners = score(guide, before_x, before_y, before, t + n, -1, scratch)
+        some = (w + n) % beam.every, beam.every
+        corners = score(guide, before_x, before_y, before, t + n, -1, some, scratch)
         lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         cos, sin, room = around(body, before_x, before_y, before)
         read = False  # whether the scratch holds the predicates at the place that the motions begin at
-        for m in range(motion_count(body)):
+        for m in range(some[0], motion_count(body), some[1]):
             if scratch.scores[m] < lowest:
                 continue
             x, y, theta = step_from(body, before_x, before_y, before, cos, sin, room, m)
@@ -241,22 +249,22 @@ def _select(found: int, n: int, open_roots: int, width: int, share: int, band: f
 
     found: how many poses of `new` count. The edges to poses that are not kept are taken out.
     """
-    here, new, edges, _, _, place, kept, heap = beam
+    here, new, edges, place, kept, heap = beam.here, beam.new, beam.edges, beam.place, beam.kept, beam.heap
     for r in range(kept.shape[0]):
         kept[r] = 0
     size = 0
     for o in range(found):
         place[o] = -1
         if new.slack[o] >= band and new.tag[o] & open_roots != 0:
-            heap.row[size], heap.slack[size] = o, new.slack[o]
+            heap.row[size], heap.rank[size] = o, -new.slack[o]
             size += 1
     for i in range(size // 2 - 1, -1, -1):
-        _sink(heap, i, size, heap.row[i], heap.slack[i])
+        sink(heap, i, size, heap.row[i], heap.rank[i])
     count, full = 0, 0  # full: the roots that have their share
     while size > 0 and count < width:
         o = heap.row[0]
         size -= 1
-        _sink(heap, 0, size, heap.row[size], heap.slack[size])
+        sink(heap, 0, size, heap.row[size], heap.rank[size])
         tag = new.tag[o] & open_roots
         if tag & ~full == 0:
             continue
@@ -276,31 +284,6 @@ def _select(found: int, n: int, open_roots: int, width: int, share: int, band: f
             joined += 1
     edges.made[n] = joined
     return count
-
-
-@inlined
-def _sink(heap: Heap, hole: int, size: int, row: int, slack: float) -> None:
-    """Puts a row into heap[:size] at `hole` or below. The hole goes down to the end first and the row up from
-    there, since it mostly belongs there: fewer branches that cannot be foreseen.
-    """
-    at = hole
-    while 2 * at + 1 < size:
-        child = 2 * at + 1
-        if child + 1 < size:
-            child += _is_before(heap, child + 1, heap.row[child], heap.slack[child])
-        heap.row[at], heap.slack[at] = heap.row[child], heap.slack[child]
-        at = child
-    while at > hole and not _is_before(heap, (at - 1) // 2, row, slack):
-        heap.row[at], heap.slack[at] = heap.row[(at - 1) // 2], heap.slack[(at - 1) // 2]
-        at = (at - 1) // 2
-    heap.row[at], heap.slack[at] = row, slack
-
-
-@inlined
-def _is_before(heap: Heap, at: int, row: int, slack: float) -> bool:
-    """Whether what is at a place of the heap comes before a row: most slack first, then the lowest row."""
-    other = heap.slack[at]
-    return bool((other > slack) | ((other == slack) & (heap.row[at] < row)))
 
 
 @leaf

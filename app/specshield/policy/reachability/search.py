@@ -17,7 +17,7 @@ from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins
 from specshield.policy.progress.recall import Past, Present, resume
-from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search
+from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search, most_looked_at
 from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
 from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
@@ -136,14 +136,13 @@ def continue_all(
         if settled[m] and base < 0:
             base = int(m)
     small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
-    for attempt in range(3):
-        share, band = width, BAND if waits else 0.0
-        if attempt == 0:
-            share = NARROW_SHARE
-        elif attempt == 2:
-            share, band = SMALL_SHARE, 2.0 * HOPELESS
-        if (attempt > 0 or not waits) and (attempt < 2 or small):
-            _beam_out(guide, t, share, width, max(band, lowest), starts, scratch)
+    for few in (True, False):
+        if few or (order.shape[0] > most_looked_at(guide) and not np.any(settled)):
+            if not waits:
+                _beam_out(guide, t, NARROW_SHARE, width, max(0.0, lowest), few, starts, scratch)
+            _beam_out(guide, t, width, width, max(BAND if waits else 0.0, lowest), few, starts, scratch)
+    if small:
+        _beam_out(guide, t, SMALL_SHARE, width, max(2.0 * HOPELESS, lowest), False, starts, scratch)
     copy_ways(motions, poses, twin)
     best = order[0]
     return int(guide.wait if waits and starts.slack[guide.wait] == starts.slack[best] else best)
@@ -203,6 +202,7 @@ def _follow(
             width,
             high - (t + n) - ESCAPE_LOSS,
             high + ESCAPE_GAIN,
+            True,
             scratch,
             way,
             taken,
@@ -232,22 +232,22 @@ def take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, 
 
 @kernel
 def _beam_out(
-    guide: Guide, t: int, share: int, width: int, band: float, starts: Starts, scratch: Scratch
+    guide: Guide, t: int, share: int, width: int, band: float, few: bool, starts: Starts, scratch: Scratch
 ) -> None:
     """Looks for a way after every first motion that is wanted, has none yet and a slack of at least `band`
-    [steps].
+    [steps]. few: as `beam_search` has it.
     """
     motions, poses = starts.motions, starts.poses
     steps, sought = motions.shape[1] - 1, starts.wanted & ~starts.settled & (starts.slack >= band)
     roots = np.array([m for m in starts.order if starts.twin[m] == m and sought[m]], dtype=np.int64)
     if steps == 0:
         return
-    few = ROOTS if guide.wait >= 0 else MAX_ROOTS
+    most = ROOTS if guide.wait >= 0 else MAX_ROOTS
     while roots.shape[0] > 0:
-        some, rest = roots[:few], roots[few:]
+        some, rest = roots[:most], roots[most:]
         way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
         here, status, run = poses[some, 0], starts.status[some], starts.run[some]
-        beam_search(guide, t + 1, here, status, run, share, band, np.inf, scratch, way, taken)
+        beam_search(guide, t + 1, here, status, run, share, band, np.inf, few, scratch, way, taken)
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:
@@ -260,6 +260,8 @@ def _beam_out(
                 simulate(guide.body, poses[m, n - 1], motions[m, n:], poses[m, n:])
         if guide.wait >= 0:
             known = some[starts.settled[some]]
+            if known.shape[0] == 0:  # nor will many others: those that are left share fewer beams
+                most = min(2 * most, MAX_ROOTS)
             for m in rest:
                 starts.settled[m] = join_sibling(guide, t, known, m, starts, scratch)
         roots = rest[~starts.settled[rest]]

@@ -21,6 +21,7 @@ from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDIN
 from specshield.robot.dynamics import Body, displacement
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
+ALL = (0, 1)  # `some` of `score` where every motion is looked at
 SAFE = 1e6  # in place of a slack [steps], where nothing is left to do
 UNKNOWN = -1  # in place of how many corners there are about a place
 DELAYS = (0, 1, 2, 4, 8)  # [steps] that a robot which cannot wait would like to have to spare
@@ -214,11 +215,14 @@ def is_broken(status: Int8s) -> bool:
 
 
 @inlined
-def score(guide: Guide, x: float, y: float, theta: float, t: int, last: int, scratch: Scratch) -> int:
+def score(
+    guide: Guide, x: float, y: float, theta: float, t: int, last: int, some: tuple[int, int], scratch: Scratch
+) -> int:
     """L after each motion from x_t into scratch.scores, contact and the step's own progress left out: a cheap
     order to try motions in.
 
     last: the motion before, -1 for none. HOPELESS for what leads straight back: the tables err by a little.
+    some: the first motion that is looked at, and how many after it the next one; the others are HOPELESS.
     Writes the corners about (x, y) into scratch.corners and returns how many there are, UNKNOWN where they
     were not needed.
     """
@@ -231,7 +235,9 @@ def score(guide: Guide, x: float, y: float, theta: float, t: int, last: int, scr
     headings = tables.code.shape[2]
     v, u, h, dv, du = coordinates_ahead(body, tables.pitch, headings, x, y, theta)
     count = find_corners(tables.cell, v, u, scratch.corners)
-    for m in range(scores.shape[0]):
+    if some[1] > 1:
+        scores[:] = HOPELESS
+    for m in range(some[0], scores.shape[0], some[1]):
         if table < 0 or leads_back(body, last, m):
             scores[m] = HOPELESS
             continue
