@@ -11,6 +11,7 @@ import typer
 
 from specshield.cores import cores
 from specshield.errors import InputError, Unsupported
+from specshield.service.library.files import check_writable
 
 
 def evaluate(
@@ -132,6 +133,7 @@ def results(
     from evaluation.houses import houses_in
     from evaluation.plan import carry_out
 
+    _check_page(page)
     kinds = _some(only, ("cases", "noise", "bodies", "houses", "models", "tasks"), "--only") if only else []
     found = houses_in(houses)
     if not found and (not kinds or "houses" in kinds):
@@ -154,6 +156,7 @@ def rewards(
     """Train the learned policy with the paper's reward and with ours, and compare what comes of them."""
     from evaluation.rewards import all_of, compare
 
+    _check_page(page)
     whole = [int(seed) for seed in _numbers(seeds, "--seeds")]
     compare(all_of(case, reward, whole, updates), runs, out, page)
 
@@ -180,6 +183,7 @@ def curves(
     from evaluation.experiment import Experiment
     from specshield.sim.cases import case_name
 
+    _check_page(page)
     asked = [
         Experiment(case_name(one), model=name, seed=seed)
         for one in case.split(",")
@@ -208,6 +212,7 @@ def habits(
     """Measure what shields break of a model's habit and of its memory."""
     from evaluation.habits import measure
 
+    _check_page(page)
     measure(runs, seed, out, page, processes or cores())
 
 
@@ -225,6 +230,7 @@ def rivals(
     """Measure look-ahead beside slacks of four kinds, and say whether it wins."""
     from evaluation.rivals import FAMILIES, measure
 
+    _check_page(page)
     models = model.split(",") if model else FAMILIES
     measure(runs, seed, models, case.split(","), out, page, processes or cores())
 
@@ -239,6 +245,15 @@ def report(
     from evaluation import writeup
 
     writeup.write_up(results, out)
+
+
+def _check_page(page: Path) -> None:
+    """Makes the folder of a page if need be. Raises InputError where the page cannot be written, since what
+    it is written from may take hours.
+    """
+    check_writable(page.parent, "--page")
+    if page.is_dir():
+        raise InputError("this is a folder", path="--page", got=str(page), expected="a file to write")
 
 
 def _some(text: str, known: Iterable[str], option: str) -> list[str]:

@@ -8,7 +8,7 @@ from importlib.metadata import entry_points
 import pytest
 import typer
 
-from evaluation import commands, jobs, plan
+from evaluation import commands, habits, jobs, plan
 from tests.serving import run_specshield
 
 
@@ -139,3 +139,23 @@ def test_a_name_that_nothing_has_is_refused(command, option, given, tmp_path):
     (line,) = refused.stderr.splitlines()
     assert line.startswith(f"{option}: ")
     assert "nope" in line
+
+
+@pytest.mark.parametrize("command", ["rivals", "habits", "rewards", "curves", "results"])
+def test_a_page_that_cannot_be_written_is_told_before_anything_runs(command, tmp_path):
+    """It was told after hours, when the runs were made and the page was to be written."""
+    (tmp_path / "file").touch()
+    for page, said in ((tmp_path / "file" / "page.md", "File exists"), (tmp_path, "this is a folder")):
+        asked = ("--page", str(page), "--out", str(tmp_path / "out"))
+        refused = specshield(command, *asked, code=1)
+        assert not refused.stdout
+        (line,) = refused.stderr.splitlines()
+        assert line.startswith("--page")
+        assert said in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_folder_of_a_page_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(habits, "measure", lambda *_: None)
+    commands.habits(1, 0, tmp_path, tmp_path / "new" / "page.md", 1)
+    assert (tmp_path / "new").is_dir()
