@@ -460,6 +460,14 @@ def test_a_setting_that_a_server_refuses_is_refused(
         assert any(str(each["path"]).startswith(path) for each in told.get("errors", [told])), told
 
 
+def test_a_threshold_of_0_metres_is_taken_here_and_there(server: RunningServer) -> None:
+    """A server refused it, as though it were a probability, of which 0 asks for nothing."""
+    asked: dict[str, Any] = {"initial_pose": START, "evaluation": "robustness", "threshold": 0.0}
+    with ShieldClient(server.url, timeout=60.0) as client:
+        there = client.sessions.create(policy_id="case1", **asked).info
+    assert there.feasible is LocalShield.shipped("case1").session(**asked).info.feasible is True
+
+
 def test_a_setting_may_come_from_numpy_and_what_is_known_of_the_robot_is_as_on_a_server(
     server: RunningServer,
 ) -> None:

@@ -68,9 +68,9 @@ class SessionRequest(_Policies):
     seed: int = Field(0, ge=0, lt=2**63, description="`action` is drawn from the seed and t.")
     threshold: float = Field(
         1.0,
-        gt=0.0,
-        description="delta, the least expected J of a step. The guarantee is for 1 with evaluation "
-        "`feasibility`: 0.99^150 is 0.22. With `robustness` it is in metres and guarantees nothing.",
+        ge=0.0,
+        description="delta, the least expected J of a step. With evaluation `feasibility` above 0 and at "
+        "most 1, and only 1 has the guarantee: 0.99^150 is 0.22. With `robustness` in metres, and without.",
     )
     margin: float = Field(
         0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
