@@ -62,6 +62,8 @@ def circle(x, radius=0.3):
         ("F[0,60] x > 11", False, "asks for 'x > 11', which holds nowhere"),
         ("F[0,9] Near and F[10,20] Far", False, None),
         ("F[22,22] Far and F[24,30] Near", False, "not all of these can be reached in time"),
+        ("F[2,2] theta > 2", False, "whatever the robot does, it breaks F[2,2] theta > 2 by step 2"),
+        ("F[0,0] Far", False, "Far is broken already"),
         ("G[2,9] theta > 2", False, "whatever the robot does, it breaks G[2,9] theta > 2 by step 2"),
         ("G[0,20] F[0,4] Far", False, "'Far' cannot be met from here before step 18"),
         ("F[0,10] Far or F[0,15] Far", False, "and its 1 other ways are ruled out likewise"),

@@ -72,7 +72,7 @@ class Reader:
     def _some(self, formula: Formula, a: int, b: int) -> Alternatives:
         """What it needs that the formula holds at some step from a to b."""
         if is_predicate(formula):
-            return self._predicate(formula, a, b, 0)
+            return self._asked(Need(formula, a, b, 0, Eventually(a, b, formula) if b else formula))
         match formula:
             case Or(children):
                 return _any(self._some(child, a, b) for child in children)
@@ -81,7 +81,7 @@ class Reader:
             case Eventually(c, d, child):
                 return self._some(child, a + c, b + d)
             case Always(c, d, child) if is_predicate(child):
-                return self._predicate(child, a + c, b + c, d - c)
+                return self._asked(Need(child, a + c, b + c, d - c))
             case Always(c, d, child) if a + d >= b + c:  # these steps count, whichever the step is
                 return self._every(child, b + c, a + d)
             case Always(c, d, child):
@@ -96,7 +96,7 @@ class Reader:
     def _every(self, formula: Formula, a: int, b: int) -> Alternatives:
         """What it needs that the formula holds at every step from a to b."""
         if is_predicate(formula):
-            return self._predicate(formula, a, a, b - a)
+            return self._asked(Need(formula, a, a, b - a))
         if a == b:
             return self._some(formula, a, b)
         match formula:
@@ -119,11 +119,11 @@ class Reader:
                 return _all([then, self._every(left_side, a, b + c - 1)]) if c > 0 else then
         return NOTHING
 
-    def _predicate(self, predicate: Formula, first: int, last: int, stay: int) -> Alternatives:
-        truth = self.constant(predicate, first)
+    def _asked(self, need: Need) -> Alternatives:
+        truth = self.constant(need.predicate, need.first)
         if truth is not None:
             return NOTHING if truth else IMPOSSIBLE
-        return ((Need(predicate, first, last, stay),),)
+        return ((need,),)
 
 
 def _any(parts: Iterable[Alternatives]) -> Alternatives:
