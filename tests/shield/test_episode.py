@@ -272,6 +272,19 @@ def test_of_a_broken_g_over_an_f_the_visit_that_is_open_yet_is_kept():
     assert decision.j_values == (1.0, 0.0, 0.0, 0.0, 1.0)
 
 
+def test_after_the_last_visit_that_is_open_it_is_said_that_what_was_left_is_kept():
+    """It was said until the horizon that it would be kept again, as if a visit were still due."""
+    cells = cells_of("G[0,2] F[0,2] A", lambda s: s["A"][..., 2:5].any(-1))
+    shield = shield_of(cells, learn_map=True)
+    before = decide(shield, walk(cells, WAIT, WAIT), EVEN).warnings
+    after = decide(shield, walk(cells, WAIT, WAIT, FORWARD), EVEN).warnings
+    assert before == ("G[0,2] F[0,2] A was broken, and is kept again as soon as it can be",)
+    assert after == ("G[0,2] F[0,2] A was broken, and what was left of it is kept",)
+    lost = cells_of("G[0,2] (F[0,2] A and G[0,1] B)", lambda s: s["A"][..., 2:5].any(-1))
+    decision = decide(shield_of(lost, learn_map=True), walk(lost, WAIT, WAIT, WAIT), EVEN)
+    assert decision.warnings[0] == f"{lost.task.formula} was broken, and is given up"
+
+
 def test_where_nothing_can_be_kept_the_policy_takes_over():
     cells = cells_of("F[0,1] A and F[0,3] x > 99", lambda s: np.zeros(s["A"].shape[:-1], bool))
     decision = decide(shield_of(cells, Scripted(cells, waits, LEFT)), walk(cells, WAIT, WAIT), EVEN)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from specshield.arrays import Floats
-from specshield.stl import SATISFIED_ABOVE, Always, And, Formula, conjuncts, robustness_bounds
+from specshield.stl import Always, And, Formula, conjuncts, verdict
 
 
 def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[list[Formula], list[Always]]:
@@ -13,8 +13,7 @@ def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[l
     kept: list[Formula] = []
     broken: list[Always] = []
     for conjunct in conjuncts(formula):
-        _, high = robustness_bounds(conjunct, {name: prefix[name] for name in conjunct.names})
-        if high > SATISFIED_ABOVE:
+        if verdict(conjunct, prefix) != "violated":
             kept.append(conjunct)
         elif isinstance(conjunct, Always) and conjunct.horizon > t:
             broken.append(conjunct)

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from specshield.robot.dynamics import simulate
-from specshield.rule.residual import left_over
+from specshield.rule.residual import again, left_over
 from specshield.shield.decision import Config, Shield
 from specshield.shield.feasibility import Futures, Prefix, rho_of
-from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, conjuncts, verdict
 
 
 def recovers(config: Config) -> bool:
@@ -51,10 +51,11 @@ def most_kept(
 
 def given_up(prefix: Prefix) -> tuple[str, ...]:
     """A sentence for each part of a violated rule that is lost."""
-    formula, t = prefix.formula, prefix.t
-    kept, broken = left_over(formula, prefix.task.samples(prefix.poses, prefix.signals), t)
-    lost = [part for part in conjuncts(formula) if part not in kept and part not in broken]
+    rule, samples = prefix.formula, prefix.task.samples(prefix.poses, prefix.signals)
+    kept, broken = left_over(rule, samples, prefix.t)
+    told = {"pending": "is kept again as soon as it can be", "satisfied": "what was left of it is kept"}
+    now = [told.get(verdict(part, samples), "is given up") for part in again(broken, prefix.t + 1)]
     return (
-        *(f"{part} was not kept, and is given up" for part in lost),
-        *(f"{part} was broken, and is kept again as soon as it can be" for part in broken),
+        *(f"{part} was not kept, and is given up" for part in conjuncts(rule) if part not in kept + broken),
+        *(f"{part} was broken, and {then}" for part, then in zip(broken, now, strict=True)),
     )
