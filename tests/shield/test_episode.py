@@ -285,6 +285,16 @@ def test_after_the_last_visit_that_is_open_it_is_said_that_what_was_left_is_kept
     assert decision.warnings[0] == f"{lost.task.formula} was broken, and is given up"
 
 
+def test_what_is_missed_is_told_of_the_ways_that_were_tried():
+    """An explanation looks at more of them: beside its own figure, "no way was found" was not so."""
+    ahead = REACH.pose(1, 0, 0)[0]
+    for place, by in ((f"x > {ahead}", "0"), (f"x > {ahead + 1.0}", "1")):
+        cells = cells_of(f"F[0,2] A and F[0,2] {place}", lambda s: np.zeros(s["A"].shape[:-1], bool))
+        decision = decide(shield_of(cells, Scripted(cells, waits), learn_map=True), walk(cells), EVEN)
+        told = f"no way that was tried keeps F[0,2] {place}: the best misses it by {by}"
+        assert decision.warnings == (told,)
+
+
 def test_where_nothing_can_be_kept_the_policy_takes_over():
     cells = cells_of("F[0,1] A and F[0,3] x > 99", lambda s: np.zeros(s["A"].shape[:-1], bool))
     decision = decide(shield_of(cells, Scripted(cells, waits, LEFT)), walk(cells, WAIT, WAIT), EVEN)

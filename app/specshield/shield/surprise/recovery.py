@@ -43,7 +43,7 @@ def most_kept(
             continue
         nearest = nearest if said else rho
         lost.append(part)
-        said.append(f"no way was found to keep {part}: the nearest misses it by {-rho[left].max():.3g}")
+        said.append(f"no way that was tried keeps {part}: the best misses it by {abs(rho[left].max()):.3g}")
     nearest = np.where(left, nearest, -np.inf)
     best = int(np.argmax(nearest[:-1]))
     return int(tried.motions[best, 0]), tuple(lost), tuple(said), bool(nearest[best] > nearest[-1])
