@@ -619,12 +619,19 @@ def test_steps_before_a_switch_are_told_under_the_rule_that_held_then(server, cl
         heading = page.get_by_role("heading", level=2).first
         page.get_by_role("heading", name="Step 3, step 0 of 20 of its rule").wait_for()
         assert page.locator(".robot:not([hidden])").count() == 1
+        goal, end = (page.locator(f".region[data-name={name}]") for name in ("Goal", "End"))
+        assert (goal.count(), end.count()) == (0, 1)
         page.get_by_label("Step", exact=True).fill("1")
         page.get_by_text("Decided under an earlier rule: F[0,6] Goal and G[0,8] battery > 10").wait_for()
+        goal.wait_for()
+        assert end.count() == 0
         assert heading.inner_text() == "Step 1 of 8"
         page.get_by_text("Decided for another robot").wait_for()
         assert page.locator(".next").get_attribute("points") == ""
         assert page.locator(".robot:not([hidden])").count() == 1
+        page.get_by_role("button", name="Newest").click()
+        end.wait_for()
+        assert goal.count() == 0
         switch(4, "case1", [4.5, 5.0, 0.0])
         assert step(session, 4, [[4.5, 5.0, 0.0]], logits=[0.0] * 20).status_code == 200
         page.get_by_role("heading", name="Step 4, step 0 of 140 of its rule").wait_for()

@@ -6,7 +6,8 @@ import { el, onceAFrame, percent } from "../lib/dom.js";
 import { Floor } from "../lib/floor.js";
 import { Learned } from "../lib/learned.js";
 import { Mark } from "../lib/mark.js";
-import { measure } from "../lib/rules.js";
+import { patiently } from "../lib/patience.js";
+import { measure, ruleOf, sameFloor } from "../lib/rules.js";
 import { Panel } from "./panel.js";
 import { Replay } from "./replay.js";
 
@@ -26,6 +27,7 @@ export class Watch {
     this.draw = onceAFrame(() => this.show());
     this.replay = new Replay(this.draw);
     this.learned = new Learned(this.floor, session, this.mark, this.draw);
+    this.places = new Map(); // of each rule that was shown, its regions and which of them it avoids, once they are told
     const left = el("div", { class: "stack" }, this.floor.frame, this.learned.key, this.replay.element);
     this.charted = el("section", { class: "card charts", "aria-label": "Over time" });
     this.charted.append(...this.charts.map(([chart]) => chart.element));
@@ -35,11 +37,34 @@ export class Watch {
 
   async load(signal) {
     this.signal = signal;
-    const { spec, map_id } = this.session;
-    const body = { formula: spec.formula, regions: spec.regions, signals: spec.signals, map_id };
-    const told = ask("v1/specs/validate", { json: body, signal }).catch(() => ({ avoided: [] }));
-    this.floor.regions(spec.regions, (await told).avoided);
+    this.of = this.session.rules.at(-1); // the rule whose regions are drawn
+    this.places.set(this.of, this.judged(this.session.spec));
+    this.floor.regions(...(await this.places.get(this.of)));
     await this.floor.load(signal);
+  }
+
+  /** The regions of a rule, and those that it avoids. */
+  async judged({ formula, regions, signals }) {
+    const body = { formula, regions, signals, map_id: this.session.map_id };
+    const told = await ask("v1/specs/validate", { json: body, signal: this.signal }).catch(() => ({ avoided: [] }));
+    return [regions ?? {}, told.avoided];
+  }
+
+  /** The same of an earlier rule, which its policy knows; no regions where that was deleted. */
+  async earlier({ policy_ids: [id] }) {
+    const path = `v1/policies/${encodeURIComponent(id)}`;
+    const found = patiently(() => ask(path, { signal: this.signal }), this.signal);
+    return found.then(({ spec }) => this.judged(spec), () => [{}, []]);
+  }
+
+  /** Draws the regions of the rule that an item was decided under; of the present one where that is on another floor. */
+  async under(item) {
+    const rule = sameFloor(this.session, item) ? ruleOf(this.session, item) : this.session.rules.at(-1);
+    if (rule === this.of) return;
+    this.of = rule;
+    if (!this.places.has(rule)) this.places.set(rule, this.earlier(rule));
+    const places = await this.places.get(rule);
+    if (rule === this.of && !this.signal.aborted) this.floor.regions(...places);
   }
 
   /** item: {t, pose, logits, decision}, as in a trajectory. */
@@ -58,6 +83,7 @@ export class Watch {
     this.learned.show(known.findLast((each) => each.decision));
     this.mark.show(known);
     this.panel.show(item);
+    this.under(item);
     const decided = this.items.filter((each) => each?.decision);
     const { origin, horizon } = this.session.rules.at(-1);
     const last = Math.max(origin + horizon, this.items.length - 1);
