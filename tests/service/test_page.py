@@ -601,6 +601,27 @@ def test_what_a_session_learned_of_its_map_is_drawn_over_it(server, begin, step,
     assert complaints == []
 
 
+def test_what_several_robots_learned_is_drawn_on_their_floor(server, begin, step, browse):
+    """Of each what it found itself, before the page was opened and since."""
+    (first, second), poses = (begin(id="finds-one"), begin(id="finds-two")), ahead(3)
+    for session in (first, second):
+        assert step(session, 0, [poses[0]]).status_code == 200
+    assert step(first, 1, [poses[1]], occupied=[[2.55, 1.05]]).status_code == 200
+    with browse() as (page, complaints):
+        page.goto(f"{server.url}/#/floor?sessions=finds-one,finds-two")
+        page.get_by_text("finds-one: found occupied").wait_for()
+        found = page.locator(".learned g:not([hidden]) path.occupied")
+        assert [each.get_attribute("d") for each in found.all()] == ["M25 10h1v1h-1z"]
+        page.get_by_text("live").wait_for()
+        assert step(second, 1, [poses[1]], occupied=[[2.55, 1.15]]).status_code == 200
+        page.get_by_text("finds-two: found occupied").wait_for()
+        assert [each.get_attribute("d") for each in found.all()] == ["M25 10h1v1h-1z", "M25 11h1v1h-1z"]
+        page.get_by_label("Step", exact=True).fill("0")
+        page.locator(".key.learned").first.wait_for(state="hidden")
+        assert found.count() == 0
+    assert complaints == []
+
+
 def test_steps_before_a_switch_are_told_under_the_rule_that_held_then(server, client, begin, step, browse):
     """What another robot did elsewhere is not told as motions of the present one, nor drawn on its floor."""
     session, poses = begin(), ahead(3)

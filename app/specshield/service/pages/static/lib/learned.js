@@ -4,12 +4,15 @@ import { ask } from "./api.js";
 import { el, svg } from "./dom.js";
 import { patiently, pause } from "./patience.js";
 
-const EVERY = 1000; // [ms] between two reads, at least: a robot with a scanner may change its map at each step
+export const EVERY = 1000; // [ms] between two reads, at least: a robot with a scanner may change its map at each step
 
 export class Learned {
-  /** session: as the API shows it. mark: of its robot. changed: called when other cells are to be drawn. */
-  constructor(floor, session, mark, changed) {
-    Object.assign(this, { floor, session, mark, changed });
+  /**
+   * session: as the API shows it. mark: of its robot. changed: called when other cells are to be drawn.
+   * name: of the robot, where the floor has several. every: milliseconds between two reads.
+   */
+  constructor(floor, session, mark, changed, name = "", every = EVERY) {
+    Object.assign(this, { floor, session, mark, changed, name, every });
     const { rules, map_id } = session;
     this.since = rules[rules.findLastIndex((rule) => rule.map_id !== map_id) + 1].from; // it has been on this map
     this.known = { t: -1, map_revision: 0, occupied: [], free: [] };
@@ -17,7 +20,8 @@ export class Learned {
     const { origin, resolution } = floor.map;
     const transform = `${floor.placed(origin)} scale(${resolution} ${-resolution})`;
     this.cells = ["occupied", "free"].map((kind) => svg("path", { class: kind, transform }));
-    floor.layers.learned.append(...this.cells);
+    this.layer = svg("g", {}, ...this.cells);
+    floor.layers.learned.append(this.layer);
     this.key = el("p", { class: "key learned", hidden: true });
   }
 
@@ -32,7 +36,7 @@ export class Learned {
         const known = await patiently(() => ask(path, { signal }), signal);
         if (known.map_id !== this.session.map_id) return; // it has been switched to another, and is shown anew
         this.take(known);
-        await pause(EVERY);
+        await pause(this.every);
       }
     } catch (error) {
       if (!signal.aborted && error.status !== 404) throw error; // else it was left, or erased, as others say
@@ -53,13 +57,13 @@ export class Learned {
     const revision = item && item.t >= this.since ? item.decision.map_revision : 0;
     const { t, occupied, free, map_revision } = this.known;
     const shown = revision > 0 && occupied.length + free.length > 0;
-    this.floor.layers.learned.toggleAttribute("hidden", !shown);
+    this.layer.toggleAttribute("hidden", !shown);
     this.key.hidden = !shown;
     this.mark.occupancy = shown ? this.own : null;
     const kinds = ["occupied", "free"].filter((kind) => this.known[kind].length);
     const told = kinds.flatMap((kind) => [el("span", {}, el("i", { class: kind }), `found ${kind}`), " "]);
     const when = revision === map_revision ? "" : ` What is drawn is from step ${t}.`;
-    this.key.replaceChildren(...told, `The map says otherwise.${when}`);
+    this.key.replaceChildren(this.name && `${this.name}: `, ...told, `The map says otherwise.${when}`);
   }
 }
 

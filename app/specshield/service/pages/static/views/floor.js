@@ -3,6 +3,7 @@
 import { ask } from "../lib/api.js";
 import { called, el, onceAFrame, percent, problem, short } from "../lib/dom.js";
 import { bare, Floor } from "../lib/floor.js";
+import { EVERY, Learned } from "../lib/learned.js";
 import { follow } from "../lib/live.js";
 import { Mark } from "../lib/mark.js";
 import { passes } from "../lib/patience.js";
@@ -30,11 +31,17 @@ export async function show(place, { query, signal }) {
   const elsewhere = sessions.filter((session) => session.map_id !== map_id).map(({ id }) => `${id} is on another floor.`);
   const floor = new Floor(map, `Floor with ${robots.length} robots`);
   floor.regions(...(await places(robots, signal)));
-  const all = robots.map((session, i) => {
-    return { session, items: [], mark: new Mark(floor, session, i), row: row(session, i) };
-  });
   const state = new State();
   const draw = onceAFrame(() => all.forEach((each) => shown(each, replay.t)));
+  const all = robots.map((session, i) => {
+    const mark = new Mark(floor, session, i);
+    const learned = new Learned(floor, session, mark, draw, short(session.id), EVERY * robots.length);
+    return { session, items: [], mark, learned, row: row(session, i) };
+  });
+  const hear = ({ learned, items }) => {
+    const item = items.findLast((each) => each?.decision);
+    if (item && floor.occupancy) learned.heard(item, signal);
+  };
   const replay = new Replay(draw);
   const heads = ["Robot", "Step", "Mode", "Feasible", "Rule"].map((name) => el("th", { scope: "col" }, name));
   const list = el("table", { class: "list" }, el("thead", {}, el("tr", {}, heads)), el("tbody", {}, all.map((each) => each.row)));
@@ -50,7 +57,7 @@ export async function show(place, { query, signal }) {
     el(
       "div",
       { class: "watch" },
-      el("div", { class: "stack" }, floor.frame, replay.element),
+      el("div", { class: "stack" }, floor.frame, ...all.map(({ learned }) => learned.key), replay.element),
       el("section", { class: "card scroll", "aria-label": "Robots" }, list),
     ),
   );
@@ -58,11 +65,16 @@ export async function show(place, { query, signal }) {
   const read = async () => {
     for (let each; (each = waiting.shift()); ) {
       await load(each, signal);
+      hear(each);
       replay.extend(each.items.length - 1);
       draw();
     }
   };
-  await Promise.all([floor.load(signal).then(draw), ...Array.from({ length: AT_ONCE }, read)]);
+  const loaded = floor.load(signal).then(() => {
+    all.forEach(hear);
+    draw();
+  });
+  await Promise.all([loaded, ...Array.from({ length: AT_ONCE }, read)]);
   const by = new Map(all.map((each) => [each.session.id, each]));
   const after = new Map(all.filter((each) => !each.session.finished).map((each) => [each.session.id, each.items.length - 1]));
   const created = new Map(all.map(({ session }) => [session.id, session.created_at]));
@@ -73,6 +85,7 @@ export async function show(place, { query, signal }) {
     if (item.finished) Object.assign(each.session, { spec_status: item.spec_status ?? each.session.spec_status, erased: item.erased });
     else {
       each.items[item.t] = item;
+      hear(each);
       replay.extend(item.t);
     }
     draw();
@@ -129,11 +142,12 @@ function row(session, i) {
   );
 }
 
-function shown({ session, items, mark, row }, t) {
+function shown({ session, items, mark, learned, row }, t) {
   const known = items.slice(0, t + 1).filter(Boolean);
   const item = known.at(-1);
   row.children[1].textContent = item ? item.t : "is read …";
   if (!item) return;
+  learned.show(known.findLast((each) => each.decision));
   mark.show(known);
   const { decision } = item;
   const mass = decision?.feasible_mass;
