@@ -19,6 +19,7 @@ def run_policy(
     policy: Annotated[str, typer.Argument(help="Id or name of a policy in SPECSHIELD_DATA_DIR.")],
     target: Annotated[str | None, typer.Option(help="Where the model goes, as 2.5,1.0 in metres.")] = None,
     seed: Annotated[int, typer.Option(help="Decides start, target and model.", min=0)] = 0,
+    shaping: Annotated[str, typer.Option(help="As a session has it: projection, lookahead.")] = "projection",
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
 ) -> None:
     """Drive a simulated robot through an episode, with and without the shield, and draw both."""
@@ -36,7 +37,7 @@ def run_policy(
     with client_of(None, status) as client:
         found = client.policies.get(policy)
         case = _case(found.id, found.name or found.id[:12], target, seed)
-        session, start, refused = begin(client, case, found.id, seed)
+        session, start, refused = begin(client, case, found.id, seed, shaping=shaping)
         status.say("driving ...")
         model = GoalSeeker(case.task.robot)
         shielded = with_shield(session, case, model, start, seed)

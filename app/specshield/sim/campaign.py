@@ -140,22 +140,20 @@ def _pair(name: str, i: int, seed: int, named: bool) -> tuple[Episode, Episode, 
     assert _client is not None
     case, own = _case(name), int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
     ids = [f"{name}-{i}-{how}" if named else None for how in ("shielded", "alone")]
-    session, start, refused = begin(_client, case, name, own, ids[0])
+    session, start, refused = begin(_client, case, name, own, id=ids[0])
     model = load_learned(case.instruction)
     shielded = with_shield(session, case, model, start, own)
     return shielded, without_shield(_client, case, model, start, own, id=ids[1]), refused
 
 
-def begin(
-    client: ShieldClient, case: Case, policy_id: str, seed: int, id: str | None = None
-) -> tuple[Session, Pose, int]:
+def begin(client: ShieldClient, case: Case, policy: str, seed: int, **more: Any) -> tuple[Session, Pose, int]:
     """A session at the first start that is not refused, of those drawn uniformly over free space; that start;
-    and how many were refused.
+    and how many were refused. more: options of the session.
     """
     starts = free_poses(case.task, case.body, DRAWS, np.random.default_rng([seed, 2]))
     for refused, (x, y, theta) in enumerate(starts.tolist()):
         start = (x, y, theta)
         with suppress(InfeasibleStart):
-            session = client.sessions.create(policy_id=policy_id, initial_pose=start, seed=seed, id=id)
+            session = client.sessions.create(policy_id=policy, initial_pose=start, seed=seed, **more)
             return session, start, refused
     raise InfeasibleStart(f"none of {DRAWS} starts in {case.name} can satisfy the rule", path="initial_pose")
