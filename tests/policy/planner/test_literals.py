@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from specshield.policy.planner.literals import GUARDS, LAST, PREDICATE, SIDE, literals_of, separate
+from specshield.policy.planner.literals import GUARDS, LAST, PREDICATE, SIDE, literals_of, released, separate
+from specshield.stl import parse, robustness
 from tests.policy.planner.worlds import cells_of
 
 
@@ -65,3 +66,17 @@ def test_a_formula_without_signals_is_left_as_it_is():
     task, parsed = _asked("G[0,4] (A -> F[0,3] B) and not B U[0,6] A", {})
     assert separate(task, parsed) == parsed
     assert np.all(told(str(parsed))[1].leaf[:, 0] >= 0)
+
+
+@pytest.mark.parametrize("a", [0, 1, 7])
+def test_a_negated_until_that_looks_far_ahead_says_what_it_asks_for(a):
+    formula = parse(f"not (not A U[{a},20] B) and F[0,20] C")
+    said, random = released(formula), np.random.default_rng(0)
+    samples = {name: random.normal(-0.5, 1.0, (500, 21)) for name in "ABC"}
+    assert "not (not A U" not in str(said)
+    np.testing.assert_array_equal(robustness(said, samples), robustness(formula, samples))
+
+
+def test_any_other_rule_is_said_as_it_is():
+    for text in ("not F[0,20] A and not B U[0,20] A", "not (not A U[0,16] B)", "not (F[0,3] A U[0,20] B)"):
+        assert released(parse(text)) == parse(text)

@@ -197,6 +197,15 @@ def test_an_until_goes_round_what_lies_between(half):
         assert (decide_at(until, pose)[1] >= stricter).all()
 
 
+@pytest.mark.parametrize("a", [0, 30])
+def test_a_negated_until_says_which_place_comes_first(a):
+    """To B only after A: a plan that waits by single steps until it may go there needs too many of them."""
+    regions = {"A": rectangle(1, 1, 2, 2), "B": rectangle(4, 4, 5, 5)}
+    rule = f"not (not A U[{a},200] B) and F[{a},200] B and G[{a},{a + 3}] not B"
+    policy = synthesise(make_task(ROOM, STRETCH, rule, regions))
+    assert policy.card["metrics"]["feasible_start"] == 1.0
+
+
 def test_an_until_stays_in_a_corridor_up_to_where_it_leads():
     """The left side ends where the right one begins: no pose is in both, and no goal in the left."""
     regions = {"Up": rectangle(1, 1, 2, 4), "Along": rectangle(1, 3, 4, 4), "B": rectangle(4, 3, 5, 4)}

@@ -14,13 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 from specshield.arrays import Ints
+from specshield.rule.residual import joined
 from specshield.rule.view import View, view_of
-from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until
-from specshield.stl.conjunction import is_predicate
+from specshield.stl import Always, And, Eventually, Formula, Implies, Node, Not, Or, Until, conjuncts
+from specshield.stl.conjunction import is_predicate, signed
 from specshield.task import Task, kept_with_task
 
 Ends = frozenset[tuple[Formula, int]]
 
+SINGLE_STEPS = 16  # in which a plan may go on by single steps; chosen by hand, nothing measured
 PREDICATE, SIDE, LAST, GUARDS = range(4)  # the columns of PackedLiterals.literal
 
 
@@ -96,19 +98,36 @@ def separate(task: Task, formula: Formula) -> Formula:
     """
     joins = isinstance(formula, And | Or | Implies) and not _reads_signals_alone(task, formula)
 
-    def apart(part: Formula) -> Formula:
+    def apart(part: object) -> object:
+        if isinstance(part, tuple):
+            return tuple(map(apart, part))
+        if not isinstance(part, Formula):
+            return part
         if joins and _reads_signals_alone(task, part):
             return part if part.horizon else Always(0, 0, part)
         return separate(task, part)
 
-    parts: dict[str, object] = {}
-    for field in fields(formula):
-        value = getattr(formula, field.name)
-        if isinstance(value, Formula):
-            parts[field.name] = apart(value)
-        elif isinstance(value, tuple):
-            parts[field.name] = tuple(apart(each) for each in value)
-    return replace(formula, **parts)
+    return replace(formula, **{field.name: apart(getattr(formula, field.name)) for field in fields(formula)})
+
+
+def released(formula: Formula) -> Formula:
+    """The same formula, of the same robustness, where a conjunct `not (p U[a,b] q)` says that q fails all the
+    while, or to a step at which p fails too. Else q is due to fail at each next step: plans go step by step.
+    """
+    said = list(parts := conjuncts(formula))
+    for i, part in enumerate(parts):
+        match part:
+            case Not(Until(a, b, p, q)) if b > SINGLE_STEPS and is_predicate(p) and is_predicate(q):
+                neither = And((signed(p, True), signed(q, True)))
+                kept = Or((Always(0, b - a, Not(q)), Until(0, b - a, Not(q), neither)))
+                said[i] = Or((Eventually(0, a - 1, Not(p)), Eventually(a, a, kept))) if a else kept
+    return formula if said == [*parts] else joined(said)
+
+
+def leading(literal: Literal) -> tuple[Formula, int]:
+    """The predicate and side of a literal's first part, where a field may lead if none leads to the whole."""
+    whole = literal.predicate
+    return _without_not(whole.children[0] if isinstance(whole, And) else whole)
 
 
 def _reads_signals_alone(task: Task, formula: Formula) -> bool:

@@ -33,13 +33,14 @@ from specshield.policy.options import options_to_json, read_options
 from specshield.policy.planner.due_dates import foresee, is_open_if, make_bounds, read_signals
 from specshield.policy.planner.fields import OUT_OF_REACH, Fields, steps_to
 from specshield.policy.planner.first_motions import plan_all
-from specshield.policy.planner.literals import Literal, PackedLiterals, literals_of
+from specshield.policy.planner.literals import Literal, PackedLiterals, leading, literals_of, released
 from specshield.policy.planner.method import Settings
 from specshield.policy.planner.way import World
 from specshield.policy.progress.recall import residuals
 from specshield.policy.progress.values import initial_signals
 from specshield.policy.reachability.sight import BESIDE, about
-from specshield.policy.shape import MAX_HEADINGS, lattice_shape, side_of
+from specshield.policy.reachability.stored import check_fit
+from specshield.policy.shape import lattice_shape, side_of
 from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.barred import NOTHING_BARRED
@@ -108,8 +109,8 @@ class PlannerPolicy(Carded):
         """The world as a search sees it for the task's formula, or for what is left of it."""
         packed, literals = literals_of(self.task, formula)
         _, all_literals = literals_of(self.task, self.task.formula)
-        known = {each[:2]: fields for each, fields in zip(all_literals, self.chosen, strict=True)}
-        leads = [known.get(each[:2], np.array([-1, -1], np.int32)) for each in literals]
+        known = {each[:2]: (*of,) for each, of in zip(all_literals, self.chosen.tolist(), strict=True)}
+        leads = [known.get(each[:2], known.get(leading(each), (-1, -1))) for each in literals]
         pad, stands = calmest_motion(self._body), self.task.robot.wait_motion >= 0
         # Without a turn in place the lattice has few of the ways that there are: its fields rule out nothing.
         band = BAND if turning_motion(self._body) >= 0 else 2.0 * OUT_OF_REACH
@@ -140,7 +141,7 @@ class PlannerPolicy(Carded):
         if high <= SATISFIED_ABOVE:
             left = residuals(self.task.formula, self.task.samples(history, signals), t)
             parts = chain((part for part in left if part.horizon > t), parts)
-        for part in parts:
+        for part in chain.from_iterable(dict.fromkeys((released(each), each)) for each in parts):
             asked = self._asked(part, history, rows, margin) if margin > 0.0 else (part,)
             worlds = (self._world if each is self.task.formula else self._world_of(each) for each in asked)
             plans = [self._plan_in(world, history, rows, margin, most) for world in worlds]
@@ -187,12 +188,9 @@ class PlannerPolicy(Carded):
         free, random = np.argwhere(lattice.valid == 1), np.random.default_rng(0)
         if not len(free):
             return 0.0
-        poses = (
-            pose_of(self._body, lattice.pitch, lattice.headings, *map(float, free[i]))
-            for i in random.integers(len(free), size=STARTS)
-        )
         begun = 0
-        for tried, pose in enumerate(poses, 1):
+        for tried, i in enumerate(random.integers(len(free), size=STARTS), 1):
+            pose = pose_of(self._body, lattice.pitch, lattice.headings, *map(float, free[i]))
             begun += self._plan(np.array([pose]), signals or {}, 0.0, ON)[1]
             on_progress(tried / STARTS)
         return begun / STARTS
@@ -255,23 +253,8 @@ def load_planner(weights: bytes | Path, card: Card, task: Task) -> PlannerPolicy
     )
     usual = cell.shape == side_of(task.grid, settings.pitch)
     pitch = settings.pitch if usual else _pitch(task, settings)
-    ny, nx = side_of(task.grid, pitch)
-    fits = (
-        cell.shape == (ny, nx)
-        and 4 <= code.shape[2] <= MAX_HEADINGS
-        and chosen.shape == (len(literals), 2)
-        and cell.min(initial=-1) >= -1
-        and cell.max(initial=-1) < code.shape[1]
-        and chosen.min(initial=-1) >= -1
-        and chosen.max(initial=-1) < code.shape[0]
-    )
-    if not fits:
-        raise PolicyError(
-            "the fields do not fit the task",
-            path="weights",
-            got=[list(cell.shape), list(code.shape), list(chosen.shape)],
-            expected=f"cell {[ny, nx]}, code [fields, cells, headings], chosen [{len(literals)}, 2]",
-        )
+    fits = chosen.shape == (len(literals), 2) and bool(np.isin(chosen, np.arange(-1, len(code))).all())
+    check_fit(cell, task, pitch, code, fits, f"a field for each of {len(literals)} literals")
     return PlannerPolicy(task, card, settings, Fields(cell, code, pitch), chosen)
 
 
@@ -287,12 +270,10 @@ def _pitch(task: Task, settings: Settings) -> float:
     pitch = fitting_pitch(task, settings.pitch, fields, MAX_ENTRIES)
     if pitch > COARSEST * settings.pitch:
         ny, nx, headings = lattice_shape(task, settings.pitch)
-        raise PolicyError(
-            "the fields are too large",
-            path="options.pitch",
-            got=f"{fields} fields of {ny} x {nx} x {headings} poses",
-            expected=f"options.pitch {pitch / COARSEST:.2f} or more, or fewer predicates",
-        )
+        got = f"{fields} fields of {ny} x {nx} x {headings} poses"
+        least = math.ceil(100.0 * pitch / COARSEST) / 100.0
+        would = f"options.pitch {least:.2f} or more, or fewer predicates"
+        raise PolicyError("the fields are too large", path="options.pitch", got=got, expected=would)
     return pitch
 
 

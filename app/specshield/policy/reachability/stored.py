@@ -55,7 +55,7 @@ def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str
     if task.robot.wait_motion < 0:
         cell, bits = named_arrays(tensors, {f"{of}cell": (np.int32, 2), f"{of}bits": (np.uint8, 4)})
         size = (task.horizon + 1, int(cell.max(initial=-1)) + 1, bits.shape[2], -(-state_count(rules) // 8))
-        _check_fit(cell, task, pitch, bits, bits.shape == size, f"bits {list(size)}")
+        check_fit(cell, task, pitch, bits, bits.shape == size, f"bits {list(size)}")
         return step_tables(rules, task.horizon, cell, bits, pitch)
     cell, code, table = named_arrays(
         tensors, {f"{of}cell": (np.int32, 2), f"{of}code": (np.uint16, 3), f"{of}table": (np.int32, 2)}
@@ -63,7 +63,7 @@ def _tables_of(tensors: Tensors, task: Task, rules: Rules, pitch: float, of: str
     phases = phases_of(rules, task.horizon)
     fits = table.shape == (len(phases), sets) and table.min() >= -1 and table.max() < code.shape[0]
     wanted = f"code [tables, cells, {code.shape[2]}], table [{len(phases)}, {sets}]"
-    _check_fit(cell, task, pitch, code, fits, wanted)
+    check_fit(cell, task, pitch, code, fits, wanted)
     return time_tables(rules, phases, cell, code, table, pitch)
 
 
@@ -94,8 +94,8 @@ def _other_kind(name: str, got: float | str, expected: str) -> PolicyError:
     return PolicyError(message, path=f"weights.{name}", got=got, expected=expected)
 
 
-def _check_fit(cell: Int32s, task: Task, pitch: float, table: NDArray[Any], fits: bool, wanted: str) -> None:
-    """table [.., cells, headings, ..]: those of it that `cell` refers to."""
+def check_fit(cell: Int32s, task: Task, pitch: float, table: NDArray[Any], fits: bool, wanted: str) -> None:
+    """Raises PolicyError unless all `fits`. table [.., cells, headings, ..]: those that `cell` refers to."""
     shape, (rows, headings) = side_of(task.grid, pitch), table.shape[1:3]
     got, expected = f"{headings} headings", f"4 to {MAX_HEADINGS} headings"
     if 4 <= headings <= MAX_HEADINGS:
