@@ -17,9 +17,10 @@ import numpy as np
 from specshield.arrays import Floats, Ints
 from specshield.reasons.course import Goal, course
 from specshield.reasons.ground import Ground, make_ground
-from specshield.reasons.known import Known, spread
+from specshield.reasons.known import Known
 from specshield.reasons.needs import Need, Reader
 from specshield.robot.dynamics import Body, in_collision, motion_count
+from specshield.shield.escape import spread
 from specshield.stl import Always
 from specshield.task import Task
 

@@ -1,4 +1,4 @@
-"""What has been driven, what the signals hold, where predicates hold by that, and where motions lead."""
+"""What has been driven, what the signals hold, and where predicates hold by that."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from specshield.arrays import Bools, Floats
-from specshield.compiled import kernel
 from specshield.errors import SampleError
-from specshield.robot.dynamics import Body, successors
 from specshield.stl import Formula, robustness
 from specshield.task import Task
 
@@ -59,10 +57,3 @@ class Known:
             return np.asarray(robustness(predicate, each) > above) if each else np.ones(1, np.bool_)
         except SampleError:
             return np.ones(count, np.bool_)
-
-
-@kernel
-def spread(body: Body, poses: Floats, out: Floats) -> None:
-    """Where each motion leads from each pose: poses (n, 3), out (n, M, 3)."""
-    for i in range(poses.shape[0]):
-        successors(body, poses[i], out[i])

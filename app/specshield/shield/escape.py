@@ -75,10 +75,10 @@ def _search(
     width = max(POSES_A_LAYER // motion_count(body), motion_count(body))
     for k in range(1, min(LONGEST_ESCAPE, prefix.task.horizon - prefix.t) + 1):
         layer = _expand(body, layers[-1])
-        layer = _rows(layer, _holding(prefix, guards, layer.pose, prefix.t + k) > SATISFIED_ABOVE)
+        layer = _rows(layer, holding(prefix, guards, layer.pose, prefix.t + k) > SATISFIED_ABOVE)
         if not len(layer.pose):
             break
-        out = _holding(prefix, broken, layer.pose, prefix.t + k)
+        out = holding(prefix, broken, layer.pose, prefix.t + k)
         order = np.argsort(-out, kind="stable")
         if out[order[0]] > SATISFIED_ABOVE:
             best = order[out[order] > SATISFIED_ABOVE]
@@ -95,8 +95,9 @@ def _rows(layer: Layer, which: NDArray[Any]) -> Layer:
 def _expand(body: Body, layer: Layer) -> Layer:
     """Every motion from every pose. Of poses that are alike, one is kept for each first motion."""
     count = motion_count(body)
-    pose = np.empty((len(layer.pose) * count, 3))
-    _successors(body, layer.pose, pose)
+    nexts = np.empty((len(layer.pose), count, 3))
+    spread(body, layer.pose, nexts)
+    pose = nexts.reshape(-1, 3)
     motion, parent = np.tile(np.arange(count), len(layer.pose)), np.repeat(np.arange(len(layer.pose)), count)
     root = motion if layer.motion[0] < 0 else layer.root[parent]
     _, once = np.unique(np.column_stack([root, np.rint(POSES_A_METRE * pose)]), axis=0, return_index=True)
@@ -105,13 +106,13 @@ def _expand(body: Body, layer: Layer) -> Layer:
 
 
 @kernel
-def _successors(body: Body, poses: Floats, out: Floats) -> None:
-    count = motion_count(body)
+def spread(body: Body, poses: Floats, out: Floats) -> None:
+    """Where each motion leads from each pose: poses (n, 3), out (n, M, 3)."""
     for i in range(poses.shape[0]):
-        successors(body, poses[i], out[i * count : (i + 1) * count])
+        successors(body, poses[i], out[i])
 
 
-def _holding(prefix: Prefix, formulas: Sequence[Always], poses: Floats, t: int) -> Floats:
+def holding(prefix: Prefix, formulas: Sequence[Always], poses: Floats, t: int) -> Floats:
     """By how much all formulas whose window holds step t would hold at each pose, [N]; inf for none."""
     least = np.full(len(poses), np.inf)
     now = {name: values[-1:] for name, values in prefix.signals.items()}
@@ -145,8 +146,7 @@ def _onward(shield: Shield, prefix: Prefix, ways: Sequence[tuple[Ints, Floats]])
         signals = {n: np.append(v, np.full(k, v[-1])) for n, v in prefix.signals.items()}
         for proposer in shield.proposers:
             proposal, wrong = ask(proposer, history, signals, 0.0, count, left)
-            if proposal is None:
-                warnings.append(str(wrong))
-                continue
-            rows.append(np.hstack([np.tile(taken, (len(proposal.motions), 1)), proposal.motions]))
+            found = [] if proposal is None else [proposal.motions]
+            rows.extend(np.hstack([np.tile(taken, (len(each), 1)), each]) for each in found)
+            warnings.extend([] if wrong is None else [wrong])
     return simulated(prefix, shield.body, rows, int(ways[0][0][0]), warnings)

@@ -238,3 +238,11 @@ def test_turns_that_do_not_divide_the_circle_fit_a_flat():
     policy = synthesise(make_task(grid, robot, "F[0,150] A", regions))
     assert policy.tables.bits.shape[2] == 25
     start(make_shield([policy]), (1.0, 1.0, -2.0))
+
+
+def test_a_policy_that_is_asked_briefly_proposes_the_way_that_it_would_go_and_nothing_else():
+    """Rows that no way was written into held whatever was in memory, and the shield then refused them all."""
+    grid, goal = OccupancyGrid(np.zeros((20, 80), bool), 0.05), {"type": "circle", "center": [3.5, 0.5]}
+    task = make_task(grid, STRETCH, "F[0,30] Goal", {"Goal": goal | {"radius": 0.4}})
+    proposal = synthesise(task, Settings(pitch=0.1)).briefly().propose(np.array([(0.6, 0.5, 0.0)]), {}, 0.0)
+    assert proposal.motions[:, 0].tolist() == [proposal.preferred]

@@ -171,10 +171,13 @@ class ReachabilityPolicy(Carded):
                 preferred = continue_narrow(guide, *of_narrow, past, wanted, least, motions, poses)
             else:
                 preferred = continue_all(guide, self.settings.beam, past, wanted, least, motions, poses)
+            if self.brief:
+                chosen = slice(preferred, preferred + 1)  # nothing was written of the others
             if preferred >= 0:
                 proposals.append(Proposal(motions[chosen], int(preferred)))
             if not self.guess and self.wanted is None and (len(self.barred) or not self.told):
-                free = poses[~in_vain(self.barred, history[-1], motions, poses, True)]
+                vain = in_vain(self.barred, history[-1], motions[chosen], poses[chosen], True)
+                free = poses[chosen][~vain]
                 if not is_known(guide, past, free):
                     most = FEWER if self.brief else POSES
                     around = go_around(guide, past, self._fields, poses, ways, most)
