@@ -13,12 +13,16 @@ from functools import cache
 import numpy as np
 import pytest
 
+from specshield.policy.planner.policy import Settings as Plan
+from specshield.policy.planner.policy import synthesise as plan
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.robot import STRETCH
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import in_collision, make_body, step
+from specshield.shield import episode
 from specshield.shield.caution.experience import FORMAT, Seen
 from specshield.shield.episode import Carry, Config, decide, make_shield
+from specshield.shield.surprise.doubt import recovered
 from specshield.shield.surprise.vain import barred_by
 from specshield.shield.taught import Taught, on_map, wary
 from specshield.shield.uncertainty import Care, Uncertainty
@@ -379,6 +383,39 @@ def test_marks_are_not_blamed_where_nothing_was_marked():
     assert (decision.mode, decision.reason) == ("fallback", "infeasible")
     assert [said for said in decision.warnings if "no way that was tried keeps F[0,1] Goal" in said]
     assert not [said for said in decision.warnings if "marked" in said]
+
+
+@pytest.mark.parametrize("method", ["reachability", "planner"])
+@pytest.mark.parametrize("formula", ["F[0,20] A and F[20,36] B", "F[0,20] A and F[20,36] B and F[0,21] A"])
+def test_what_can_still_be_kept_is_kept_while_another_part_is_lost_but_not_yet_broken(
+    method, formula, monkeypatch
+):
+    """Pushed away to the right end at step 5, the robot is too late for A at the left end. To B it takes 26
+    steps: there are 31, and 16 once A is broken.
+    """
+    grid = OccupancyGrid(np.zeros((20, 180), bool), 0.05)
+    regions = {"A": GOAL | {"center": [0.8, 0.5]}, "B": GOAL | {"center": [3.0, 0.5]}}
+    task = make_task(grid, STRETCH, formula, regions)
+    make = synthesise if method == "reachability" else plan
+    policy = make(task, (Settings if method == "reachability" else Plan)(pitch=0.1))
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=Uncertainty()))
+
+    def checked(*args):  # the ways that give a part up are not among those that J is read from
+        judged = recovered(*args)
+        assert len(judged.tried.rho) == len(judged.kept)
+        return judged
+
+    monkeypatch.setattr(episode, "recovered", checked)
+    poses, carry, said = [(2.0, 0.5, math.pi)], None, []
+    for t in range(37):
+        decision = decide(shield, poses, None, True, carry=carry)
+        carry = decision.carry
+        assert t < 5 or decision.spec_status == "violated" or decision.reason == "infeasible"
+        said += [each for each in decision.warnings if "B: the nearest misses it" in each]
+        moved = step(shield.body, *poses[-1], int(STRETCH.motion_of[decision.action]))
+        poses.append((8.6, 0.5, math.pi) if t == 4 else moved)
+    assert max(0.4 - math.hypot(x - 3.0, y - 0.5) for x, y, _ in poses[20:37]) > 0.0
+    assert said == []
 
 
 @pytest.mark.parametrize("uncertainty", [None, Uncertainty()])

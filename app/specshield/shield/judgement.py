@@ -9,20 +9,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from specshield.arrays import Bools, Bytes, Floats, Ints
-from specshield.compiled import kernel, leaf
+from specshield.arrays import Bools, Floats, Ints
+from specshield.compiled import kernel
 from specshield.robot.barred import in_vain
 from specshield.robot.room import has_room, widened
 from specshield.rule.residual import again, joined, left_over
 from specshield.shield import shaping
 from specshield.shield.caution.aim import Aimed, aim
 from specshield.shield.decision import Shield
-from specshield.shield.escape import escape, is_place
+from specshield.shield.escape import escape, holding, is_place
 from specshield.shield.feasibility import Futures, Prefix, best_of, futures, rho_of, simulated, together
 from specshield.shield.proposal import adapted, ask
 from specshield.shield.surprise.recovery import given_up, recovers
 from specshield.shield.uncertainty import Care
-from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict, robustness
+from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict
 from specshield.stl.conjunction import flat
 
 LESS = 4  # [steps] V has ways asked for with so much less slack, and in such strides with more. By hand.
@@ -222,7 +222,9 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
     broken = [
         each
         for each in map(flat, lost)
-        if is_place(task, each) or each.child.horizon > 0 or _holds_now(prefix, each)
+        if is_place(task, each)
+        or each.child.horizon > 0
+        or holding(prefix, [each], prefix.poses[-1:], t)[0] > SATISFIED_ABOVE
     ]
     places = [each for each in broken if is_place(task, each)]
     guards = [flat(each) for each in kept if isinstance(each, Always)]
@@ -252,12 +254,6 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
     return tried, part
 
 
-def _holds_now(prefix: Prefix, formula: Always) -> bool:
-    """Whether the child of a G over signals alone holds at x_t."""
-    now = {name: values[-1:] for name, values in prefix.task.samples(prefix.poses, prefix.signals).items()}
-    return bool(robustness(formula.child, {n: now[n] for n in formula.child.names}) > SATISFIED_ABOVE)
-
-
 @kernel
 def _kept(robustness: Floats, asked: float) -> tuple[Bools, bool]:
     """Which motions keep the margin asked for, or else the largest there is; whether it was lowered.
@@ -276,18 +272,9 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
     motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()
-    rows, n = np.empty((len(feasible), motions.shape[1] - 1), np.uint8), motions.shape[1] - 1
-    _take_rests(motions, judged.aimed.best.row, rows)
-    content = rows.tobytes()
+    rows = motions[judged.aimed.best.row, 1:].astype(np.uint8)
+    content, n = rows.tobytes(), rows.shape[1]
     return tuple([content[m * n : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
-
-
-@leaf
-def _take_rests(motions: Ints, row: Ints, rests: Bytes) -> None:
-    """Writes rows [M] of motions [N, T - t] into rests [M, T - t - 1], without the first motion of each."""
-    for m in range(rests.shape[0]):
-        for k in range(rests.shape[1]):
-            rests[m, k] = motions[row[m], k + 1]
 
 
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:

@@ -5,9 +5,7 @@ computed once (fields.py). A decision asks the formula which literals are due (d
 a way that serves them (search.py). The shield certifies what is proposed like anything else, so a way that is
 not found costs permission, never safety; how often a way that exists is found is measured. The planner covers
 what reachability does not: reactive rules over signals, patrols (G F), until, disjunctions of temporal parts,
-nested mixes.
-
-A robot that cannot stand still, or cannot turn in place, is planned for too (docs/decisions.md).
+nested mixes. A robot that cannot stand still, or turn in place, is planned for too (docs/decisions.md).
 """
 
 from __future__ import annotations
@@ -45,6 +43,7 @@ from specshield.policy.tensors import named_arrays, read_tensors
 from specshield.reasons.still_open import bounds_after, still_open
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, calmest_motion, make_body, turning_motion
+from specshield.rule.residual import joined as all_of
 from specshield.rule.values import REGIONS, places, regions_of, signal_rows
 from specshield.rule.view import look
 from specshield.rule.worst import worst_signals
@@ -71,7 +70,7 @@ class PlannerPolicy(Carded):
 
     chosen [L, 2]: of each literal of the formula, which field leads to it freely, and which keeps to what has
     to hold for a while; -1 for none. foreseen [S]: what the signals hold from x_{t+1} on; None: their last
-    values. share: of the effort that the settings allow.
+    values. share: of the effort that the settings allow. rest: what is planned for where parts are given up.
     """
 
     settings: Settings
@@ -79,6 +78,7 @@ class PlannerPolicy(Carded):
     chosen: Int32s
     foreseen: Floats | None = None
     share: float = 1.0
+    rest: Formula | None = None
 
     @cached_property
     def _world(self) -> World:
@@ -95,6 +95,11 @@ class PlannerPolicy(Carded):
     def avoiding(self, barred: Floats) -> PlannerPolicy:
         """The policy for a robot that some motions led nowhere (robot/barred.py)."""
         return self._in(self._world._replace(barred=barred))
+
+    def giving_up(self, lost: tuple[Formula, ...]) -> PlannerPolicy:
+        """The policy for its rule without these parts: it proposes one way alone, with less effort."""
+        rest = [part for part in conjuncts(self.task.formula) if part not in lost]
+        return replace(self, share=GUESSED, rest=all_of(rest))._in(self._world)
 
     def foreseeing(self, signals: Floats) -> PlannerPolicy:
         """The policy that takes the signals to hold these values [S] from x_{t+1} on, whatever they hold."""
@@ -122,6 +127,8 @@ class PlannerPolicy(Carded):
         it looks for one with them, unless the decision has other maps to try.
         """
         ways, found = self._plan(history, signals, margin, FIRST if len(history) == 1 else ON)
+        if self.rest is not None:
+            return Proposal(ways.motions[ways.motions[:, 0] == ways.preferred], ways.preferred)
         if found or len(self._world.barred) == 0 or self.share < 1.0:
             return ways
         quick = self.briefly().avoiding(NOTHING_BARRED)
@@ -137,9 +144,10 @@ class PlannerPolicy(Carded):
         t, rows = len(history) - 1, signal_rows(self.task, signals, len(history))
         formula = self._world.literals.formula
         _, high = look(formula, history, rows, np.empty(formula.tree.size))
-        parts: Iterable[Formula] = (self.task.formula,)
+        whole = self.rest or self.task.formula
+        parts: Iterable[Formula] = (whole,)
         if high <= SATISFIED_ABOVE:
-            left = residuals(self.task.formula, self.task.samples(history, signals), t)
+            left = residuals(whole, self.task.samples(history, signals), t)
             parts = chain((part for part in left if part.horizon > t), parts)
         for part in chain.from_iterable(dict.fromkeys((released(each), each)) for each in parts):
             asked = self._asked(part, history, rows, margin) if margin > 0.0 else (part,)

@@ -22,6 +22,7 @@ from specshield.policy.lattice import INVALID, STEP_CODES, holds_at, make_lattic
 from specshield.policy.methods import Run
 from specshield.policy.options import options_to_json, read_options
 from specshield.policy.progress import Rules, make_rules
+from specshield.policy.progress.obligations import obligations
 from specshield.policy.progress.recall import pasts
 from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells
 from specshield.policy.reachability.around.search import FEWER, GAVE_UP, NO_WAY, POSES, go_around, is_known
@@ -42,7 +43,7 @@ from specshield.rule.values import signal_rows
 from specshield.rule.view import view_of
 from specshield.shield.feasibility import prefix_of, simulated
 from specshield.shield.proposal import Proposal, joined
-from specshield.stl import SATISFIED_ABOVE
+from specshield.stl import SATISFIED_ABOVE, Formula, conjuncts
 from specshield.task import Task
 from specshield.world.occupancy import OccupancyGrid
 
@@ -92,6 +93,14 @@ class ReachabilityPolicy(Carded):
         proposes nothing to a robot that cannot wait, nor where its tables say that it would come too late.
         """
         return self._but(self._body, early=steps, wanted=wanted)
+
+    def giving_up(self, lost: tuple[Formula, ...]) -> ReachabilityPolicy:
+        """`briefly`, and as if the windows of these parts of the rule were over before it began."""
+        other, rules = self._but(self._body, brief=True, guess=False), self._rules
+        gone = [part in lost for part in conjuncts(self.task.formula) for _ in obligations(part)]
+        a, b, c1, c2, last = np.where(gone, [[0], *[[-1]] * 4], rules[1:6])
+        other.__dict__["_rules"] = rules._replace(a=a, b=b, c1=c1, c2=c2, last=last)
+        return other
 
     def briefly(self) -> ReachabilityPolicy:
         """The policy with a smaller search around, and one way alone: for an explanation, which goes none."""

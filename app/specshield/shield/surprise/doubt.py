@@ -11,8 +11,9 @@ import numpy as np
 
 from specshield.robot.dynamics import step
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Futures, futures
+from specshield.shield.feasibility import Futures, futures, together
 from specshield.shield.judgement import Judged, Situation
+from specshield.shield.proposal import adapted
 from specshield.shield.signals import judged_by_signals
 from specshield.shield.surprise.recovery import most_kept, recovers
 from specshield.shield.taught import Taught, on_map
@@ -20,6 +21,7 @@ from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand
+MOST_PARTS = 4  # of those that no way keeps together: for which ways are asked that keep one; chosen by hand
 
 
 def tried_again(
@@ -74,6 +76,14 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
         return judged
     tried = judged.tried
     first, lost, said, helps = most_kept(shield, judged.part, tried)
+    if len(lost) > 1:  # together; some of them may be kept by a way that gives up the others
+        few = [tuple(each for each in lost if each != one) for one in lost[:MOST_PARTS]]
+        few += [(one,) for one in lost[:MOST_PARTS] if (one,) not in few]
+        able = [each for each in shield.proposers if hasattr(each, "giving_up")]
+        asked = [adapted(each, "giving_up", parts) for parts in few for each in able]
+        if asked:
+            tried = together(tried, futures(now.prefix, shield.body, asked, None, (0.0,)))
+            first, lost, said, helps = most_kept(shield, judged.part, tried)
     awaited = _awaited(told, shield, taught, now)
     if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
@@ -85,7 +95,7 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
         first = first if helps else ways.preferred
         if marked.any() or len(taught.barred):
             said = ("what was marked after contacts leaves no way, so it is ignored for this action", *said)
-    tried = tried._replace(warnings=(*tried.warnings, *said))
+    tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # the futures that were judged, no more
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 
 
