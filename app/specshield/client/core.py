@@ -91,8 +91,9 @@ def deliver(request: Request) -> Flow[Delivery]:
     while True:
         outcome = yield request
         seconds += outcome.seconds
-        # None for a reply that does not say that the service is not there now
-        error = outcome.error if isinstance(outcome, Failure) else _unavailable(outcome)
+        error: SpecshieldError | None = outcome.error if isinstance(outcome, Failure) else None
+        if isinstance(outcome, Reply) and outcome.status in (502, 503, 504):  # it is not there now
+            error = error_of(outcome)
         if isinstance(outcome, Reply) and isinstance(error, Starting):
             wait = _asked_for(outcome)
         else:
@@ -108,11 +109,6 @@ def deliver(request: Request) -> Flow[Delivery]:
             return Delivery(outcome, tries, seconds)
         yield Wait(wait)
         seconds += wait
-
-
-def _unavailable(reply: Reply) -> SpecshieldError | None:
-    """The error of a reply that says the service is not there now; None for any other reply."""
-    return error_of(reply) if reply.status in (502, 503, 504) else None
 
 
 def _asked_for(reply: Reply) -> float:

@@ -83,7 +83,8 @@ class Plan:
             kind = "avoid" if is_avoided(self._task.formula, name) else "visit"
             self._parts.append(f'<g class="region {kind}" stroke-width="{2 * self._unit:g}">')
             self._parts += [self._shape(member) for member in _members(region)]
-            x, y = self._at(*_below(region))
+            (left, low), (right, _) = (end(outlines(region)[0], axis=0) for end in (np.min, np.max))
+            x, y = self._at(float(left + right) / 2, float(low))  # below its first part
             self._parts.append(
                 f"</g>{self._text(x, y + 26 * self._unit, name, 22, f'name {kind}', 'middle')}"
             )
@@ -170,9 +171,3 @@ class Plan:
 
 def _members(region: Region) -> Sequence[Region]:
     return region.members if isinstance(region, Union) else (region,)
-
-
-def _below(region: Region) -> tuple[float, float]:
-    """The lowest point of a region's first part, at the middle of its width."""
-    (left, low), (right, _) = (end(outlines(region)[0], axis=0).tolist() for end in (np.min, np.max))
-    return (left + right) / 2, low

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from specshield.policy.lattice import holds_at, make_lattice
 from specshield.policy.progress import make_rules
+from specshield.policy.reachability.policy import synthesise
 from specshield.policy.reachability.stepwise import (
     BROKEN_STATE,
     digits_of,
@@ -13,7 +16,11 @@ from specshield.policy.reachability.stepwise import (
     state_count,
     transitions,
 )
+from specshield.robot import robot_from_json
 from specshield.robot.dynamics import make_body
+from specshield.shield.episode import decide, make_shield
+from specshield.task import make_task
+from specshield.world.occupancy import OccupancyGrid
 from tests.oracles.cells import CELL
 from tests.policy.reachability.corridor import EAST, NORTH, RESTLESS, make_corridor
 
@@ -57,3 +64,26 @@ def test_the_steps_at_which_a_corridor_is_feasible():
     assert pending[1, :, EAST].tolist() == [0, 0, 1, 1, 1, 0]
     assert pending[1, :, NORTH].tolist() == [0, 0, 0, 1, 1, 1]  # a turn, then a move
     assert pending[0, :, EAST].tolist() == [0, 1, 1, 1, 1, 1]  # the last by two turns and a move
+
+
+def test_a_robot_of_many_motions_that_cannot_wait_keeps_most_of_them():
+    """40 motions, of which each step of a search looks at 14: first of all motions a way is looked for after
+    few, and after all only where that finds none.
+    """
+    actions = [
+        {"name": f"a{i}{j}", "translate": 0.05 * i, "rotate": math.radians(9.0 * (j - 4.5))}
+        for i in range(4)
+        for j in range(10)
+    ]
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": actions})
+    grid = OccupancyGrid(np.zeros((40, 40), np.bool_), 0.1)
+    rule, regions = "F[0,25] A and F[30,50] B", {}
+    for name, x in (("A", 0.8), ("B", 3.2)):
+        regions[name] = {"type": "circle", "center": [x, x], "radius": 0.4}
+    shield = make_shield([synthesise(make_task(grid, robot, rule, regions))])
+    rng, kept = np.random.default_rng(0), []
+    for _ in range(6):
+        x, y = rng.uniform(0.8, 3.2, 2)
+        found = decide(shield, [[x, y, rng.uniform(-np.pi, np.pi)]], np.zeros(40))
+        kept.append(sum(value == 1.0 for value in found.j_values))
+    assert min(kept) >= 36, kept

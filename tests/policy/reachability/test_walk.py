@@ -14,7 +14,7 @@ from specshield.policy.reachability.beam import beam_search
 from specshield.policy.reachability.guide import make_scratch, update_progress
 from specshield.policy.reachability.policy import Settings, synthesise
 from specshield.policy.reachability.search import continue_all
-from specshield.policy.reachability.tables import ALL, HOPELESS, SAFE, score, slack
+from specshield.policy.reachability.tables import HOPELESS, SAFE, score, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, climb, rejoin
 from specshield.robot.dynamics import motion_count, step
 from tests.oracles.cells import CELL, FORWARD, LEFT, RIGHT, ROBOT, WAIT
@@ -78,10 +78,14 @@ def test_a_dwell_under_way_leaves_what_comes_after_it():
 
 def test_the_score_of_each_motion(visit):
     scratch = scratch_of(visit, PENDING, 0)
-    score(visit, *pose(2), 0, -1, ALL, scratch)
+    score(visit, *pose(2), 0, -1, (0, 1), scratch)
     assert scratch.scores.tolist() == pytest.approx([9.0, 7.0, 7.0, 8.0])
-    score(visit, *pose(2), 0, LEFT, ALL, scratch)
+    score(visit, *pose(2), 0, LEFT, (0, 1), scratch)
     assert scratch.scores[RIGHT] == HOPELESS
+    score(visit, *pose(2), 0, -1, (1, 2), scratch)
+    assert scratch.scores.tolist() == pytest.approx([HOPELESS, 7.0, HOPELESS, 8.0]), (
+        "one in two was asked for"
+    )
 
 
 def test_a_climb_turns_goes_and_stays(visit):
@@ -133,17 +137,26 @@ def test_a_beam_of_two_roots_ends_where_the_goal_is(visit):
     scratch = make_scratch(visit.rules, 4)
     motions, taken = np.full((2, 4), -1), np.zeros(2, np.int64)
     status, run = np.full((2, 1), PENDING, np.int8), np.zeros((2, 1), np.int64)
-    beam_search(visit, 6, roots, status, run, 4, 0.0, np.inf, False, scratch, motions, taken)
+    beam_search(visit, 6, roots, status, run, 4, 0.0, np.inf, 1, scratch, motions, taken)
     assert taken.tolist() == [1, 2]
     assert motions[0, 0] == FORWARD
     assert motions[1, :2].tolist() == [RIGHT, FORWARD]
+
+
+def test_a_beam_that_looks_at_one_motion_in_two_looks_at_the_others_a_step_later(visit):
+    """Two cells before A: it goes on, waits where it does not look at going on, and goes on then."""
+    scratch = make_scratch(visit.rules, 4)
+    motions, taken = np.full((1, 5), -1), np.zeros(1, np.int64)
+    status, run = np.full((1, 1), PENDING, np.int8), np.zeros((1, 1), np.int64)
+    beam_search(visit, 5, pose(3)[None], status, run, 2, 0.0, np.inf, 2, scratch, motions, taken)
+    assert motions[0, : taken[0]].tolist() == [FORWARD, WAIT, FORWARD]
 
 
 def test_a_beam_gives_up_what_comes_too_late(visit):
     scratch = make_scratch(visit.rules, 4)
     motions, taken = np.full((1, 1), -1), np.zeros(1, np.int64)
     status, run = np.full((1, 1), PENDING, np.int8), np.zeros((1, 1), np.int64)
-    beam_search(visit, 9, pose(3)[None], status, run, 4, 0.0, np.inf, False, scratch, motions, taken)
+    beam_search(visit, 9, pose(3)[None], status, run, 4, 0.0, np.inf, 1, scratch, motions, taken)
     assert taken.tolist() == [0]
 
 

@@ -25,7 +25,7 @@ MAX_ROOTS = 62  # bits of a tag, which is an int64
 # Chosen by hand; nothing measured.
 MAX_KEPT = 128  # poses kept at a step, unless one root alone has a larger share
 MAX_TRIED = 16  # motions from a pose; of more, only those with nearly the best score are tried
-MAX_SCORED = 64  # motions from a pose that are looked at; of more, others at other poses
+MAX_SCORED = 64  # motions from a pose; of more, others have a score at other poses
 WIDEST_GAP, NARROWEST_GAP = 4.0, 0.1  # [steps] how far below the best score such a motion may be
 EASY = 8.0  # [steps] of slack after a goal was settled: from there the tables can be followed again
 POSE_GRAIN = 1e3  # [1/m, 1/rad] poses that round to the same multiples of its inverse count once
@@ -59,8 +59,8 @@ class Beam(NamedTuple):
 
     here: the poses kept at a step; new: those that their motions lead to. begun [R, K]: the roots' status at
     the beginning. table: where the poses of `new` are looked up; place [N]: the row that each has in `here`;
-    kept [R]: how many poses each root has there; heap: of the rows of `new`, the most slack first. every: one
-    motion in so many is looked at from a pose.
+    kept [R]: how many poses each root has there; heap: of the rows of `new`, the most slack first. every:
+    as in `beam_search`.
     """
 
     here: Poses
@@ -84,7 +84,7 @@ def beam_search(
     share: int,
     band: float,
     target: float,
-    few: bool,
+    every: int,
     scratch: Scratch,
     motions: Ints,
     taken: Ints,
@@ -94,11 +94,11 @@ def beam_search(
     pose (R, 3), status, run (R, K): the roots at step t, R <= MAX_ROOTS. share: the poses kept for each root.
     band: a pose with less slack [steps] is given up. A way ends where every goal is settled, where one more
     goal is settled and EASY steps are to spare, or where the latest feasible time [steps] is above `target`.
-    few: whether only some motions are looked at from each pose, others from others.
+    every: one motion in so many is looked at from each pose, others from others.
     Writes each root's way into motions (R, n) and its length into taken (R,), 0 where none was found.
     """
     roots, k_count = status.shape
-    steps, most = motions.shape[1], most_looked_at(guide)
+    steps = motions.shape[1]
     width = max(min(share * roots, MAX_KEPT), share)
     room = width * motion_count(guide.body)
     edges = Edges(
@@ -117,7 +117,7 @@ def beam_search(
         place=np.empty(room, np.int64),
         kept=np.empty(roots, np.int64),
         heap=Heap(np.empty(room, np.int32), np.empty(room)),
-        every=(motion_count(guide.body) + most - 1) // most if few else 1,
+        every=every,
     )
     for r in range(roots):
         _put(beam.here, r, pose[r, 0], pose[r, 1], pose[r, 2], status[r], run[r])
@@ -132,14 +132,6 @@ def beam_search(
         count = _select(found, n, open_roots, width, share, band, beam)
         if count == 0:
             return
-
-
-@inlined
-def most_looked_at(guide: Guide) -> int:
-    """How many motions are looked at from a pose where there are many. The tables of a robot that cannot wait
-    do not tell which of these lead on best.
-    """
-    return MAX_TRIED if guide.tables.bits.shape[0] > 0 else MAX_SCORED
 
 
 @kernel
@@ -169,7 +161,7 @@ def _expand(
             continue
         before_x, before_y, before = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
         copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
-        some = (w + n) % beam.every, beam.every
+        some = ((31 * w + n) * 2654435761 >> 16) % beam.every, beam.every  # in no order
         corners = score(guide, before_x, before_y, before, t + n, -1, some, scratch)
         lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         cos, sin, room = around(body, before_x, before_y, before)

@@ -17,12 +17,12 @@ from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins
 from specshield.policy.progress.recall import Past, Present, resume
-from specshield.policy.reachability.beam import EASY, MAX_ROOTS, beam_search, most_looked_at
+from specshield.policy.reachability.beam import EASY, MAX_ROOTS, MAX_SCORED, MAX_TRIED, beam_search
 from specshield.policy.reachability.guide import copy_progress, fill, make_scratch, update_progress
 from specshield.policy.reachability.tables import HOPELESS, SAFE, Guide, Scratch, goals_settled, slack
 from specshield.policy.reachability.walk import SETTLED_ALL, STUCK, climb, rejoin
 from specshield.policy.undo import IMPOSSIBLE, NOT_NEEDED, move_back, turn_by
-from specshield.robot.dynamics import displacement, simulate, step
+from specshield.robot.dynamics import displacement, motion_count, simulate, step
 
 # Chosen by hand; nothing measured.
 ESCAPE_GAIN = 2.0  # [steps] how much later than where a climb got stuck a way out has to lead
@@ -135,14 +135,16 @@ def continue_all(
                 ways += 1
         if settled[m] and base < 0:
             base = int(m)
-    small = guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL
-    for few in (True, False):
-        if few or (order.shape[0] > most_looked_at(guide) and not np.any(settled)):
-            if not waits:
-                _beam_out(guide, t, NARROW_SHARE, width, max(0.0, lowest), few, starts, scratch)
-            _beam_out(guide, t, width, width, max(BAND if waits else 0.0, lowest), few, starts, scratch)
-    if small:
-        _beam_out(guide, t, SMALL_SHARE, width, max(2.0 * HOPELESS, lowest), False, starts, scratch)
+    every = 1 + (order.shape[0] - 1) // (MAX_SCORED if waits else MAX_TRIED)
+    while True:
+        if not waits:
+            _beam_out(guide, t, NARROW_SHARE, width, max(0.0, lowest), every, starts, scratch)
+        _beam_out(guide, t, width, width, max(BAND if waits else 0.0, lowest), every, starts, scratch)
+        if every == 1 or np.any(settled):
+            break
+        every = 1
+    if guide.tables.code.shape[1] * guide.tables.code.shape[2] <= SMALL:
+        _beam_out(guide, t, SMALL_SHARE, width, max(2.0 * HOPELESS, lowest), 1, starts, scratch)
     copy_ways(motions, poses, twin)
     best = order[0]
     return int(guide.wait if waits and starts.slack[guide.wait] == starts.slack[best] else best)
@@ -202,7 +204,7 @@ def _follow(
             width,
             high - (t + n) - ESCAPE_LOSS,
             high + ESCAPE_GAIN,
-            True,
+            1 + (motion_count(guide.body) - 1) // MAX_SCORED,
             scratch,
             way,
             taken,
@@ -232,10 +234,10 @@ def take(guide: Guide, t: int, n: int, way: Ints, motions: Ints, poses: Floats, 
 
 @kernel
 def _beam_out(
-    guide: Guide, t: int, share: int, width: int, band: float, few: bool, starts: Starts, scratch: Scratch
+    guide: Guide, t: int, share: int, width: int, band: float, every: int, starts: Starts, scratch: Scratch
 ) -> None:
     """Looks for a way after every first motion that is wanted, has none yet and a slack of at least `band`
-    [steps]. few: as `beam_search` has it.
+    [steps]. every: as `beam_search` has it.
     """
     motions, poses = starts.motions, starts.poses
     steps, sought = motions.shape[1] - 1, starts.wanted & ~starts.settled & (starts.slack >= band)
@@ -247,7 +249,7 @@ def _beam_out(
         some, rest = roots[:most], roots[most:]
         way, taken = np.empty((some.shape[0], steps), np.int64), np.empty(some.shape[0], np.int64)
         here, status, run = poses[some, 0], starts.status[some], starts.run[some]
-        beam_search(guide, t + 1, here, status, run, share, band, np.inf, few, scratch, way, taken)
+        beam_search(guide, t + 1, here, status, run, share, band, np.inf, every, scratch, way, taken)
         for i in range(some.shape[0]):
             m = some[i]
             if taken[i] > 0:

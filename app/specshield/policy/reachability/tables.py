@@ -21,7 +21,6 @@ from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDIN
 from specshield.robot.dynamics import Body, displacement
 
 HOPELESS = -1e9  # in place of a slack or a latest time [steps], where nothing is feasible
-ALL = (0, 1)  # `some` of `score` where every motion is looked at
 SAFE = 1e6  # in place of a slack [steps], where nothing is left to do
 UNKNOWN = -1  # in place of how many corners there are about a place
 DELAYS = (0, 1, 2, 4, 8)  # [steps] that a robot which cannot wait would like to have to spare
@@ -235,11 +234,9 @@ def score(
     headings = tables.code.shape[2]
     v, u, h, dv, du = coordinates_ahead(body, tables.pitch, headings, x, y, theta)
     count = find_corners(tables.cell, v, u, scratch.corners)
-    if some[1] > 1:
-        scores[:] = HOPELESS
+    scores[:] = HOPELESS
     for m in range(some[0], scores.shape[0], some[1]):
         if table < 0 or leads_back(body, last, m):
-            scores[m] = HOPELESS
             continue
         d, angle = displacement(body, m)
         w = heading_after(headings, h, angle)

@@ -114,7 +114,10 @@ class Claims:
                 yield
         except BaseException:
             if said == "made":
-                self._give_back(kind, id, key.name, map_id)
+                token = secrets.token_hex(8)
+                self._run("mark", kind, id, key.name, token)
+                self._run("free", kind, id, key.name, token, map_id=map_id)
+                self.unmark(kind, id, token)
             raise
 
     def mark(self, kind: str, id: str, owner: str, token: str) -> str | None:
@@ -142,12 +145,6 @@ class Claims:
     def owners(self, kind: str, id: str) -> int:
         """How many hold it."""
         return int(reached(lambda: self._store().scard(_key("owners", kind, id))))
-
-    def _give_back(self, kind: str, id: str, owner: str, map_id: str) -> None:
-        token = secrets.token_hex(8)
-        self._run("mark", kind, id, owner, token)
-        self._run("free", kind, id, owner, token, map_id=map_id)
-        self.unmark(kind, id, token)
 
     def _patiently(self, what: str, *args: Any) -> str:
         """Waits while another deletes the same thing. Raises Conflict where that takes long."""

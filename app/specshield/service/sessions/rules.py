@@ -52,14 +52,6 @@ def added(names: Iterable[str], signals: Iterable[str]) -> list[str]:
     return [name for name in sorted(signals) if name not in known]
 
 
-def columns_of(rules: Sequence[Config]) -> list[str]:
-    """The signals of the rows, by column."""
-    names = list[str]()
-    for config in rules:
-        names += added(names, config["spec"]["signals"])
-    return names
-
-
 def signals_in(rows: Floats, names: Iterable[str]) -> dict[str, Floats]:
     """What rows [n, 3 + signals] hold of these signals, [n] each. names: by column."""
     return {name: rows[:, 3 + i] for i, name in enumerate(names)}

@@ -53,7 +53,9 @@ class Session(NamedTuple):
     @staticmethod
     def of(stored: Record | Dump) -> Session:
         rules, state = ruled.read(stored.config), State.of(stored.state)
-        names = ruled.columns_of(rules)
+        names = list[str]()
+        for config in rules:
+            names += ruled.added(names, config["spec"]["signals"])
         width = 3 + len(names)
         rows = np.frombuffer(stored.rows, "<f8", state.length * width).reshape(-1, width)
         settings, sizes = settings_of(rules[-1]), (len(stored.config), len(stored.state))
