@@ -69,8 +69,8 @@ class SessionRequest(_Policies):
     threshold: float = Field(
         1.0,
         ge=0.0,
-        description="delta, the least expected J of a step. With evaluation `feasibility` above 0 and at "
-        "most 1, and only 1 has the guarantee: 0.99^150 is 0.22. With `robustness` in metres, and without.",
+        description="delta, the least expected J of a step. With `feasibility` it is above 0 and at most 1; "
+        "only 1 has the guarantee: 0.99^150 is 0.22. With `robustness` it is in metres, with no guarantee.",
     )
     margin: float = Field(
         0.0, ge=0.0, le=1e8, description="Robustness to keep in hand [the unit of the formula, m]."
