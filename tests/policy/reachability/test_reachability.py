@@ -246,3 +246,21 @@ def test_a_policy_that_is_asked_briefly_proposes_the_way_that_it_would_go_and_no
     task = make_task(grid, STRETCH, "F[0,30] Goal", {"Goal": goal | {"radius": 0.4}})
     proposal = synthesise(task, Settings(pitch=0.1)).briefly().propose(np.array([(0.6, 0.5, 0.0)]), {}, 0.0)
     assert proposal.motions[:, 0].tolist() == [proposal.preferred]
+
+
+@pytest.mark.parametrize(
+    ("formula", "radius", "x", "cells"),
+    [("F[0,12] Goal", 0.03, 7.0, 180), ("G[0,30] not Start and F[0,20] Goal", 0.4, 2.8, 80)],
+)
+def test_a_policy_that_is_asked_briefly_hands_over_no_memory(formula, radius, x, cells, monkeypatch):
+    """Where its lattice hardly sees a goal that is too far away; and where it proposes two ways, one by the
+    margin and one without it.
+    """
+    circle = {"type": "circle", "radius": radius}
+    regions = {"Start": circle | {"center": [1.0, 0.5]}, "Goal": circle | {"center": [3.5, 0.5]}}
+    task = make_task(OccupancyGrid(np.zeros((20, cells), bool), 0.05), STRETCH, formula, regions)
+    policy = synthesise(task, Settings(pitch=0.1)).briefly()
+    history = np.tile((x, 0.5, 0.0), (3, 1))
+    simulate(make_body(STRETCH, task.grid), history[0], np.zeros(2, np.int64), history[1:])
+    monkeypatch.setattr(np, "empty", lambda shape, dtype=float: np.full(shape, -1, dtype))
+    assert policy.propose(history, {}, 0.2).motions.min() >= 0

@@ -79,7 +79,7 @@ def continue_narrow(
             if settled[m]:
                 known[ways], ways = m, ways + 1
     copy_ways(motions, poses, twin)
-    return int(base if base >= 0 else order[0])
+    return int(base if base >= 0 else order[0] if wanted[order[0]] else guide.wait)
 
 
 @kernel

@@ -157,7 +157,6 @@ class ReachabilityPolicy(Carded):
         rows = signal_rows(self.task, signals, len(history))
         shape = len(self.task.robot.motions), self.task.horizon + 1 - len(history)
         chosen, least = (slice(None), -np.inf) if self.wanted is None else (self.wanted, HURRIED)
-        wanted = np.full(shape[0], not self.brief) if self.wanted is None else self.wanted.copy()
         proposals = []
         for past in pasts(rules, history, rows):
             guide = Guide(self._body, rules, self.tables, self.task.robot.wait_motion, self.barred)
@@ -166,6 +165,7 @@ class ReachabilityPolicy(Carded):
                 if not sooner:
                     continue
             motions, ways, poses = np.empty(shape, np.int64), np.empty(shape, np.int64), np.empty((*shape, 3))
+            wanted = np.full(shape[0], not self.brief) if self.wanted is None else self.wanted.copy()
             around = NO_WAY
             if self.guess:
                 fields = self._fields if guide.wait < 0 else NO_FIELDS
