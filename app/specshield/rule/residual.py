@@ -9,20 +9,24 @@ from specshield.stl import Always, And, Formula, conjuncts, verdict
 
 
 def left_over(formula: Formula, prefix: Mapping[str, Floats], t: int) -> tuple[list[Formula], list[Always]]:
-    """The conjuncts that can still be kept, and the broken G of which some step is open yet."""
+    """The conjuncts that can still be kept, and the broken G of which some step can be kept yet."""
     kept: list[Formula] = []
     broken: list[Always] = []
     for conjunct in conjuncts(formula):
         if verdict(conjunct, prefix) != "violated":
             kept.append(conjunct)
         elif isinstance(conjunct, Always) and conjunct.horizon > t:
-            broken.append(conjunct)
+            broken += [conjunct] if verdict(again([conjunct], t + 1)[0], prefix) != "violated" else []
     return kept, broken
 
 
-def again(broken: Sequence[Always], t: int) -> list[Formula]:
-    """The broken G that look as far as step t, each enforced from step t on, or at its last step at least."""
-    return [Always(min(max(each.a, t), each.b), each.b, each.child) for each in broken if each.horizon >= t]
+def again(broken: Sequence[Always], t: int, early: int = 0) -> list[Formula]:
+    """The broken G that look as far as step t, each enforced from step t on, or at its last step at least.
+    early: from so many steps before t on, but only where the child, at that step, looks as far as t.
+    """
+    first = [max(each.a, t - min(early, each.child.horizon)) for each in broken]
+    ways = zip(first, broken, strict=True)
+    return [Always(min(a, each.b), each.b, each.child) for a, each in ways if each.horizon >= t]
 
 
 def joined(parts: Sequence[Formula]) -> Formula:

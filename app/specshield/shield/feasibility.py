@@ -144,20 +144,9 @@ def simulated(
     poses, rho = np.empty((*motions.shape, 3)), np.empty(len(motions))
     leaves = np.empty((len(motions), prefix.view.tree.size))
     violated = prefix.high <= SATISFIED_ABOVE  # then parts of the rule are judged, on every row as a whole
-    finite = _simulate_and_rate(
-        body,
-        prefix.view,
-        prefix.known,
-        prefix.t,
-        prefix.poses[-1],
-        prefix.held,
-        prefix.task.robot.wait_motion,
-        not violated,
-        motions,
-        poses,
-        rho,
-        leaves,
-    )
+    known = prefix.view, prefix.known, prefix.t, prefix.poses[-1], prefix.held
+    wait, written = prefix.task.robot.wait_motion, (motions, poses, rho, leaves)
+    finite = _simulate_and_rate(body, *known, wait, not violated, *written)
     said = warnings if finite else [*warnings, NOT_FINITE]
     return Futures(motions, poses, rho, leaves, preferred, tuple(dict.fromkeys(said)))
 

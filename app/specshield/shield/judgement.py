@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -209,7 +210,7 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
     Conjuncts that cannot be kept any more are dropped. A broken G can still be enforced from a later step on.
     These are tried in turn, and the first that some future keeps is what is kept:
 
-    1. all other conjuncts, and each broken G from the next step on;
+    1. all other conjuncts, and each broken G from the first step on that can be kept, the next one at most;
     2. the same, each broken G from the earliest step at which the robot can be out of the forbidden place;
     3. the same without broken G over signals, which no motion of the robot mends;
     4. the conjuncts of the form G, and the broken G, at the price of what was to be reached;
@@ -230,10 +231,15 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
     guards = [flat(each) for each in kept if isinstance(each, Always)]
     guards = [each for each in guards if is_place(task, each)]
 
+    def keeps(parts: list[Formula]) -> bool:
+        return bool(rho_of(prefix.of(joined(parts)), tried.poses)[0].max() > SATISFIED_ABOVE)
+
     def options() -> Iterator[list[Formula]]:
         nonlocal tried
-        if broken:
-            yield [*kept, *again(broken, t + 1)]
+        if broken:  # what a visit within so many steps is asked for now is not put off by a step at each step
+            most = range(max(each.child.horizon for each in broken))
+            late = bisect_left(most, True, key=lambda k: not keeps([*kept, *again(broken, t + 1, k + 1)]))
+            yield [*kept, *again(broken, t + 1, late)]
         if places:
             steps, ways = escape(shield, prefix, places, guards)
             if ways is not None:
@@ -246,12 +252,11 @@ def _left(shield: Shield, prefix: Prefix, tried: Futures) -> tuple[Futures, Pref
                 yield [*guards, *again(places, t + steps)]
         yield kept
 
-    part = prefix
-    for parts in filter(None, options()):
-        part = prefix.of(joined(parts))
-        if rho_of(part, tried.poses)[0].max() > SATISFIED_ABOVE:
+    left = list[Formula]()
+    for left in filter(None, options()):
+        if keeps(left):
             break
-    return tried, part
+    return tried, prefix.of(joined(left)) if left else prefix
 
 
 @kernel

@@ -53,8 +53,8 @@ def given_up(prefix: Prefix) -> tuple[str, ...]:
     """A sentence for each part of a violated rule that is lost."""
     rule, samples = prefix.formula, prefix.task.samples(prefix.poses, prefix.signals)
     kept, broken = left_over(rule, samples, prefix.t)
-    told = {"pending": "is kept again as soon as it can be", "satisfied": "what was left of it is kept"}
-    now = [told.get(verdict(part, samples), "is given up") for part in again(broken, prefix.t + 1)]
+    done = [verdict(part, samples) == "satisfied" for part in again(broken, prefix.t + 1)]
+    now = ["what was left of it is kept" if each else "is kept again as soon as it can be" for each in done]
     return (
         *(f"{part} was not kept, and is given up" for part in conjuncts(rule) if part not in kept + broken),
         *(f"{part} was broken, and {then}" for part, then in zip(broken, now, strict=True)),
