@@ -418,6 +418,23 @@ def test_what_can_still_be_kept_is_kept_while_another_part_is_lost_but_not_yet_b
     assert said == []
 
 
+def test_where_no_part_can_be_kept_alone_no_ways_are_asked_for_that_keep_two(monkeypatch):
+    """Walled in, the robot cannot come to A, B or C. Each way that is asked for costs a search in vain."""
+    grid, parts = OccupancyGrid(np.zeros((40, 80), bool), 0.05), "ABC"
+    regions = {name: GOAL | {"center": [3.5, 0.5 + 0.5 * k], "radius": 0.2} for k, name in enumerate(parts)}
+    task = make_task(grid, STRETCH, " and ".join(f"F[0,40] {name}" for name in parts), regions)
+    policy = synthesise(task, Settings(pitch=0.1))
+    asked, giving_up = [], type(policy).giving_up
+    monkeypatch.setattr(
+        type(policy), "giving_up", lambda self, lost: asked.append(lost) or giving_up(self, lost)
+    )
+    wall = [(1.2, y) for y in np.arange(0.025, 2.0, 0.05)]
+    shield = make_shield([policy], Config(learn_map=True, uncertainty=Uncertainty()))
+    decision = decide(shield, [START], None, True, occupied=wall)
+    assert decision.reason == "infeasible"
+    assert [len(lost) for lost in asked] == [2, 2, 2]
+
+
 @pytest.mark.parametrize("uncertainty", [None, Uncertainty()])
 @pytest.mark.parametrize("steps", [17, 19, 22])
 def test_whoever_pauses_within_the_time_that_is_left_is_there_in_time(steps, uncertainty):

@@ -258,9 +258,8 @@ def on_map(shield: Shield, known: LearnedMap, guess: bool = False, barred: Float
 
     barred [n, 6]: what its policies are to find ways without (robot/barred.py).
     """
-    body, proposers = shield.body, shield.proposers
+    body, proposers = body_on(shield, known), shield.proposers
     if len(known):
-        body = body_on(shield, known)
         proposers = tuple(adapted(p, "on_body", body, guess) for p in proposers)
     if barred is not None and len(barred):
         proposers = tuple(adapted(p, "avoiding", barred) for p in proposers)

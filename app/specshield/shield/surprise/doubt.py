@@ -35,8 +35,7 @@ def tried_again(
         return None
     vain = None
     for guess in doubted(taught, now.prefix.t):
-        other = on_map(told, guess.map, True, taught.barred)
-        found = judged_by_signals(other, now)
+        found = judged_by_signals(on_map(told, guess.map, True, taught.barred), now)
         if found[2].some and not found[2].vain:
             return guess, found
         if found[2].some and vain is None and not judged.some:
@@ -76,24 +75,26 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
         return judged
     tried = judged.tried
     first, lost, said, helps = most_kept(shield, judged.part, tried)
-    if len(lost) > 1:  # together; some of them may be kept by a way that gives up the others
-        few = [tuple(each for each in lost if each != one) for one in lost[:MOST_PARTS]]
-        few += [(one,) for one in lost[:MOST_PARTS] if (one,) not in few]
-        able = [each for each in shield.proposers if hasattr(each, "giving_up")]
-        asked = [adapted(each, "giving_up", parts) for parts in few for each in able]
-        if asked:
-            tried = together(tried, futures(now.prefix, shield.body, asked, None, (0.0,)))
-            first, lost, said, helps = most_kept(shield, judged.part, tried)
+    parts, able = lost, [each for each in shield.proposers if hasattr(each, "giving_up")]
+    for alone in (True, False) if able and len(parts) > 1 else ():  # a part may be kept without the others
+        few = [tuple(each for each in parts if (each == one) != alone) for one in parts[:MOST_PARTS]]
+        asked = [adapted(each, "giving_up", some) for some in few for each in able]
+        tried = together(tried, futures(now.prefix, shield.body, asked, None, (0.0,)))
+        first, lost, said, helps = most_kept(shield, judged.part, tried)
+        if len(parts) == 2 or lost == parts:  # where none can be kept alone, no two can
+            break
     awaited = _awaited(told, shield, taught, now)
     if awaited is not None and most_kept(shield, judged.part, _that_wait(told, tried, awaited))[1] == lost:
         first, said = awaited, ("something is in every way that is left: it is waited for",)
     elif not helps:  # what is believed of contacts may be why
         known, marked = taught.map, taught.map.occupied & (taught.map.by != SENT)
-        free = on_map(told, revised(known, forget(known, marked)))
-        ways = futures(now.prefix, free.body, free.proposers, None, (0.0,))
+        believed = marked.any() or len(taught.barred) > 0
+        free = on_map(told, revised(known, forget(known, marked))) if believed else shield
+        asked = [adapted(each, "briefly") if believed else each for each in free.proposers]
+        ways = futures(now.prefix, free.body, asked, None, (0.0,))
         first, _, said, helps = most_kept(free, judged.part, ways)
         first = first if helps else ways.preferred
-        if marked.any() or len(taught.barred):
+        if believed:
             said = ("what was marked after contacts leaves no way, so it is ignored for this action", *said)
     tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # the futures that were judged, no more
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
