@@ -112,8 +112,9 @@ def test_a_server_that_never_answers_costs_a_bounded_time(use):
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(errors.TransportTimeout) as caught:
             use(url, validate, timeout=0.1)
-        # Five is what is promised; fewer are made where the calls' own time is used up on a busy machine.
-        assert 1 <= caught.value.details["tries"] <= 5
+        # They begin after 0, 0.15 and 0.35 s; a fourth would begin after 0.65 s, and four timeouts are 0.4 s.
+        # Fewer are made where a busy machine has used up that time before.
+        assert 1 <= caught.value.details["tries"] <= 3
 
 
 def test_a_closed_port_is_a_transport_error(use):

@@ -161,7 +161,7 @@ def _expand(
             continue
         before_x, before_y, before = here.pose[w, 0], here.pose[w, 1], here.pose[w, 2]
         copy_progress(here.status[w], here.run[w], scratch.status, scratch.run)
-        some = ((31 * w + n) * 2654435761 >> 16) % beam.every, beam.every  # in no order
+        some = ((31 * w + n) * 2654435761 >> 16) % beam.every, beam.every  # scattered by Knuth's hash
         corners = score(guide, before_x, before_y, before, t + n, -1, some, scratch)
         lowest = max(band + (t + tables.early) + n + 1, _lowest(scratch.scores))
         cos, sin, room = around(body, before_x, before_y, before)
