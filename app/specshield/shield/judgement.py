@@ -85,19 +85,20 @@ def judge(shield: Shield, now: Situation) -> Judged:
             without_it = best_of(tried, others, motions)
             left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
             kept, best = others, without_it
-    follows = recovers(shield.config) and tail is not None and len(tail) == prefix.steps
+    follows, had = recovers(shield.config) and tail is not None and len(tail) == prefix.steps, None
     if roomy:
         apart = _with_room(shield, prefix, tried, kept)
-        roomy = apart.max() > SATISFIED_ABOVE
-        if roomy:  # but a way with room may cost half of the slack that is asked for, and no more
-            room, none = (aim(shield, care, part, tried, each, leaves, follows) for each in (apart, kept))
-            roomy = room.slack >= min(none.slack, care.least // 2)
+        roomy = max(apart.tolist()) > SATISFIED_ABOVE
+        had = aim(shield, care, part, tried, apart, leaves, follows) if roomy else None
+        if had and had.slack < care.least // 2:  # room may cost half of the slack that is asked for
+            none = aim(shield, care, part, tried, kept, leaves, follows)
+            roomy, had = (True, had) if had.slack >= none.slack else (False, none)
         kept = apart if roomy else kept
         best = best_of(tried, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and best.robustness.max() > SATISFIED_ABOVE):
-        aimed = aim(shield, care, part, tried, kept, leaves, follows)
+        aimed = had or aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
         # A threshold for the episode weighs ways with any slack, also with more than the first futures have.
         by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
