@@ -251,6 +251,68 @@ def test_a_connection_that_is_closed_while_it_is_in_use_is_a_store_that_cannot_b
         asyncio.run(scenario(nodes.url))
 
 
+def test_a_session_goes_with_its_slot_to_another_node(tmp_path):
+    """Appends while its keys are on their way, and later, are all there; then redis-py is asked no more."""
+
+    async def scene(nodes: list[redis.Redis], url: str) -> None:
+        store = Store(url, timeout=5.0, ttl=60)
+        id = next(id for id in map(str, range(1000)) if key_slot(id.encode()) < FIRST)
+        slot, (one, other) = key_slot(id.encode()), nodes[:2]
+        version = await store.create(id, b"config", Change(b"state", bytes(24)))
+        steps = iter(range(100))
+
+        async def append() -> None:
+            nonlocal version
+            t = next(steps)
+            added = await store.append(id, version, Change(b"state", bytes(24), 24 * (t + 1), t, b"%d" % t))
+            assert isinstance(added, bytes)
+            version = added
+
+        await append()
+        names = [node.execute_command("CLUSTER", "MYID").decode() for node in (one, other)]
+        other.execute_command("CLUSTER", "SETSLOT", slot, "IMPORTING", names[0])
+        one.execute_command("CLUSTER", "SETSLOT", slot, "MIGRATING", names[1])
+        await append()
+        held = one.execute_command("CLUSTER", "GETKEYSINSLOT", slot, 10)
+        port = other.connection_pool.connection_kwargs["port"]
+        assert len(held) == 3
+        one.execute_command("MIGRATE", "127.0.0.1", port, "", 0, 5000, "KEYS", *held)
+        await append()
+        for node in (other, one, *nodes[2:3]):
+            node.execute_command("CLUSTER", "SETSLOT", slot, "NODE", names[1])
+        await append()
+        sent_on, store.redis.eval = store.redis.eval, None
+        await append()
+        store.redis.eval = sent_on
+        found = await store.dump(id)
+        assert found is not None
+        assert found.steps == [b"0", b"1", b"2", b"3", b"4"]
+        await store.aclose()
+
+    with cluster(tmp_path / "store") as there:
+        asyncio.run(scene(there.nodes, there.url))
+
+
+def test_a_node_that_serves_nothing_for_now_is_told_at_once(tmp_path):
+    """As one that is just back, for two seconds: redis-py, which waits and asks again, is not asked."""
+
+    async def scene(node: redis.Redis, url: str) -> None:
+        store = Store(url, timeout=60.0, ttl=60)
+        id = next(id for id in map(str, range(1000)) if key_slot(id.encode()) < FIRST)
+        slot = key_slot(id.encode())
+        await store.create(id, b"config", Change(b"state", bytes(24)))
+        store.redis.eval = None
+        node.execute_command("CLUSTER", "DELSLOTS", slot)
+        with pytest.raises(StoreError, match="CLUSTERDOWN"):
+            await store.load(id)
+        node.execute_command("CLUSTER", "ADDSLOTS", slot)
+        assert await store.load(id) is not None
+        await store.aclose()
+
+    with cluster(tmp_path / "store") as there:
+        asyncio.run(scene(there.nodes[0], there.url))
+
+
 def test_a_cluster_that_is_away_is_said_to_be(tmp_path):
     away = "redis+cluster://127.0.0.1:1"
     with (

@@ -63,6 +63,6 @@ def test_a_server_that_goes_while_a_connection_is_made_cannot_be_reached():
     async def gone():
         raise RuntimeError("unable to perform operation on <TCPTransport closed=True>; the handler is closed")
 
-    wire = Wire(SimpleNamespace(make_connection=lambda: SimpleNamespace(connect=gone)), 60.0)
+    wire = Wire(lambda: SimpleNamespace(connect=gone), 60.0)
     with pytest.raises(redis.ConnectionError, match="closed"):
         asyncio.run(wire.run(Script("return 1"), [], []))

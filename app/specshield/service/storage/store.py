@@ -18,7 +18,8 @@ import anyio
 from specshield.errors import LimitReached, SessionExists
 from specshield.service.access.owners import between, shown
 from specshield.service.storage.connect import FAILURES, away, connect, is_cluster, reaching
-from specshield.service.storage.wire import PART, Script, Wire, too_few
+from specshield.service.storage.wire import Script, Wire
+from specshield.service.storage.wires import Wires
 
 PAGE_BYTES = 256 << 10  # of the configs on a page; chosen by hand: read and shown in a few ms
 AT_ONCE = 100  # commands of one pipeline, which the event loop writes and reads in 2 ms or so
@@ -77,15 +78,17 @@ class Store:
 
     def __init__(self, url: str, timeout: float, ttl: int, replicas: int = 0) -> None:
         self.redis: Any = connect(url, socket_timeout=timeout)
-        self._append = self.redis.register_script(APPEND.text)
         self._claim = self.redis.register_script(Path(__file__).with_name("claim.lua").read_text())
-        # A cluster has no one connection: redis-py finds the server that has a session's keys.
-        self._wire = None if is_cluster(url) else Wire(self.redis.connection_pool, timeout, replicas)
+        self._in_cluster = is_cluster(url)
+        self._wire: Wire | Wires = (
+            Wires(self.redis, timeout, replicas)
+            if self._in_cluster
+            else Wire(self.redis.connection_pool.make_connection, timeout, replicas)
+        )
         self._timeout, self._ttl, self._replicas = timeout, ttl, replicas
 
     async def aclose(self) -> None:
-        if self._wire is not None:
-            self._wire.close()
+        self._wire.close()
         await self.redis.aclose()
 
     @asynccontextmanager
@@ -151,32 +154,14 @@ class Store:
         field = "" if change.t is None else change.t
         args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state, config]
         args.append(self._ttl * 1000)
-        if self._wire is None:
-            async with self._reaching():
-                written = await self._append(keys=keys(id), args=args)
-                if self._replicas:
-                    await self._replicated(id, written if isinstance(written, bytes) else written[2])
-        else:
-            try:
-                written = await self._wire.run(APPEND, keys(id), args)
-            except FAILURES as error:
-                raise away(error) from error
+        try:
+            written = await self._wire.run(APPEND, keys(id), args)
+        except FAILURES as error:
+            raise away(error) from error
         if isinstance(written, bytes):
             return written
         config, state, version, rows, step = written
         return None if config is None or rows is None else Record(config, state, version, rows, step or None)
-
-    async def _replicated(self, id: str, version: bytes | None) -> None:
-        """Waits until the replicas of this session's node have it; it is still of this version there. WAIT is
-        for all that the node had done when the command before it, on the same connection, was done.
-        """
-        node, longest = self.redis.get_node_from_key(keys(id)[0]), int(PART * 1000 * self._timeout)
-        pipe = self.redis.pipeline()
-        pipe.execute_command("HGET", keys(id)[0], "version", target_nodes=node)
-        pipe.execute_command("WAIT", self._replicas, longest, target_nodes=node)
-        found, count = await pipe.execute()
-        if found != version or count < self._replicas:
-            raise too_few(count, self._replicas)
 
     async def dump(self, id: str) -> Dump | None:
         """All of a session as it is at one moment; None where there is none."""
@@ -226,7 +211,7 @@ class Store:
     async def held_bytes(self) -> int:
         """The memory that the store takes: in a cluster all its masters, their replicas not counted."""
         async with self._reaching():
-            if self._wire is not None:
+            if not self._in_cluster:
                 return int((await self.redis.info("memory"))["used_memory"])
             nodes = await self.redis.info("memory", target_nodes="primaries")
             return sum(int(node["used_memory"]) for node in nodes.values())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import hiredis
@@ -31,12 +31,12 @@ class Script:
 
 
 class Wire:
-    """pool: redis-py's, of a single server. timeout: longest wait for one answer, with all tries [s].
-    replicas: how many of the server's have to have all that an answer tells of before it is given.
+    """make: what makes redis-py's connection, not yet open. timeout: longest wait for one answer, with all
+    tries [s]. replicas: how many of the server's have to have all that an answer tells of before it is given.
     """
 
-    def __init__(self, pool: Any, timeout: float, replicas: int = 0) -> None:
-        self._pool, self._timeout, self._replicas = pool, timeout, replicas
+    def __init__(self, make: Callable[[], Any], timeout: float, replicas: int = 0) -> None:
+        self._make, self._timeout, self._replicas = make, timeout, replicas
         self._link: _Link | None = None
         self._opening = asyncio.Lock()
 
@@ -61,7 +61,7 @@ class Wire:
     async def _open(self, deadline: float) -> _Link:
         async with asyncio.timeout_at(deadline), self._opening:
             if self._link is None or self._link.closed:
-                connection = self._pool.make_connection()
+                connection = self._make()
                 try:
                     await connection.connect()
                 except RuntimeError as error:  # uvloop's word for one that the other side has closed by now
