@@ -16,7 +16,7 @@ import pytest
 from specshield.policy.planner.policy import Settings as Plan
 from specshield.policy.planner.policy import synthesise as plan
 from specshield.policy.reachability.policy import Settings, synthesise
-from specshield.robot import STRETCH
+from specshield.robot import STRETCH, Action, Robot
 from specshield.robot.barred import is_barred
 from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield import episode
@@ -496,3 +496,22 @@ def test_a_pose_that_no_robot_can_have_is_answered(far):
     shield = shield_of(learn_map=True, uncertainty=Uncertainty())
     carry = decide(shield, [START], None, True).carry
     assert decide(shield, [START, (far, 1.0, 0.0)], None, True, carry=carry).in_collision
+
+
+@pytest.mark.parametrize("make", [synthesise, plan])
+def test_a_robot_that_has_passed_what_the_map_has_beside_it_is_not_shut_in_there(make):
+    """The wall on its left stands 5 cm farther off than on the map, which learns this only where the robot
+    reached into it by more than 3 cm. The rest of the wall, behind, would then block the way back.
+    """
+    arcs = [Action(f"{far} {turn}", far, turn) for far in (0.2, -0.2) for turn in (0.0, 0.5, -0.5)]
+    robot, walls = Robot("arcs", 0.2, (0.0, 0.0), "stop", (*arcs, Action("wait"))), np.zeros((40, 80), bool)
+    walls[24:, :40] = True
+    goal = {"Goal": GOAL | {"center": [0.8, 0.8]}}
+    task = make_task(OccupancyGrid(walls, 0.05), robot, "F[0,60] Goal", goal)
+    shield = make_shield([make(task)], Config(learn_map=True, uncertainty=Uncertainty()))
+    way, carry = [(1.6, 0.985, 0.19), (1.79, 1.023, 0.19), (1.92, 1.0495, 0.19)], None
+    for t in range(3):
+        decision = decide(shield, way[: t + 1], None, True, carry=carry)
+        carry = decision.carry
+    assert decision.mode == "completion"
+    assert decision.next_poses[decision.action][0] < 1.8

@@ -36,8 +36,7 @@ def answer_of(
     weights [A]: the preference's log-weights inside S_t beside the model's log-probabilities. chance [A],
     left: of a threshold over the episode (threshold.py).
     """
-    terminal = shield.task.robot.terminal
-    any_feasible = judged.some
+    terminal, any_feasible = shield.task.robot.terminal, judged.some
     said: Reason | None = "margin_unattainable" if judged.aimed.lowered else None
     certified = np.zeros(len(terminal))
     certified[judged.completion] = 1.0
@@ -63,12 +62,10 @@ def answer_of(
         shaped = shaping.restrict(wanted, judged.feasible)
     else:
         shaped = shaping.soften(conditional, judged.feasible, config.threshold)
-    reason: Reason | None = said
+    mode = "shaped"
     if shaped is None:
-        reason = "zero_prior_mass" if attainable else "infeasible"
-    mode = "fallback" if shaped is None else "shaped"
-    body = certified if shaped is None else shaped
-    return Answer(shaping.with_ending(body, log_prior, ending, terminal), mode, reason, conditional)
+        mode, said, shaped = "fallback", "zero_prior_mass" if attainable else "infeasible", certified
+    return Answer(shaping.with_ending(shaped, log_prior, ending, terminal), mode, said, conditional)
 
 
 def unmodified(shield: Shield, log_prior: Floats | None) -> Answer:

@@ -150,17 +150,14 @@ def decide(
         believed = tried_again(told, taught, judged, now)
         if believed is not None:
             taught, (shield, now, judged, withstands) = believed
-            said = (*said, "no other way was left, so what was run into is tried again")
+            said = (*said, "no other way was left, so the map is doubted where the robot touched something")
             touches = _look_around(shield.body, poses[-1], nexts)
         prefix = now.prefix
         doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)
         judged = recovered(told, shield, taught, judged, now)
         judged = without(judged, shield, doubts, risky)
         if judged.vain and judged.some:
-            said = (
-                *said,
-                "every way that is left uses a motion that led nowhere from here before; it is tried again",
-            )
+            said = (*said, "every way left has a motion that led nowhere from here before: it is tried again")
         if shield.preference is not None and log_prior is not None and spec_status == "pending":
             known = shield.preference.begin() if memory is None else memory
             memory, weights = shield.preference.step(known, poses, signals, log_prior, judged.feasible)

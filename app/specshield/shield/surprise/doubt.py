@@ -9,15 +9,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from specshield.robot.dynamics import step
+from specshield.robot.dynamics import overlap, step
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Futures, futures, together
+from specshield.shield.feasibility import Futures, Prefix, futures, together
 from specshield.shield.judgement import Judged, Situation
 from specshield.shield.proposal import adapted
 from specshield.shield.signals import judged_by_signals
+from specshield.shield.surprise.contact import cells_under
 from specshield.shield.surprise.recovery import most_kept, recovers
-from specshield.shield.taught import Taught, on_map
-from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, revised
+from specshield.shield.taught import Taught, body_on, on_map
+from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand
@@ -34,7 +35,7 @@ def tried_again(
     if judged.some and not judged.vain:
         return None
     vain = None
-    for guess in doubted(taught, now.prefix.t):
+    for guess in doubted(told, taught, now.prefix):
         found = judged_by_signals(on_map(told, guess.map, True, taught.barred), now)
         if found[2].some and not found[2].vain:
             return guess, found
@@ -43,16 +44,16 @@ def tried_again(
     return vain
 
 
-def doubted(taught: Taught, t: int) -> Iterator[Taught]:
-    """What may be believed of contacts where no way is left, in the order in which it is to be tried.
+def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
+    """What may be believed of the map where no way is left, in the order in which it is to be tried.
 
     A motion that stopped short met something, but nobody knows where along its front, nor how large it is. So
     less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
     lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
-    before was wrong, and the next one is tried first. Last, contacts that were made DOUBTED_AFTER steps ago
-    or earlier are forgotten, since nothing that only runs into things ever sees that one is gone.
+    before was wrong, and the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
+    forgotten, since no contact shows that a thing is gone. Last, all that the robot has passed is free.
     """
-    known = taught.map
+    known, t = taught.map, prefix.t
     young = t - known.step < DOUBTED_AFTER
     seen = ~known.occupied | (known.by == SENT)
     first = max(taught.followed.met - 1, 0) % len(GUESSES)
@@ -62,6 +63,13 @@ def doubted(taught: Taught, t: int) -> Iterator[Taught]:
             yield taught._replace(map=revised(known, forget(known, ~stays)))
     if not (seen | young).all():
         yield taught._replace(map=revised(known, forget(known, ~(seen | young))))
+    if told.config.learn_map:
+        body, poses = body_on(told, known), np.unique(prefix.poses, axis=0)
+        under = [cells_under(body, pose, 0.0) for pose in poses if overlap(body, *pose) > 0.0]
+        passed = np.setdiff1d(np.concatenate([known.cell, *under]), known.cell)  # not what came there later
+        free = learn(told.task.grid, known, t, passed, False, CONTACT)
+        if len(free) > len(known):
+            yield taught._replace(map=revised(known, free))
 
 
 def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now: Situation) -> Judged:
@@ -95,7 +103,7 @@ def recovered(told: Shield, shield: Shield, taught: Taught, judged: Judged, now:
         first, _, said, helps = most_kept(free, judged.part, ways)
         first = first if helps else ways.preferred
         if believed:
-            said = ("what was marked after contacts leaves no way, so it is ignored for this action", *said)
+            said = ("what contacts taught leaves no way, so it is ignored for this action", *said)
     tried = judged.tried._replace(warnings=(*tried.warnings, *said))  # the futures that were judged, no more
     return judged._replace(tried=tried, completion=int(shield.task.robot.representative[first]))
 

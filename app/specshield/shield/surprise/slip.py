@@ -10,6 +10,7 @@ import numpy as np
 from specshield.arrays import Floats, Ints
 from specshield.shield.decision import Carry, Shield
 from specshield.shield.proposal import Proposal
+from specshield.shield.surprise.contact import is_near
 from specshield.task import Task
 
 SAME_POSE = 1e-6  # [m] and [rad]: poses this near are one pose
@@ -38,14 +39,11 @@ def with_begun(shield: Shield, carry: Carry | None, poses: Floats) -> Shield:
         return shield
     motion = int(task.robot.motion_of[carry.action])
     way = carry.witnesses[motion] if motion >= 0 else None
-    if not way or not _is_at(poses[-1], poses[-2]) or _is_at(poses[-1], carry.next_poses[motion]):
+    went, near = carry.next_poses[motion : motion + 1], (SAME_POSE, SAME_POSE)
+    if not way or not is_near(poses[-2:-1], poses[-1], near) or is_near(went, poses[-1], near):
         return shield
     wait, rows = bytes([max(task.robot.wait_motion, 0)]), [way[:-1]]
     if task.robot.wait_motion >= 0 and wait in way:  # a robot that is late waits for less long
         rows.append(way.replace(wait, b"", 1))
     again = np.array([[motion, *row] for row in rows], np.int64)
     return replace(shield, proposers=(*shield.proposers, Begun(task, again)))
-
-
-def _is_at(one: Floats, other: Floats) -> bool:
-    return all(abs(a - b) <= SAME_POSE for a, b in zip(one.tolist(), other.tolist(), strict=True))
