@@ -175,6 +175,13 @@ def test_a_deadline_that_cannot_come_earlier_leaves_the_others_their_slack():
     assert list(found.j_values[:4]) == [1, 0, 0, 1]
 
 
+@pytest.mark.parametrize(("waits", "slack"), [(0, 2), (1, 2), (2, 1), (3, 0)])
+def test_the_slack_that_is_told_is_that_of_the_patrol_that_is_due_next(waits, slack):
+    """The robot is where the first patrol leads, and A is due at step 4; it can be there in one step."""
+    found = decision("G[0,4] F[0,4] x < 9 and G[0,4] F[0,4] A", *[WAIT] * waits, slack=2)
+    assert found.slack == slack
+
+
 def tables(task):
     return reachability.synthesise(task, reachability.Settings(pitch=0.2))
 

@@ -83,12 +83,15 @@ def _is_plain(part: Formula) -> bool:
 
 
 @kernel
-def find_open(parts: Conjuncts, known: Floats, t: int, still: Bools) -> None:
-    """Writes which conjuncts x_{0:t} has not settled into still (K,). known (size,): the leaves to step t."""
+def find_open(parts: Conjuncts, known: Floats, t: int, still: Bools) -> Floats:
+    """Writes which conjuncts x_{0:t} has not settled into still (K,). known (size,): the leaves to step t.
+    Returns the least that each node may have, by x_{0:t}.
+    """
     low = known.copy()
     bounds_at(parts.below, t, low, known.copy())
     for k in range(still.shape[0]):
         still[k] = not _value(parts, k, parts.a[k], parts.b[k], low) > SATISFIED_ABOVE
+    return low
 
 
 @kernel

@@ -19,7 +19,7 @@ from specshield.shield.decision import Shield
 from specshield.shield.feasibility import Best, Futures, Prefix, best_rows, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
-from specshield.stl.tree import EVENTUALLY
+from specshield.stl.tree import ALWAYS, EVENTUALLY
 
 NEVER = 1 << 40  # in place of a number of steps
 
@@ -121,7 +121,7 @@ def _best_asked(
     """
     parts, still, asked, due, t = now[:5]
     noise, stride, least, chance = care
-    find_open(parts, known, t, still)
+    low = find_open(parts, known, t, still)
     for k in range(still.shape[0]):
         half, due[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER
         if still[k] and half > 0:
@@ -130,6 +130,11 @@ def _best_asked(
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             due[k] = left
+            for i in range(parts.a[k], min(t, parts.b[k]) + 1 if parts.kind[k] == ALWAYS else 0):
+                if (
+                    not low[parts.at[k] - parts.a[k] + i] > SATISFIED_ABOVE
+                ):  # what step i asks for is due first
+                    due[k] = min(due[k], i + parts.horizon[k] - t)
     return _best_open(now, asked, margin, best)
 
 

@@ -207,17 +207,9 @@ def observe(told: Told, seen: Seen, before: Floats, foreseen: Floats, pose: Floa
         asked = (1.0 - standing) * rate
         slipped = noise.slips * asked / (noise.slips * asked + standing) if standing > 0.0 else 1.0
         odds = seen.odds * standing / (standing + asked)
-        return Seen(
-            seen.moved + slipped,
-            seen.lost + slipped * min(1.0, miss / way),
-            odds,
-            seen.noisy,
-            seen.moves,
-            seen.turns,
-            seen.exact,
-            seen.standing,
-            seen.slipping * _slip(noise) if still < miss else 1.0,
-        )
+        lost = seen.lost + slipped * min(1.0, miss / way)
+        slipping = seen.slipping * _slip(noise) if still < miss else 1.0
+        return Seen(seen.moved + slipped, lost, odds, *seen[3:8], slipping)
     gone = math.hypot(foreseen[motion, 0] - before[0], foreseen[motion, 1] - before[1])
     dx, dy = pose[0] - foreseen[motion, 0], pose[1] - foreseen[motion, 1]
     return Seen(
