@@ -87,7 +87,7 @@ class Guard:
             try:
                 await self._check(scope, dict(scope["headers"]))
             except SpecshieldError as error:
-                await problems.response(error)(scope, receive, send)
+                await problems.ProblemResponse(error)(scope, receive, send)
                 return
         await self.app(scope, receive, send)
 

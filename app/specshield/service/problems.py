@@ -110,16 +110,22 @@ def plain(value: Any, room: int = 400) -> Any:
     return value if len(text) <= room else text[:room] + "…"
 
 
-def response(error: SpecshieldError, headers: Mapping[str, str] | None = None) -> Response:
-    status = status_of(error)
-    extra = dict(headers or {})
-    if status == 401:
-        extra["WWW-Authenticate"] = "Bearer"
-    if status == 503:
-        extra["Retry-After"] = "1"
-    if isinstance(error, errors.RateLimited):
-        extra["Retry-After"] = str(error.details["retry_after"])
-    return ProblemResponse(error, status, extra)
+class ProblemResponse(Response):
+    """A problem document. Once it is sent, `scope["state"]["problem"]` is its type."""
+
+    def __init__(self, error: SpecshieldError, headers: Mapping[str, str] | None = None) -> None:
+        super().__init__(json.dumps(document(error)), status_of(error), headers, media_type=MEDIA_TYPE)
+        self._type = error.type
+        if self.status_code == 401:
+            self.headers["WWW-Authenticate"] = "Bearer"
+        if self.status_code == 503:
+            self.headers["Retry-After"] = "1"
+        if isinstance(error, errors.RateLimited):
+            self.headers["Retry-After"] = str(error.details["retry_after"])
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        scope["state"]["problem"] = self._type
+        await super().__call__(scope, receive, send)
 
 
 def failed() -> Response:
@@ -127,26 +133,14 @@ def failed() -> Response:
     log and closes the connection, which the caller has to know before it asks there again.
     """
     error = errors.ServerError("the server failed on this request; its log says more")
-    return response(error, {"Connection": "close"})
-
-
-class ProblemResponse(Response):
-    """A problem document. Once it is sent, `scope["state"]["problem"]` is its type."""
-
-    def __init__(self, error: SpecshieldError, status: int, headers: Mapping[str, str]) -> None:
-        super().__init__(json.dumps(document(error)), status, headers, media_type=MEDIA_TYPE)
-        self._type = error.type
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        scope["state"]["problem"] = self._type
-        await super().__call__(scope, receive, send)
+    return ProblemResponse(error, {"Connection": "close"})
 
 
 def tell(scope: Scope, error: SpecshieldError) -> Response:
     """The answer, and a line of the log for what is this server's fault, or its store's."""
     if status_of(error) >= 500 and not isinstance(error, errors.Starting | errors.Stopping):
         log.warning("%s %s: %s", scope.get("method", "WEBSOCKET"), scope["path"], error.message)
-    return response(error)
+    return ProblemResponse(error)
 
 
 def from_validation(found: Sequence[Mapping[str, Any]], body: Any, below: str = "") -> InputError:
@@ -243,7 +237,7 @@ def _allowed(request: Request) -> str:
 
 
 def install(app: FastAPI) -> None:
-    """Every way an answer can go wrong ends in `response`."""
+    """Every way an answer can go wrong ends in a `ProblemResponse`."""
 
     @app.exception_handler(SpecshieldError)
     async def known(request: Request, error: SpecshieldError) -> Response:
@@ -251,22 +245,24 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> Response:
-        return response(from_validation(error.errors(), error.body))
+        return ProblemResponse(from_validation(error.errors(), error.body))
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> Response:
         path = request.url.path
         if error.status_code == 404:
             told, expected = f"there is no {path} here", "a path listed at /docs"
-            return response(errors.NotFound(told, got=path, expected=expected))
+            return ProblemResponse(errors.NotFound(told, got=path, expected=expected))
         if error.status_code == 405:
             told, allowed = f"{path} does not take {request.method}", _allowed(request)
             wrong = errors.MethodNotAllowed(told, got=request.method, expected=allowed)
-            return response(wrong, {"Allow": allowed})
+            return ProblemResponse(wrong, {"Allow": allowed})
         reason = UNREADABLE.get(type(error.__cause__))
         if reason is not None:
-            return response(InputError(f"the body is not JSON: {reason}", expected="a JSON object"))
-        return response(InputError(str(error.detail), expected="a request in the form that /docs describes"))
+            return ProblemResponse(InputError(f"the body is not JSON: {reason}", expected="a JSON object"))
+        return ProblemResponse(
+            InputError(str(error.detail), expected="a request in the form that /docs describes")
+        )
 
     @app.exception_handler(ClientGone)
     async def gone(request: Request, error: Exception) -> Response:
@@ -277,7 +273,9 @@ def install(app: FastAPI) -> None:
     async def disk(request: Request, error: OSError) -> Response:
         if not is_full(error):
             raise error
-        return response(errors.InsufficientStorage("the server's disk is full", expected="a disk with room"))
+        return ProblemResponse(
+            errors.InsufficientStorage("the server's disk is full", expected="a disk with room")
+        )
 
     @app.exception_handler(Exception)
     async def unknown(request: Request, error: Exception) -> Response:

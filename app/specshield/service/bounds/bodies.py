@@ -54,7 +54,7 @@ class Bodies:
                     self._check_members(body.content)
             except SpecshieldError as error:
                 # What is still to come of the body is not waited for.
-                await problems.response(error, {"Connection": "close"})(scope, receive, send)
+                await problems.ProblemResponse(error, {"Connection": "close"})(scope, receive, send)
                 return
             if upload:
                 scope["state"]["body"] = body

@@ -145,7 +145,7 @@ class BoundedProtocol(HttpToolsProtocol):
         """Answers and closes, without the application."""
         self._stop_waiting()
         metrics.refused(error.type)
-        answer = problems.response(error, {"Connection": "close"})
+        answer = problems.ProblemResponse(error, {"Connection": "close"})
         head = b"".join(name + b": " + value + b"\r\n" for name, value in answer.raw_headers)
         status = STATUS_LINE[problems.status_of(error)]
         self.transport.write(status + head + b"\r\n" + bytes(answer.body))
