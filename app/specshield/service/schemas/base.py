@@ -31,7 +31,7 @@ class Strict(BaseModel):
     thousands of them would take long to say so.
     """
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, protected_namespaces=())
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 
     @model_validator(mode="before")
     @classmethod
@@ -43,17 +43,13 @@ class Strict(BaseModel):
         return value
 
 
-class Answer(BaseModel):
-    model_config = ConfigDict(protected_namespaces=())
-
-
-class FieldError(Answer):
+class FieldError(BaseModel):
     path: str = Field(description="The field: `poses[0][2]`.")
     got: JsonValue = Field(None, description="What it held, shortened.")
     expected: str = Field(description="What is valid.")
 
 
-class ProblemConjunct(Answer):
+class ProblemConjunct(BaseModel):
     formula: str = Field(description="The part.")
     feasible_alone: bool = Field(description="Whether a future was found that keeps this part by itself.")
     robustness: float | None = Field(
@@ -66,7 +62,7 @@ class ProblemConjunct(Answer):
     )
 
 
-class Problem(Answer):
+class Problem(BaseModel):
     """An error, as RFC 9457 has it. Other members may follow, such as `position` or `expected_t`."""
 
     model_config = ConfigDict(extra="allow")
@@ -90,5 +86,5 @@ class Problem(Answer):
     )
 
 
-class Health(Answer):
+class Health(BaseModel):
     status: Literal["ok"]

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, JsonValue, Tag
 from specshield.policy.methods import DEFAULT, METHODS
 from specshield.policy.options import options_schema
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Id, Name, Strict
+from specshield.service.schemas.base import Id, Name, Strict
 from specshield.service.schemas.robots import RobotSpec
 from specshield.service.schemas.specs import Spec
 
@@ -60,7 +60,7 @@ class Card(BaseModel):
     metrics: dict[str, JsonValue] = Field(max_length=256, fail_fast=True)
 
 
-class PolicyResponse(Answer):
+class PolicyResponse(BaseModel):
     id: str = Field(description="Hash of map, task, method, options and seed.")
     name: str | None = Field(description="Its name, if it has one; accepted wherever an id is.")
     status: Literal["queued", "training", "ready", "failed"] = Field(description="Sessions need `ready`.")
@@ -83,6 +83,6 @@ class PolicyResponse(Answer):
     created_at: str | None = Field(description="RFC 3339; null for one that came with the server.")
 
 
-class PolicyList(Answer):
+class PolicyList(BaseModel):
     items: list[PolicyResponse]
     next: str | None = Field(description="`cursor` of the next page; null on the last.")

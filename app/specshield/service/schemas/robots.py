@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from specshield.robot import Robot
-from specshield.service.schemas.base import Answer, Name, Strict
+from specshield.service.schemas.base import Name, Strict
 
 
 class Footprint(Strict):
@@ -38,14 +38,14 @@ class RobotSpec(Strict):
     actions: list[ActionSpec] = Field(min_length=1, max_length=256, fail_fast=True)
 
 
-class RobotResponse(Answer):
+class RobotResponse(BaseModel):
     name: str = Field(description="A preset's name; `custom` for a robot that came with a policy.")
     footprint: Footprint
     on_contact: Literal["stay", "stop"] = Field(description="What a move that would touch something does.")
     actions: list[ActionSpec] = Field(description="In the order of the logits.")
 
 
-class RobotList(Answer):
+class RobotList(BaseModel):
     items: list[RobotResponse]
     next: None = Field(None, description="Always null: the presets are one page.")
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any, Literal, Self
 
-from pydantic import ConfigDict, Field, JsonValue, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
 from specshield.lookahead.preferences import PREFERENCES, PROJECTION
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Id, Name, Pose, Poses, SpecStatus, Strict
+from specshield.service.schemas.base import Id, Name, Pose, Poses, SpecStatus, Strict
 from specshield.service.schemas.robots import RobotResponse
 from specshield.shield.uncertainty import MOST_TRANSLATION
 
@@ -131,7 +131,7 @@ class SwitchRequest(_Policies):
     )
 
 
-class SessionRule(Answer):
+class SessionRule(BaseModel):
     begins: int = Field(alias="from", description="The first step that it decides, or decided.")
     origin: int = Field(description="The step from which its windows count.")
     clock: Literal["keep", "restart"] = Field(description="As the switch said; of the first one `restart`.")
@@ -147,7 +147,7 @@ class SessionRule(Answer):
     )
 
 
-class SessionResponse(Answer):
+class SessionResponse(BaseModel):
     id: str = Field(description="For the paths below /v1/sessions.")
     policy_ids: list[str] = Field(description="Ids of its policies.")
     map_id: str = Field(description="Id of its map.")
@@ -192,6 +192,6 @@ class SessionResponse(Answer):
     )
 
 
-class SessionList(Answer):
+class SessionList(BaseModel):
     items: list[SessionResponse]
     next: str | None = Field(description="`cursor` of the next page; null on the last.")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Id, Point, Strict
+from specshield.service.schemas.base import Id, Point, Strict
 from specshield.task import MAX_REGIONS
 from specshield.world.regions import MAX_MEMBERS, MAX_VERTICES
 
@@ -77,7 +77,7 @@ Formula = Annotated[
 ]
 
 
-class MapResponse(Answer):
+class MapResponse(BaseModel):
     id: str = Field(description="Hash of the content.")
     name: str | None = Field(description="Its name, if it has one; accepted wherever an id is.")
     resolution: float = Field(description="Side of a cell [m].")
@@ -88,7 +88,7 @@ class MapResponse(Answer):
     rooms: dict[str, Region] = Field(description="Named areas; their names can be used in formulas.")
 
 
-class MapList(Answer):
+class MapList(BaseModel):
     items: list[MapResponse]
     next: str | None = Field(description="`cursor` of the next page; null on the last.")
 
@@ -102,7 +102,7 @@ class SpecRequest(Strict):
     map_id: Id | None = Field(None, description="A map, whose rooms are then names too.")
 
 
-class Window(Answer):
+class Window(BaseModel):
     operator: Literal["G", "F", "U"] = Field(description="Always, eventually or until.")
     formula: str = Field(description="The operator with what it is about.")
     begin: int = Field(description="The first step that it looks at.")
@@ -110,7 +110,7 @@ class Window(Answer):
     depth: int = Field(description="How many other windows it lies in.")
 
 
-class SpecResponse(Answer):
+class SpecResponse(BaseModel):
     formula: str = Field(description="Canonical text; it parses back to an equal formula.")
     horizon: int = Field(description="The horizon T in steps: T + 1 states decide the formula.")
     names: list[str] = Field(description="The names it uses, sorted.")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import msgspec
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from specshield.service import examples
-from specshield.service.schemas.base import Answer, Point, Pose, Poses, SpecStatus, Strict
+from specshield.service.schemas.base import Point, Pose, Poses, SpecStatus, Strict
 from specshield.service.schemas.sessions import SessionResponse, SessionRule
 
 MOST_POINTS = 2000  # of each kind, in one step
@@ -71,12 +71,12 @@ class StepBody(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     explain: bool = False
 
 
-class Residual(Answer):
+class Residual(BaseModel):
     translation: float = Field(description="In metres.")
     rotation: float = Field(description="In radians.")
 
 
-class Explanation(Answer):
+class Explanation(BaseModel):
     conjunct: str = Field(description="The part of the formula that the action's best future does not keep.")
     robustness: float | None = Field(description="Of that part on it; null: it has none.")
     late_by: int | None = Field(
@@ -89,7 +89,7 @@ class Explanation(Answer):
     )
 
 
-class StepResponse(Answer):
+class StepResponse(BaseModel):
     t: int = Field(description="The step that was decided.")
     mode: Literal["prior", "shaped", "completion", "fallback", "violated"] = Field(
         description="How `distribution` came about. `prior`: it is the model's own; the rule is settled. "
@@ -167,7 +167,7 @@ class CloseResponse(SessionResponse):
     )
 
 
-class Learned(Answer):
+class Learned(BaseModel):
     t: int = Field(description="The step before `next_t`, up to which this was learned; -1: none yet.")
     map_id: str = Field(description="Id of the map that the cells are of.")
     map_revision: int = Field(description="How often the session's own map has changed; 0: it is the map.")
@@ -175,7 +175,7 @@ class Learned(Answer):
     free: list[int] = Field(description="Cells that are occupied on the map, and were found free.")
 
 
-class TrajectoryItem(Answer):
+class TrajectoryItem(BaseModel):
     t: int = Field(description="The step.")
     pose: Pose
     signals: dict[str, float] = Field(description="The samples held at t.")
@@ -186,7 +186,7 @@ class TrajectoryItem(Answer):
     )
 
 
-class Trajectory(Answer):
+class Trajectory(BaseModel):
     items: list[TrajectoryItem]
     next: None = Field(None, description="Always null: a trajectory is one page.")
     rules: list[SessionRule] = Field(description="As in the session.")
