@@ -127,8 +127,7 @@ def serve(
     if not insecure:
         _check_exposure(host, settings)
     with contextlib.suppress(StoreError):  # a store that is away now may come
-        url = embedded.url if embedded is not None else str(settings.redis_url)
-        check_files(url, settings.files_at, settings.store_timeout)
+        check_files(settings.store_url, settings.files_at, settings.store_timeout)
     options: dict[str, Any] = {
         "host": host,
         "port": port,
@@ -269,15 +268,12 @@ def _check_exposure(host: str, settings: Settings) -> None:
 
 
 def _settings() -> Settings:
-    """The settings, and a data folder that will do. Raises InputError and StoreError."""
+    """The settings, and a data folder that will do. Raises InputError."""
     from specshield.service.library.files import check_writable
     from specshield.service.settings import read_settings
-    from specshield.service.storage.embedded import EmbeddedStore
 
     settings = read_settings()
     check_writable(settings.data_dir, "SPECSHIELD_DATA_DIR")
-    if settings.redis_url is None:
-        EmbeddedStore(settings.data_dir)  # knows how long its path may be
     return settings
 
 

@@ -210,7 +210,7 @@ def test_what_nobody_makes_says_so_and_a_worker_that_dies_as_it_starts_is_not_of
     store = EmbeddedStore(tmp_path)
     store.join()
     try:
-        jobs = Jobs(store.url, Settings(data_dir=tmp_path))
+        jobs = Jobs(Settings(data_dir=tmp_path))
         jobs.start("a" * 64, "planner")
         waiting = jobs.get("a" * 64)
         assert (waiting.status, "none is running" in waiting.error) == ("queued", True)
@@ -234,7 +234,7 @@ def test_a_worker_waits_for_work_longer_than_the_store_may_take_to_answer(tmp_pa
     store = EmbeddedStore(tmp_path)
     store.join()
     try:
-        jobs = Jobs(store.url, Settings(data_dir=tmp_path, store_timeout=0.2))
+        jobs = Jobs(Settings(data_dir=tmp_path, store_timeout=0.2))
         jobs.worker_lives(["planner"])
         worker = _Worker(store.url, jobs, ["planner"], [])
         with pytest.raises(DequeueTimeout):  # rq's word for an empty queue

@@ -172,7 +172,7 @@ def test_of_a_deletion_and_a_creation_one_wins(keyed):
 @pytest.fixture
 def claims(keyed):
     settings = Settings(data_dir=keyed.data_dir, store_timeout=30.0)
-    jobs = Jobs(f"unix://{keyed.data_dir}/store/socket", settings)
+    jobs = Jobs(settings)
     return Claims(lambda: jobs.redis, settings)
 
 

@@ -112,10 +112,10 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         embedded = EmbeddedStore(settings.data_dir)
     if embedded is not None:
         await asyncio.to_thread(embedded.join)
-    url = embedded.url if embedded is not None else str(settings.redis_url)
+    url = settings.store_url
     archive, replicas = Archive(open_objects(f"{settings.files_at}/archive")), settings.store_replicas
     store = ArchivingStore(url, settings.store_timeout, settings.session_ttl, archive, replicas)
-    mover, jobs = Mover(store, settings), Jobs(url, settings)
+    mover, jobs = Mover(store, settings), Jobs(settings)
     library = Maps(settings, Claims(lambda: jobs.redis, settings))
     known = Policies(settings, library)
     trains = settings.redis_url is None if settings.worker is None else settings.worker

@@ -15,6 +15,7 @@ from specshield import shipped
 from specshield.errors import InputError
 from specshield.service.access.site import AUTHORITY
 from specshield.service.storage.connect import FORMS, connect, is_cluster
+from specshield.service.storage.embedded import EmbeddedStore
 
 LONGEST = 24 * 3600  # [s] that a wait may be set to: timers do not take every number
 ALIKE = 0.9  # of a name's letters, by difflib: Kubernetes sets SPECSHIELD_PORT, SPECSHIELD_SERVICE_HOST...
@@ -193,6 +194,11 @@ class Settings(BaseSettings):
     def hosts(self) -> frozenset[str]:
         """`allowed_hosts`, one by one."""
         return frozenset(_listed(self.allowed_hosts))
+
+    @property
+    def store_url(self) -> str:
+        """Of the store: of the one that the server starts where none is named."""
+        return self.redis_url or EmbeddedStore(self.data_dir).url
 
     @property
     def files_at(self) -> str:

@@ -63,10 +63,9 @@ def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = 
     embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
     if embedded is not None:
         embedded.join()
-    url = embedded.url if embedded is not None else str(settings.redis_url)
 
     async def act() -> R:
-        async with aclosing(connect(url, socket_timeout=settings.store_timeout)) as store:
+        async with aclosing(connect(settings.store_url, socket_timeout=settings.store_timeout)) as store:
             return await action(Keys(store))
 
     try:

@@ -37,7 +37,6 @@ from specshield.service.schemas.base import ID
 from specshield.service.schemas.policies import Card, PolicyRequest
 from specshield.service.schemas.specs import SpecRequest
 from specshield.service.settings import Settings
-from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.training.jobs import Jobs
 from specshield.task import names_for, parse_regions, parse_signals
 from specshield.world.formats import read_map
@@ -60,7 +59,7 @@ def policies_of(settings: Settings) -> Policies:
 
 @cache
 def _maps(settings: Settings) -> Maps:
-    jobs = Jobs(settings.redis_url or EmbeddedStore(settings.data_dir).url, settings)
+    jobs = Jobs(settings)
     return Maps(settings, _Finishing(lambda: jobs.redis, settings))
 
 

@@ -43,14 +43,14 @@ class Training:
 class Jobs:
     """Every method raises StoreError where the store cannot be reached in time."""
 
-    def __init__(self, url: str, settings: Settings) -> None:
-        self._url, self._wait = url, settings.store_timeout
+    def __init__(self, settings: Settings) -> None:
         self._settings = settings
 
     @cached_property
     def redis(self) -> Any:
         """Opened when it is first asked: a cluster is asked at once for its nodes, and may be away."""
-        return connect(self._url, blocking=True, socket_timeout=self._wait)
+        settings = self._settings
+        return connect(settings.store_url, blocking=True, socket_timeout=settings.store_timeout)
 
     @cached_property
     def _write(self) -> Any:

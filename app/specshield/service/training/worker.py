@@ -41,15 +41,15 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
     failed the worker for good.
     """
     logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
-    url, held = settings.redis_url, tuple[int, ...]()
-    if url is None:
+    held = tuple[int, ...]()  # keep the embedded store running: a run that is handed back needs it
+    if settings.redis_url is None:
         embedded = EmbeddedStore(settings.data_dir)
         embedded.join()
-        url, held = embedded.url, embedded.held
-    os.environ["REDIS_URL"] = url  # for the runs, and for the second process
+        held = embedded.held
+    url = os.environ["REDIS_URL"] = settings.store_url  # for the runs, and for the second process
     with suppress(StoreError):  # rq tells of a store that is away
         check_files(url, settings.files_at, settings.store_timeout)
-    jobs = Jobs(url, settings)
+    jobs = Jobs(settings)
     if until_eof:
         at_end_of_input(lambda: os.kill(os.getpid(), signal.SIGTERM))
     methods = available()  # what is installed later is made by the next worker, whose queues include it
@@ -156,7 +156,7 @@ def train(id: str, attempt: str) -> None:
     follow_parent()
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     settings = Settings()
-    jobs = Jobs(str(settings.redis_url), settings)
+    jobs = Jobs(settings)
     cancelled = threading.Event()
 
     def live() -> None:
