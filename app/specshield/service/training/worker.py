@@ -59,12 +59,15 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
     else:
         _tell(methods)
         methods = [name for name in methods if name not in learning]
-    second = _Second(held) if (learning or others) and not learner else None
+    second: subprocess.Popen[bytes] | None = None
 
     def live() -> None:
+        nonlocal second
         jobs.worker_lives(methods)
-        if second is not None:
-            second.ensure()
+        if (learning or others) and not learner and (second is None or second.poll() is not None):
+            # It ends when this process does: its standard input is a pipe.
+            command = [sys.executable, "-m", "specshield.cli", "worker", "--until-eof", "--learner"]
+            second = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=held)
 
     with _regularly(live):
         _Worker(url, jobs, methods, others if learner else ()).work(logging_level="WARNING")
@@ -81,23 +84,6 @@ def _tell(methods: Sequence[str]) -> None:
         if name not in methods:
             modules = " and ".join(missing(method))
             log.warning("this worker makes no policies by %s: %s is not installed", name, modules)
-
-
-class _Second:
-    """The process for what takes hours. It ends when this process does: its standard input is a pipe.
-
-    held: descriptors that keep the embedded store running, so that it is there when a run is handed back.
-    """
-
-    def __init__(self, held: tuple[int, ...]) -> None:
-        self._held = held
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def ensure(self) -> None:
-        """Starts it, or starts it again."""
-        if self._process is None or self._process.poll() is not None:
-            command = [sys.executable, "-m", "specshield.cli", "worker", "--until-eof", "--learner"]
-            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, pass_fds=self._held)
 
 
 class _Worker(Worker):
