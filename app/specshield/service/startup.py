@@ -14,7 +14,6 @@ import contextlib
 import fcntl
 import gc
 import logging
-import os
 import sys
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
@@ -25,6 +24,7 @@ from specshield import compiled
 from specshield.cores import cores
 from specshield.errors import InputError, ServerError, SpecshieldError, Starting, Stopping, StoreError
 from specshield.service import warmup
+from specshield.service.storage.keeper import private
 
 # The file `ready` (`compiled.mark`) says that every kernel of a start is on the disk; `complete`, that those
 # are too which only some rules and robots need.
@@ -175,16 +175,13 @@ async def _tell() -> None:
 @asynccontextmanager
 async def _one_at_a_time(path: Path) -> AsyncIterator[None]:
     """Holds the lock of this file, which ends with the process that holds it."""
-    lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-    try:
+    with open(path, "ab", opener=private) as lock:
         while True:
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             await asyncio.sleep(CHECK_EVERY)
         yield
-    finally:
-        os.close(lock)
 
 
 def main() -> None:

@@ -63,8 +63,7 @@ class EmbeddedStore:
         self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         log = self.folder / "store.log"
         said = log.stat().st_size if log.exists() else 0
-        lock = os.open(self.folder / "start.lock", os.O_RDWR | os.O_CREAT, 0o600)
-        try:
+        with open(self.folder / "start.lock", "ab", opener=keeper.private) as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             deadline, tries = time.monotonic() + START_TIMEOUT, 0
             while not (self.joined() and self._answers()):
@@ -74,8 +73,6 @@ class EmbeddedStore:
                 if tries > TRIES or time.monotonic() > deadline:
                     raise StoreError(f"the embedded store does not start{_reason(log, said)}; see {log}")
                 time.sleep(0.005)
-        finally:
-            os.close(lock)
 
     def joined(self) -> bool:
         """Whether the keeper still listens to this process."""

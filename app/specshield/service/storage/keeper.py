@@ -19,6 +19,11 @@ LOCK = "keeper.lock"
 GRACE = 10.0  # seconds for the store to write its file out and leave
 
 
+def private(path: str, flags: int) -> int:
+    """For `open`: a file that is made is this user's alone."""
+    return os.open(path, flags, 0o600)
+
+
 def follow_parent() -> None:
     """Linux: this process is told to stop when the one that started it is gone, however it went."""
     if sys.platform == "linux":

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import fcntl
 import logging
-import os
 import subprocess
 import sys
 
@@ -15,6 +14,7 @@ from specshield.policy.methods import available
 from specshield.service.settings import Settings
 from specshield.service.startup import Startup
 from specshield.service.storage.embedded import EmbeddedStore
+from specshield.service.storage.keeper import private
 
 CHECK_EVERY = 0.25  # seconds
 log = logging.getLogger("specshield")
@@ -45,8 +45,8 @@ class TrainingWorker:
         if self._alive:
             return
         self._settings.data_dir.mkdir(parents=True, exist_ok=True)
-        lock = os.open(self._settings.data_dir / "worker.lock", os.O_RDWR | os.O_CREAT, 0o600)
-        try:
+        path = self._settings.data_dir / "worker.lock"
+        with open(path, "ab", opener=private) as lock, contextlib.suppress(BlockingIOError):
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._methods = available() if self._process is None else []
             # It ends when this process does: its standard input is a pipe from here.
@@ -54,13 +54,9 @@ class TrainingWorker:
                 [sys.executable, "-m", "specshield.cli", "worker", "--until-eof"],
                 env=self._settings.environment(),
                 stdin=subprocess.PIPE,
-                pass_fds=[lock],
+                pass_fds=[lock.fileno()],
                 start_new_session=True,
             )
-        except BlockingIOError:
-            pass
-        finally:
-            os.close(lock)
 
     def stop(self) -> None:
         if self._process is not None and self._process.stdin is not None:

@@ -19,6 +19,7 @@ import numpy as np
 from prometheus_client.metrics_core import CounterMetricFamily, HistogramMetricFamily, Metric
 
 from specshield.arrays import Floats
+from specshield.service.storage.keeper import private
 
 SIZE = 512  # cells; a page of memory
 
@@ -102,9 +103,6 @@ class Cells:
     def _map(self) -> mmap.mmap:
         if self._folder is None:
             return mmap.mmap(-1, SIZE * 8)
-        file = os.open(self._folder / f"{os.getpid()}.cells", os.O_RDWR | os.O_CREAT, 0o600)
-        try:
-            os.ftruncate(file, SIZE * 8)  # what a process of the same number left goes on
-            return mmap.mmap(file, SIZE * 8)
-        finally:
-            os.close(file)
+        with open(self._folder / f"{os.getpid()}.cells", "ab+", opener=private) as file:
+            file.truncate(SIZE * 8)  # what a process of the same number left goes on
+            return mmap.mmap(file.fileno(), SIZE * 8)
