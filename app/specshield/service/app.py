@@ -170,14 +170,13 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
 
 async def _adopt(library: Maps, known: Policies) -> None:
     """Once the store answers."""
-    waiting = True
-    while waiting:
-        waiting = False
+    while True:
         try:
             await asyncio.to_thread(library.adopt)
             await asyncio.to_thread(known.adopt)
+            break
         except StoreError:
-            waiting = True
             await asyncio.sleep(1.0)
         except SpecshieldError as error:  # no room for them, say
             log.error("maps and policies of a time before owners stay unseen: %s", error)
+            break
