@@ -97,7 +97,6 @@ def create_app(settings: Settings | None = None, embedded: EmbeddedStore | None 
     )
     for module in (pages, specs, maps, robots, policies, sessions, pictures, events, system):
         app.include_router(module.router)
-    app.include_router(events.overview)
     problems.install(app)
     app.openapi = lambda: described(app)  # type: ignore[method-assign]
     return Application(app, settings)

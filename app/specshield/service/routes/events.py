@@ -23,8 +23,7 @@ from specshield.service.sessions import chain
 from specshield.service.state import ServerState, problems
 
 EVENTS = "text/event-stream"
-router = APIRouter(prefix="/v1/sessions", tags=["sessions"])
-overview = APIRouter(tags=["sessions"])
+router = APIRouter(prefix="/v1", tags=["sessions"])
 
 
 class EventStream(Response):
@@ -63,7 +62,7 @@ EVENT = {  # of each in the stream
 
 
 @router.get(
-    "/{session_id}/events",
+    "/sessions/{session_id}/events",
     response_class=Response,
     summary="Watch a session",
     responses={
@@ -97,44 +96,8 @@ async def events(
     return Response(status_code=204) if stream is None else EventStream(stream)
 
 
-MOST_SESSIONS = 64  # of one stream; chosen by hand: a page of more is not read
-PLACE = rf"^{ID}(:(-1|[0-9]{{1,7}}))?$"
-Places = Annotated[
-    list[Annotated[str, Field(pattern=PLACE)]],
-    Query(
-        min_length=1,
-        max_length=MOST_SESSIONS,
-        openapi_examples={"example": {"value": [f"{examples.SESSION['id']}:-1"]}},
-        description="Ids of sessions; `id:41` begins after step 41, `id:-1` with the first, `id` now.",
-    ),
-]
-
-
-@overview.get(
-    "/v1/events",
-    response_class=Response,
-    summary="Watch several sessions",
-    responses={
-        200: {
-            "content": {EVENTS: {"schema": EVENT}},
-            "description": "Server-sent events: `data` is `session`, `t`, `pose`, `logits`, `decision`, as "
-            "in a trajectory; the last one of a session is `session`, `finished` and `spec_status`.",
-        },
-        **problems(_429="The server has no room for more streams."),
-    },
-)
-async def several(server: ServerState, owner: Owner, session: Places) -> Response:
-    """What several robots do, in one stream: what a page needs to show them on one floor.
-
-    Sessions that are not there are left out. The stream ends when all of them are over.
-    """
-    asked = (place.partition(":") for place in session)
-    after = {scoped(owner, id): int(t) if t else None for id, _, t in asked}
-    return EventStream(await server.watchers.open_all(after))
-
-
 @router.get(
-    "/{session_id}/record",
+    "/sessions/{session_id}/record",
     response_class=Response,
     summary="Read the record",
     responses={
@@ -154,3 +117,39 @@ async def read_record(key: SessionKey, session_id: PathId, server: ServerState) 
     name = f'attachment; filename="{session_id}.record"'
     headers = {"Content-Disposition": name, "X-Record-Seal": seal}
     return Response(content, media_type=chain.MEDIA_TYPE, headers=headers)
+
+
+MOST_SESSIONS = 64  # of one stream; chosen by hand: a page of more is not read
+PLACE = rf"^{ID}(:(-1|[0-9]{{1,7}}))?$"
+Places = Annotated[
+    list[Annotated[str, Field(pattern=PLACE)]],
+    Query(
+        min_length=1,
+        max_length=MOST_SESSIONS,
+        openapi_examples={"example": {"value": [f"{examples.SESSION['id']}:-1"]}},
+        description="Ids of sessions; `id:41` begins after step 41, `id:-1` with the first, `id` now.",
+    ),
+]
+
+
+@router.get(
+    "/events",
+    response_class=Response,
+    summary="Watch several sessions",
+    responses={
+        200: {
+            "content": {EVENTS: {"schema": EVENT}},
+            "description": "Server-sent events: `data` is `session`, `t`, `pose`, `logits`, `decision`, as "
+            "in a trajectory; the last one of a session is `session`, `finished` and `spec_status`.",
+        },
+        **problems(_429="The server has no room for more streams."),
+    },
+)
+async def several(server: ServerState, owner: Owner, session: Places) -> Response:
+    """What several robots do, in one stream: what a page needs to show them on one floor.
+
+    Sessions that are not there are left out. The stream ends when all of them are over.
+    """
+    asked = (place.partition(":") for place in session)
+    after = {scoped(owner, id): int(t) if t else None for id, _, t in asked}
+    return EventStream(await server.watchers.open_all(after))
