@@ -134,8 +134,8 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
 
 def check_policy(settings: Settings, content: Content, owner: str) -> tuple[Record, str | None]:
     """What is asked for, once it is checked, and what it is to be called; nothing is kept."""
-    body = parse(REQUEST, _bytes(content)).model_dump(exclude_unset=True)
-    asked = PolicyRequest(**body)
+    asked = parse(REQUEST, _bytes(content))
+    body = asked.model_dump(exclude_unset=True)
     method = METHODS.get(asked.method)
     options = read_options(method.options, asked.options)
     robot, settled = body.get("robot", "stretch"), options_to_json(options)
