@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from contextlib import aclosing
+from contextlib import ExitStack, aclosing
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
@@ -60,16 +60,14 @@ def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = 
     from specshield.service.storage.embedded import EmbeddedStore
 
     settings = settings or read_settings()
-    embedded = EmbeddedStore(settings.data_dir) if settings.redis_url is None else None
-    if embedded is not None:
-        embedded.join()
 
     async def act() -> R:
         async with aclosing(connect(settings.store_url, socket_timeout=settings.store_timeout)) as store:
             return await action(Keys(store))
 
-    try:
+    with ExitStack() as opened:
+        if settings.redis_url is None:
+            embedded = EmbeddedStore(settings.data_dir)
+            embedded.join()
+            opened.callback(embedded.leave)
         return asyncio.run(act())
-    finally:
-        if embedded is not None:
-            embedded.leave()
