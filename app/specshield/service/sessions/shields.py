@@ -46,9 +46,7 @@ class Shields:
 
     def slow(self, session: Session) -> bool:
         """Whether its decisions take long. A session with a preference stays where that is prepared."""
-        if session.config["shaping"] != PROJECTION:
-            return False
-        return self.slow_policies(session.config["policy_ids"])
+        return session.config["shaping"] == PROJECTION and self.slow_policies(session.config["policy_ids"])
 
     def slow_policies(self, policy_ids: Sequence[str]) -> bool:
         key = tuple(policy_ids)
