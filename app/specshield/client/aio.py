@@ -18,7 +18,7 @@ from specshield.client.models import Decision, Page
 from specshield.client.resources import Maps, Policies, Sessions, Specs, performing
 from specshield.client.state import SessionState
 from specshield.client.stream import AsyncStreams, packed
-from specshield.client.transport import STALE, Exchange, address, check_open, headers
+from specshield.client.transport import STALE, Exchange, address, headers
 from specshield.client.wire import Failure, Reply, Request, seconds_value
 
 
@@ -74,8 +74,7 @@ class AsyncShieldClient:
             return cast(T, stop.value)
 
     async def _perform(self, request: Request, ends: float) -> Reply | Failure:
-        check_open(self._http)
-        exchange = Exchange(request, self._http.base_url, self._timeout, ends)
+        exchange = Exchange(request, self._http, self._timeout, ends)
         if exchange.seconds <= 0.0:
             return exchange.failure(httpx.PoolTimeout(""))
         if self._streams is not None:

@@ -17,7 +17,7 @@ from specshield.client.models import Decision, Page
 from specshield.client.resources import Maps, Policies, Sessions, Specs, performing
 from specshield.client.state import SessionState
 from specshield.client.stream import SyncStreams, packed
-from specshield.client.transport import STALE, Exchange, address, check_open, headers
+from specshield.client.transport import STALE, Exchange, address, headers
 from specshield.client.wire import Failure, Reply, Request, seconds_value
 
 
@@ -81,8 +81,7 @@ class ShieldClient:
             return cast(T, stop.value)
 
     def _perform(self, request: Request, ends: float) -> Reply | Failure:
-        check_open(self._http)
-        exchange = Exchange(request, self._http.base_url, self._timeout, ends)
+        exchange = Exchange(request, self._http, self._timeout, ends)
         if exchange.seconds <= 0.0:
             return exchange.failure(httpx.PoolTimeout(""))
         if self._streams is not None:

@@ -46,11 +46,16 @@ def headers(api_key: str | None) -> dict[str, str]:
 class Exchange:
     """One try: what httpx is to send, and what is made of that which comes back, in the time there is.
 
-    timeout: the client's. ends: of the call, on the clock of time.monotonic().
+    timeout: the client's. ends: of the call, on the clock of time.monotonic(). Raises TransportError where
+    the client is closed.
     """
 
-    def __init__(self, request: Request, base_url: httpx.URL, timeout: float, ends: float) -> None:
-        self.request, self.began, self._ends, self._base_url = request, time.monotonic(), ends, base_url
+    def __init__(
+        self, request: Request, http: httpx.Client | httpx.AsyncClient, timeout: float, ends: float
+    ) -> None:
+        if http.is_closed:
+            raise TransportError("the client is closed", expected="a client that is still open")
+        self.request, self.began, self._ends, self._base_url = request, time.monotonic(), ends, http.base_url
         self._allowed = max(timeout, PREPARING) if request.slow else timeout
         self.seconds = min(self._allowed, ends - self.began)  # what this try has; none if not above 0
         self.ends = self.began + self.seconds
@@ -123,8 +128,3 @@ class Exchange:
             )
         mapped.__cause__ = error
         return Failure(mapped, *self._taken())
-
-
-def check_open(http: httpx.Client | httpx.AsyncClient) -> None:
-    if http.is_closed:
-        raise TransportError("the client is closed", expected="a client that is still open")
