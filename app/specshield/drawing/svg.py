@@ -82,7 +82,8 @@ class Plan:
         for name, region in self._task.regions.items():
             kind = "avoid" if is_avoided(self._task.formula, name) else "visit"
             self._parts.append(f'<g class="region {kind}" stroke-width="{2 * self._unit:g}">')
-            self._parts += [self._shape(member) for member in _members(region)]
+            members = region.members if isinstance(region, Union) else (region,)
+            self._parts += [self._shape(member) for member in members]
             (left, low), (right, _) = (end(outlines(region)[0], axis=0) for end in (np.min, np.max))
             x, y = self._at(float(left + right) / 2, float(low))  # below its first part
             self._parts.append(
@@ -167,7 +168,3 @@ class Plan:
             f'<image x="{x:g}" y="{y:g}" width="{wide:g}" height="{high:g}" {more} '
             f'style="image-rendering:pixelated" href="data:image/png;base64,{data}"/>'
         )
-
-
-def _members(region: Region) -> Sequence[Region]:
-    return region.members if isinstance(region, Union) else (region,)
