@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import from_json
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import create_form_parser
@@ -41,15 +41,12 @@ from specshield.service.training.jobs import Jobs
 from specshield.task import names_for, parse_regions, parse_signals
 from specshield.world.formats import read_map
 
-T = TypeVar("T")
+M = TypeVar("M", bound=BaseModel)
 Content = bytes | Path  # a body, or the file that it is in
 FILES = "map_server"  # the format of a map sent as files that do not say which it is
 PARTS = {"weights": "policy.safetensors", "card": "card.json"}
 MOST_PARTS = 16  # of a multipart body
 MOST_WINDOWS = 100  # shown of a formula
-REQUEST = TypeAdapter(PolicyRequest)
-CARD = TypeAdapter(Card)
-SPEC = TypeAdapter(SpecRequest)
 
 
 @cache
@@ -113,7 +110,7 @@ def add_policy(settings: Settings, content_type: str, content: Content, key: Key
     if (got := len(files["card"])) > (limit := settings.max_body_bytes):
         expected = f"at most {limit} bytes"
         raise BodyTooLarge("the card is too large", path="card", got=got, expected=expected, limit=limit)
-    card = parse(CARD, files["card"], "card").model_dump(exclude_unset=True)
+    card = parse(Card, files["card"], "card").model_dump(exclude_unset=True)
     for path, number in _numbers(card, "card"):
         if not math.isfinite(number):
             raise PolicyError("not a finite number", path=path, got=number, expected="a finite number")
@@ -134,7 +131,7 @@ def _numbers(value: Any, path: str) -> Iterator[tuple[str, float]]:
 
 def check_policy(settings: Settings, content: Content, owner: str) -> tuple[Record, str | None]:
     """What is asked for, once it is checked, and what it is to be called; nothing is kept."""
-    asked = parse(REQUEST, _bytes(content))
+    asked = parse(PolicyRequest, _bytes(content))
     body = asked.model_dump(exclude_unset=True)
     method = METHODS.get(asked.method)
     options = read_options(method.options, asked.options)
@@ -159,7 +156,7 @@ def check_spec(settings: Settings, content: bytes, owner: str) -> dict[str, Any]
 
 def explain(maps: Maps, settings: Settings, content: bytes, owner: str) -> dict[str, Any]:
     """What a formula means, as the contract shows it."""
-    request = parse(SPEC, content)
+    request = parse(SpecRequest, content)
     body = request.model_dump()
     regions = parse_regions(body["regions"] or {})
     signals = parse_signals(body["signals"] or {}, regions)
@@ -236,11 +233,11 @@ def _object(content: bytes) -> dict[str, Any]:
     return members
 
 
-def parse(adapter: TypeAdapter[T], content: bytes, below: str = "") -> T:
+def parse(model: type[M], content: bytes, below: str = "") -> M:
     """`content` as JSON of this shape. Raises InputError, its path below `below`."""
     content = content.removeprefix(codecs.BOM_UTF8)  # that some editors and shells write
     try:
-        return adapter.validate_json(content)
+        return model.model_validate_json(content)
     except ValidationError as invalid:
         found = [{**item, "loc": ("body", *item["loc"])} for item in invalid.errors(include_url=False)]
         body = None if found[0]["type"] == "json_invalid" else from_json(content)
