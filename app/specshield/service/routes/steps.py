@@ -37,12 +37,10 @@ class StepRoute:
             return
         scope["route"], scope["path_params"] = ROUTE, {"session_id": found[1]}
         headers = dict(scope["headers"])
-        message = await receive()  # bounds/bodies.py gives the body in one piece
-        if message["type"] != "http.request":  # the caller has gone
-            return
+        body = (await receive())["body"]  # in one piece, and of a caller who is there: bounds/bodies.py
         try:
             packed = headers.get(b"content-type", b"").lower().startswith(PACKED)
-            request = read_step(message["body"], packed)
+            request = read_step(body, packed)
             server: Server = scope["app"].state.server
             key = scoped(scope["state"]["owner"], found[1])
             answer = await server.sessions.steps.decide(key, request, scope["state"]["timing"])
