@@ -26,10 +26,3 @@ from specshield.stl.formula import (
 )
 from specshield.stl.parser import parse
 from specshield.stl.robustness import SATISFIED_ABOVE, Verdict, robustness, robustness_bounds, verdict
-
-__all__ = [
-    "BODY_WORDS", "SATISFIED_ABOVE", "Abs", "Always", "And", "Arithmetic", "Atom", "Comparison",
-    "Eventually", "Formula", "Implies", "Name", "Neg", "Node", "Not", "Number", "Or", "Term",
-    "Until", "Verdict", "body_name", "conjuncts", "is_name", "parse", "region_named",
-    "robustness", "robustness_bounds", "verdict",
-]  # fmt: skip
