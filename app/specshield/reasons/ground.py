@@ -18,7 +18,8 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.robot.dynamics import Body, displacements
 from specshield.stl import And, Atom, Comparison, Formula, Not, Or
-from specshield.stl.formula import Abs, Arithmetic, Name, Neg, Number, Term
+from specshield.stl.robustness import difference
+from specshield.stl.terms import interval
 from specshield.task import Task
 from specshield.world.regions import area_distance, pack_areas
 
@@ -75,12 +76,10 @@ class Ground:
             case Not(child):
                 low, high = self._rho(child, frozenset(), beyond)
                 return self._unless(child in kept, -high, -low)
-            case Atom(name):
-                return self._unless(Not(predicate) in kept, *self._read(name, beyond))
-            case Comparison(op, left, right):
-                a, b = self._term(left, beyond), self._term(right, beyond)
-                low, high = (a[0] - b[1], a[1] - b[0]) if op.startswith(">") else (b[0] - a[1], b[1] - a[0])
-                return self._unless(Not(predicate) in kept, _known(low, -np.inf), _known(high, np.inf))
+            case Atom() | Comparison():
+                ends = interval(difference(predicate), lambda name: self._read(name, beyond))
+                low, high = (np.broadcast_to(end, self.free.shape) for end in ends)
+                return self._unless(Not(predicate) in kept, low, high)
         return np.full(self.free.shape, -np.inf), np.full(self.free.shape, np.inf)
 
     def _unless(self, contradicted: bool, low: Floats, high: Floats) -> Interval:
@@ -102,22 +101,6 @@ class Ground:
         else:
             value, wide = np.full(self.free.shape, self.values[name]), 0.0
         return value - wide, value + wide
-
-    def _term(self, term: Term, beyond: float) -> Interval:
-        match term:
-            case Number(value):
-                return np.full(self.free.shape, value), np.full(self.free.shape, value)
-            case Name(name):
-                return self._read(name, beyond)
-            case Neg(child):
-                low, high = self._term(child, beyond)
-                return -high, -low
-            case Abs(child):
-                low, high = self._term(child, beyond)
-                return np.maximum(np.maximum(low, -high), 0.0), np.maximum(high, -low)
-            case Arithmetic(op, left, right):
-                return _arithmetic(op, self._term(left, beyond), self._term(right, beyond))
-        raise TypeError(f"not a term: {term!r}")
 
     def ways_to(self, goal: Bools, free: Bools) -> Floats:
         """The length [m] of the shortest way from each square to some square of `goal`, through squares that
@@ -144,27 +127,6 @@ def make_ground(task: Task, body: Body, values: dict[str, float]) -> Ground:
     moves, turns = displacements(body)
     travel = float((np.abs(moves) + np.abs(turns) * math.hypot(*task.robot.offset)).max())
     return Ground(task, side, free, centres, side * math.sqrt(0.5), travel, values)
-
-
-def _arithmetic(op: str, a: Interval, b: Interval) -> Interval:
-    with np.errstate(all="ignore"):
-        if op == "+":
-            low, high = a[0] + b[0], a[1] + b[1]
-        elif op == "-":
-            low, high = a[0] - b[1], a[1] - b[0]
-        else:
-            ends = [x * y if op == "*" else x / y for x in a for y in b]
-            low, high = np.minimum.reduce(ends), np.maximum.reduce(ends)
-            if op == "/":
-                through = (b[0] <= 0.0) & (b[1] >= 0.0)
-                low, high = np.where(through, -np.inf, low), np.where(through, np.inf, high)
-    return _known(low, -np.inf), _known(high, np.inf)
-
-
-def _known(bound: Floats, otherwise: float) -> Floats:
-    """NaN says nothing of that end."""
-    found: Floats = np.where(np.isnan(bound), otherwise, bound)
-    return found
 
 
 @kernel

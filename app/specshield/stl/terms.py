@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from functools import reduce
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from specshield.arrays import Floats
 from specshield.errors import SampleError
 from specshield.stl.formula import Abs, Arithmetic, Name, Neg, Node, Number, Term
 
+Interval: TypeAlias = tuple[Any, Any]  # the lower and the upper bound
 _ARITHMETIC = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}
 
 
@@ -52,30 +53,32 @@ def may_fail(node: Node) -> bool:
     return isinstance(node, Arithmetic) or any(map(may_fail, node.parts))
 
 
-def interval(term: Term) -> tuple[float, float]:
-    """Bounds on the term's value if every name may be any real number (interval arithmetic)."""
+@np.errstate(all="ignore")
+def interval(term: Term, read: Callable[[str], Interval] = lambda name: (-np.inf, np.inf)) -> Interval:
+    """Bounds on the term's value by interval arithmetic, as numbers or arrays, where `read` gives those on a
+    name; unless it is given, every name may be any real number.
+    """
     match term:
         case Number(number):
             return number, number
-        case Name():
-            return -math.inf, math.inf
+        case Name(name):
+            return read(name)
         case Neg(child):
-            lo, hi = interval(child)
-            return -hi, -lo
+            low, high = interval(child, read)
+            return -high, -low
         case Abs(child):
-            lo, hi = interval(child)
-            return max(0.0, lo, -hi), max(hi, -lo)
+            low, high = interval(child, read)
+            return np.maximum(np.maximum(low, -high), 0.0), np.maximum(high, -low)
         case Arithmetic(op, left, right):
-            a, b = interval(left), interval(right)
-            if op == "/" and b[0] <= 0.0 <= b[1]:
-                return -math.inf, math.inf
+            (a, b), (c, d) = interval(left, read), interval(right, read)
             if op in "+-":
-                c = b if op == "+" else (-b[1], -b[0])
-                lo, hi = a[0] + c[0], a[1] + c[1]
+                low, high = (a + c, b + d) if op == "+" else (a - d, b - c)
                 # inf - inf is NaN. It takes a sum that overflows, so nothing is known of that end.
-                return -math.inf if math.isnan(lo) else lo, math.inf if math.isnan(hi) else hi
+                return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
             # Samples are finite, so 0 * inf is 0. inf / inf lies between 0 and inf, which are ends as well.
-            ends = [x * y if op == "*" else x / y for x in a for y in b]
-            ends = [0.0 if math.isnan(end) else end for end in ends]
-            return min(ends), max(ends)
+            ends = [_ARITHMETIC[op](x, y) for x in (a, b) for y in (c, d)]
+            ends = [np.where(np.isnan(end), 0.0, end) for end in ends]
+            unknown = (op == "/") & (c <= 0.0) & (d >= 0.0)
+            low, high = reduce(np.minimum, ends), reduce(np.maximum, ends)
+            return np.where(unknown, -np.inf, low), np.where(unknown, np.inf, high)
     raise TypeError(f"not a term: {term!r}")
