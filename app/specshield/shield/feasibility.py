@@ -205,7 +205,8 @@ def _simulate_and_rate(
                 slot = _slot(x, y, theta, m, met.shape[0])
                 g, j = met[slot] // steps, met[slot] % steps
                 before = poses[g, j - 1] if j > 0 else pose
-                if met[slot] >= 0 and motions[g, j] == m and _is_pose(before, x, y, theta):
+                same = before[0] == x and before[1] == y and before[2] == theta  # to the last bit
+                if met[slot] >= 0 and motions[g, j] == m and same:
                     x, y, theta = poses[g, j, 0], poses[g, j, 1], poses[g, j, 2]
                 else:
                     x, y, theta = step(body, x, y, theta, m)
@@ -230,12 +231,6 @@ def _slot(x: float, y: float, theta: float, motion: int, slots: int) -> int:
     """The slot for a motion from a pose: a hash (Teschner et al., 2003); `slots` is a power of two."""
     key = int(1e7 * x) * 73856093 ^ int(1e7 * y) * 19349663 ^ int(1e7 * theta) * 83492791 ^ motion * 40503
     return (key ^ key >> 17) & (slots - 1)
-
-
-@inlined
-def _is_pose(pose: Floats, x: float, y: float, theta: float) -> bool:
-    """Whether it is the same to the last bit."""
-    return bool(pose[0] == x and pose[1] == y and pose[2] == theta)
 
 
 class Best(NamedTuple):
