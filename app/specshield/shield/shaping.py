@@ -81,11 +81,8 @@ def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats | None, float]:
 
     None where it ends for certain.
     """
-    ending, kept = 0.0, log_prior.copy()
-    for a in range(len(kept)):
-        if terminal[a]:
-            ending = min(ending + np.exp(kept[a]), 1.0)  # a sum may be rounded up
-            kept[a] = -np.inf
+    ending = min(np.sum(np.exp(log_prior[terminal])), 1.0)  # a sum may be rounded up
+    kept = np.where(terminal, -np.inf, log_prior)
     if np.max(kept) == -np.inf:
         return None, ending
     return log_softmax(kept), ending
@@ -94,11 +91,7 @@ def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats | None, float]:
 @kernel
 def with_ending(body: Floats, log_prior: Floats, ending: float, terminal: Bools) -> Floats:
     """`body`, for if the model does not end, with the prior's own mass on what ends its task. Shapes (A,)."""
-    whole = (1.0 - ending) * body
-    for a in range(len(whole)):
-        if terminal[a]:
-            whole[a] = np.exp(log_prior[a])
-    return whole
+    return np.where(terminal, np.exp(log_prior), (1.0 - ending) * body)
 
 
 @kernel
