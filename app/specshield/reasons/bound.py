@@ -108,10 +108,7 @@ class _Ahead(NamedTuple):
         that were met on the way, one bit a goal. Added to `limiting`: guards that some pose breaks; to
         `soonest` [goals]: the first step at which each goal's place is reached, in its window or not.
         """
-        count = motion_count(self.body)
-        nexts = np.empty((len(poses), count, 3))
-        spread(self.body, poses, nexts)
-        further, also = nexts.reshape(-1, 3), np.repeat(met, count)
+        further, also = spread(self.body, poses), np.repeat(met, motion_count(self.body))
         keys = np.column_stack(
             [
                 np.round(SAME * further[:, :2]),

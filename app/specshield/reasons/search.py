@@ -92,10 +92,8 @@ def search(
             run, seen = np.zeros((len(ids), len(goals)), np.int64), np.empty(0, np.int64)
             chosen = _best(goals, ground, poses, met, run, step - 1, width)
             ids, poses, met, run = ids[chosen], poses[chosen], met[chosen], run[chosen]
-        nexts = np.empty((len(poses), count, 3))
-        spread(body, poses, nexts)
         parent, motion = np.repeat(ids, count), np.tile(np.arange(count), len(ids))
-        poses, met, run = nexts.reshape(-1, 3), np.repeat(met, count), np.repeat(run, count, axis=0)
+        poses, met, run = spread(body, poses), np.repeat(met, count), np.repeat(run, count, axis=0)
         keep = _kept(known, guards, poses, step)
         poses, met, run, parent, motion = poses[keep], met[keep].copy(), run[keep], parent[keep], motion[keep]
         waiting = np.zeros(len(poses), np.bool_)

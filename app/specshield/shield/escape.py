@@ -95,9 +95,7 @@ def _rows(layer: Layer, which: NDArray[Any]) -> Layer:
 def _expand(body: Body, layer: Layer) -> Layer:
     """Every motion from every pose. Of poses that are alike, one is kept for each first motion."""
     count = motion_count(body)
-    nexts = np.empty((len(layer.pose), count, 3))
-    spread(body, layer.pose, nexts)
-    pose = nexts.reshape(-1, 3)
+    pose = spread(body, layer.pose)
     motion, parent = np.tile(np.arange(count), len(layer.pose)), np.repeat(np.arange(len(layer.pose)), count)
     root = motion if layer.motion[0] < 0 else layer.root[parent]
     _, once = np.unique(np.column_stack([root, np.rint(POSES_A_METRE * pose)]), axis=0, return_index=True)
@@ -106,10 +104,12 @@ def _expand(body: Body, layer: Layer) -> Layer:
 
 
 @kernel
-def spread(body: Body, poses: Floats, out: Floats) -> None:
-    """Where each motion leads from each pose: poses (n, 3), out (n, M, 3)."""
+def spread(body: Body, poses: Floats) -> Floats:
+    """Where each motion leads from each of poses (n, 3): from one pose after the other, (n M, 3)."""
+    out = np.empty((poses.shape[0], motion_count(body), 3))
     for i in range(poses.shape[0]):
         successors(body, poses[i], out[i])
+    return out.reshape(-1, 3)
 
 
 def holding(prefix: Prefix, formulas: Sequence[Always], poses: Floats, t: int) -> Floats:
