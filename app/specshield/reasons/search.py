@@ -43,25 +43,19 @@ class Wanted(NamedTuple):
 
 @dataclass
 class _Tree:
-    """What was reached: of each node its pose, step, parent and the motion that led there."""
+    """What was reached: of each node its step, its parent and the motion that led there."""
 
-    pose: list[Floats] = field(default_factory=list)
-    step: list[Ints] = field(default_factory=list)
-    parent: list[Ints] = field(default_factory=list)
-    motion: list[Ints] = field(default_factory=list)
+    rows: list[tuple[Ints, Ints, Ints]] = field(default_factory=list)
     size: int = 0
 
-    def add(self, pose: Floats, step: int, parent: Ints, motion: Ints) -> Ints:
-        self.pose.append(pose)
-        self.step.append(np.full(len(pose), step))
-        self.parent.append(parent)
-        self.motion.append(motion)
-        self.size += len(pose)
-        return np.arange(self.size - len(pose), self.size)
+    def add(self, step: int, parent: Ints, motion: Ints) -> Ints:
+        self.rows.append((np.full(len(parent), step), parent, motion))
+        self.size += len(parent)
+        return np.arange(self.size - len(parent), self.size)
 
     def way(self, node: int, wait: int) -> list[int]:
         """The motions to a node; where time passed between two nodes the robot waited."""
-        step, parent, motion = (np.concatenate(each) for each in (self.step, self.parent, self.motion))
+        step, parent, motion = (np.concatenate(each) for each in zip(*self.rows, strict=True))
         back: list[int] = []
         while parent[node] >= 0:
             before = int(parent[node])
@@ -82,7 +76,7 @@ def search(
     width = max(1, min(WIDTH, MOST_MOTIONS // count))
     stays = [k for k, goal in enumerate(goals) if goal.need.stay > 0]
     events = {goal.need.first for goal in goals} | {s for g in guards for s in (g.first, g.end + 1)}
-    ids = tree.add(known.history[-1:], now, np.array([-1]), np.array([-1]))
+    ids = tree.add(now, np.array([-1]), np.array([-1]))
     poses, met, run = known.history[-1:], np.zeros(1, np.int64), np.zeros((1, len(goals)), np.int64)
     pool: list[tuple[Ints, Floats, Ints]] = []
     seen = np.empty(0, np.int64)
@@ -107,7 +101,7 @@ def search(
             poses, met, run, parent, motion = poses[keep], met[keep], run[keep], parent[keep], motion[keep]
             waiting = waiting[keep]
         if (met == every).any():
-            node = int(tree.add(poses, step, parent, motion)[np.argmax(met == every)])
+            node = int(tree.add(step, parent, motion)[np.argmax(met == every)])
             return np.array(tree.way(node, wait) + [wait] * (until - step), np.int64)
         key = _key(poses, met, run[:, stays])
         _, first = np.unique(key, return_index=True)
@@ -117,7 +111,7 @@ def search(
         if not len(chosen) and not any(event > step for event in events):
             return None
         poses, met, run = poses[chosen], met[chosen], run[chosen]
-        ids = tree.add(poses, step, parent[chosen], motion[chosen])
+        ids = tree.add(step, parent[chosen], motion[chosen])
         pool.append((ids, poses, met))
         seen = np.concatenate([seen, key[chosen]])
         if tree.size > MOST_NODES:

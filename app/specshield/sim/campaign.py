@@ -37,7 +37,6 @@ class Campaign(NamedTuple):
     """
 
     case: Case
-    seed: int
     shielded: list[Episode]
     unshielded: list[Episode]
     refused: int
@@ -79,7 +78,7 @@ def run(
         pairs[i] = pair
         on_progress(len(pairs))
     shielded, unshielded, refused = zip(*(pairs[i] for i in range(runs)), strict=True)
-    return Campaign(load_case(case), seed, list(shielded), list(unshielded), sum(refused))
+    return Campaign(load_case(case), list(shielded), list(unshielded), sum(refused))
 
 
 def each_done(futures: Iterable[Future[T]]) -> Iterator[tuple[int, T]]:

@@ -30,7 +30,6 @@ class Episode:
 
     case: str
     seed: int
-    shielded: bool
     start: Pose
     spec_status: str = "pending"
     robustness: tuple[float | None, float | None] = (None, None)
@@ -68,7 +67,7 @@ class Episode:
 
 def with_shield(session: Session, case: Case, model: FoundationModel, start: Pose, seed: int) -> Episode:
     """The model proposes, the service decides, the robot executes; `session` has just begun at `start`."""
-    episode, robot = Episode(case.name, seed, True, start), SimulatedRobot(case, start)
+    episode, robot = Episode(case.name, seed, start), SimulatedRobot(case, start)
     episode.session = session.id
     model.reset(np.random.default_rng([seed, 0]))
     with session:
@@ -102,7 +101,7 @@ def without_shield(
 
     The verdict is the service's: the poses are recorded into a session that decides nothing.
     """
-    episode, robot = Episode(case.name, seed, False, start), SimulatedRobot(case, start)
+    episode, robot = Episode(case.name, seed, start), SimulatedRobot(case, start)
     model.reset(np.random.default_rng([seed, 0]))
     random = np.random.default_rng([seed, 1])
     terminal = case.task.robot.terminal
