@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,8 +12,7 @@ LIMIT = 1e8  # [m] beyond any map; a float64 still tells 1e-7 m apart there
 
 def number(value: Any, path: str, low: float = -LIMIT, high: float = LIMIT) -> float:
     """`value` as a float in [low, high]. Booleans, strings, NaN and infinities are errors."""
-    wrong_type = isinstance(value, bool) or not isinstance(value, int | float)
-    if wrong_type or not low <= value <= high or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
         raise wrong("number", path, value, f"a number from {low:g} to {high:g}")
     return float(value)
 

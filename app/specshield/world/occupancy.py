@@ -152,8 +152,6 @@ def _squared_half_cells(occupied: Bools) -> Floats:
             if occupied[i, j]:
                 last = j
             along[i + 1, j] = max(2 * (j - last) - 1, 0)
-            if occupied[i, j]:
-                along[i + 1, j] = 0
         last = w
         for j in range(w - 1, -1, -1):
             if occupied[i, j]:

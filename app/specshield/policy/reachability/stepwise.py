@@ -90,7 +90,6 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
         pattern |= holds[k].astype(np.int64) << k
     patterns, of = np.unique(pattern[used], return_inverse=True)
     of = of.reshape(-1, lattice.headings)
-    always = sum(1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS))
     bits = np.zeros((horizon + 1, len(of), lattice.headings, -(-states // 8)), np.uint8)
     valid: Bytes = lattice.valid[used]
     last: Bytes | None = None
@@ -100,7 +99,7 @@ def feasible_steps(lattice: Lattice, rules: Rules, holds: Bytes, horizon: int, r
             1 << int(k) for k in np.flatnonzero(rules.kind == ALWAYS) if rules.a[k] <= t <= rules.b[k]
         )
         after = np.array([transitions(rules, t, int(p)) for p in patterns], np.int64).reshape(-1, states)
-        after[(patterns & asked & always) != asked] = BROKEN_STATE
+        after[(patterns & asked) != asked] = BROKEN_STATE
         before = np.zeros_like(bits[t])
         _before(bits[t], valid, of, after, before)
         if t > 0:
