@@ -91,12 +91,9 @@ def arrive(rules: Rules, t: int, x: float, y: float, theta: float, state: State)
 @leaf
 def outcome(status: Int8s) -> int:
     """BROKEN if any obligation is, SETTLED if all are, else PENDING."""
-    settled = True
-    for k in range(status.shape[0]):
-        if status[k] == BROKEN:
-            return BROKEN
-        settled = settled and status[k] == SETTLED
-    return SETTLED if settled else PENDING
+    if BROKEN in status:
+        return BROKEN
+    return PENDING if PENDING in status else SETTLED
 
 
 @inlined

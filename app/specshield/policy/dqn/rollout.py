@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from specshield.arrays import Bools, Floats, Int8s, Ints
+from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import copy_ways, find_sibling, find_twins, is_same_pose, join
 from specshield.policy.dqn.network import Layers, Network, greedy, make_layers
@@ -24,14 +24,6 @@ def _begin(rules: Rules, now: Present, state: State) -> None:
 
 
 @leaf
-def _is_pending(status: Int8s) -> bool:
-    pending = False
-    for k in range(status.shape[0]):
-        pending = pending or status[k] == PENDING
-    return pending
-
-
-@leaf
 def _follow(
     scene: Scene, net: Network, layers: Layers, t: int, first: int, state: State, motions: Ints, poses: Floats
 ) -> int:
@@ -46,7 +38,7 @@ def _follow(
         if k == 0 and first >= 0:
             motion = first
             x, y, theta = step(scene.body, state.pose[0], state.pose[1], state.pose[2], first)
-        elif scene.wait >= 0 and not _is_pending(state.status):
+        elif scene.wait >= 0 and PENDING not in state.status:
             _stay(state, k, scene.wait, motions, poses)
             break
         else:

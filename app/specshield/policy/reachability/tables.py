@@ -207,10 +207,7 @@ def goals_settled(rules: Rules, status: Int8s) -> bool:
 
 @inlined
 def is_broken(status: Int8s) -> bool:
-    broken = False
-    for k in range(status.shape[0]):
-        broken = broken or status[k] == BROKEN
-    return broken
+    return BROKEN in status
 
 
 @inlined
