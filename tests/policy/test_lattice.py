@@ -20,9 +20,9 @@ from specshield.policy.lattice import (
     leads_back,
     make_lattice,
     pose_of,
-    read_corners,
 )
 from specshield.policy.planner.fields import OUT_OF_REACH, UNREACHED, Fields, to_go
+from specshield.policy.reachability.tables import HOPELESS, latest_at
 from specshield.policy.shape import heading_count
 from specshield.robot import STRETCH
 from specshield.robot.dynamics import make_body
@@ -79,7 +79,8 @@ CODES = np.array([[1, 65], [129, 193], [257, INVALID]], np.uint16)  # of two hea
 def steps_at(v, u, h):
     """As the tables and the planner's fields have it, whose codes begin at 1 and at 0."""
     corners = Corners(np.empty(4, np.int64), np.empty(4))
-    found = read_corners(corners, find_corners(CELLS, v, u, corners), CODES, np.inf, h)
+    found = latest_at(CODES, corners, find_corners(CELLS, v, u, corners), h)
+    found = np.inf if found == HOPELESS else found
     codes = np.where(CODES == INVALID, INVALID, CODES - 1).astype(np.uint16)
     assert to_go(Fields(CELLS, codes[None], 1.0), 0, v, u, h) == found
     return found

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from specshield.arrays import Bools, Bytes, Codes, Floats, Int32s, Ints, Singles
+from specshield.arrays import Bools, Bytes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.progress import Rules
 from specshield.policy.progress.values import fill_place, fill_signals, region_count
@@ -158,27 +158,6 @@ def find_corners(cell: Int32s, v: float, u: float, corners: Corners) -> int:
         corners.row[found], corners.weight[found] = cell[j, i], across
         found += 1
     return found
-
-
-@inlined
-def read_corners(corners: Corners, count: int, code: Codes, nothing: float, h: float) -> float:
-    """A table of steps at the first `count` of the corners about a place: linear in x, y and heading over
-    those that are valid. Codes [cells, H] are 1 + STEP_CODES * steps, or INVALID. nothing: the result where
-    none is valid.
-    """
-    low, high, f = beside(h, code.shape[1])
-    total, weights = 0.0, 0.0
-    for n in range(count):
-        row, across = corners.row[n], corners.weight[n]
-        w, found = across * (1.0 - f), code[row, low]
-        if w >= 1e-9 and found != INVALID:
-            total += w * (int(found) - 1.0)
-            weights += w
-        w, found = across * f, code[row, high]
-        if w >= 1e-9 and found != INVALID:
-            total += w * (int(found) - 1.0)
-            weights += w
-    return total / (STEP_CODES * weights) if weights > 1e-6 else nothing
 
 
 @inlined

@@ -9,13 +9,15 @@ import numpy as np
 from specshield.arrays import Bytes, Codes, Floats, Int8s, Int32s, Ints
 from specshield.compiled import inlined, leaf
 from specshield.policy.lattice import (
+    INVALID,
+    STEP_CODES,
     Corners,
+    beside,
     coordinates,
     coordinates_ahead,
     find_corners,
     heading_after,
     leads_back,
-    read_corners,
 )
 from specshield.policy.progress import ALWAYS, BROKEN, EVENTUALLY_ALWAYS, PENDING, SETTLED, Rules
 from specshield.robot.dynamics import Body, displacement
@@ -85,9 +87,23 @@ class Scratch(NamedTuple):
 
 
 @inlined
-def latest_at(tables: Tables, table: int, corners: Corners, count: int, h: float) -> float:
-    """L at the first `count` of the corners about a place, HOPELESS where none is valid."""
-    return read_corners(corners, count, tables.code[table], HOPELESS, h)
+def latest_at(code: Codes, corners: Corners, count: int, h: float) -> float:
+    """L at the first `count` of the corners about a place: linear in x, y and heading over those that are
+    valid, HOPELESS where none is. code [cells, H]: of a table.
+    """
+    low, high, f = beside(h, code.shape[1])
+    total, weights = 0.0, 0.0
+    for n in range(count):
+        row, across = corners.row[n], corners.weight[n]
+        w, found = across * (1.0 - f), code[row, low]
+        if w >= 1e-9 and found != INVALID:
+            total += w * (int(found) - 1.0)
+            weights += w
+        w, found = across * f, code[row, high]
+        if w >= 1e-9 and found != INVALID:
+            total += w * (int(found) - 1.0)
+            weights += w
+    return total / (STEP_CODES * weights) if weights > 1e-6 else HOPELESS
 
 
 @inlined
@@ -180,7 +196,7 @@ def _slack_with(tables: Tables, mask: int, t: int, corners: Corners, count: int,
     if _nothing_left(tables, t, mask):
         return float(tables.end[-1] - (t + tables.early))
     table = tables.table[tables.phase[t], mask]
-    return latest_at(tables, table, corners, count, h) - (t + tables.early) if table >= 0 else HOPELESS
+    return latest_at(tables.code[table], corners, count, h) - (t + tables.early) if table >= 0 else HOPELESS
 
 
 @inlined
@@ -238,10 +254,10 @@ def score(
         d, angle = displacement(body, m)
         w = heading_after(headings, h, angle)
         if d == 0.0:
-            scores[m] = latest_at(tables, table, scratch.corners, count, w)
+            scores[m] = latest_at(tables.code[table], scratch.corners, count, w)
         else:
             there = find_corners(tables.cell, v + d * dv, u + d * du, scratch.ahead)
-            scores[m] = latest_at(tables, table, scratch.ahead, there, w)
+            scores[m] = latest_at(tables.code[table], scratch.ahead, there, w)
     spare = _after_dwells(guide, mask, t, scratch.corners, count, h, scratch)
     scores[wait] = max(scores[wait], spare + (t + tables.early) + 1.0)
     return count
