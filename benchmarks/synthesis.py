@@ -80,18 +80,18 @@ def _sb3(case: Case, rate: float, minutes: float, seed: int) -> list[list[float]
     from stable_baselines3.common.callbacks import BaseCallback
 
     practice = Environment(case.task, 1, seed)
-    inputs, outputs = practice.observations.shape[1], len(case.task.robot.motions)
+    inputs, outputs = practice.robots.observation.shape[1], len(case.task.robot.motions)
 
     class Practice(gymnasium.Env[np.ndarray, np.int64]):
         observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
         action_space = gymnasium.spaces.Discrete(outputs)
 
         def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
-            return practice.observations[0].copy(), {}  # an episode that ends begins anew at once
+            return practice.robots.observation[0].copy(), {}  # an episode that ends begins anew at once
 
         def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
             rewards, ended = practice.step(np.array([action]))
-            return practice.observations[0].copy(), float(rewards[0]), bool(ended[0]), False, {}
+            return practice.robots.observation[0].copy(), float(rewards[0]), bool(ended[0]), False, {}
 
     poses = free_poses(case.task, practice.scene.body, STARTS, np.random.default_rng(0))
     curve: list[list[float]] = []

@@ -65,7 +65,7 @@ def test_observations_are_finite_and_bounded(robot):
     least, most = np.inf, -np.inf
     for _ in range(150):
         environment.step(random.integers(0, len(robot.motions), 128))
-        observations = environment.observations
+        observations = environment.robots.observation
         assert np.isfinite(observations).all()
         least, most = min(least, observations.min()), max(most, observations.max())
     assert -2.0 <= least < most <= 2.5

@@ -42,7 +42,7 @@ class Robots(NamedTuple):
     status: Int8s  # [N, K]
     run: Ints  # [N, K]
     nexts: Floats  # [N, M, 3]
-    observation: Singles  # [N, F]
+    observation: Singles  # [N, F] what each one sees now
 
 
 class Environment:
@@ -64,11 +64,6 @@ class Environment:
             observation=np.zeros((count, inputs), dtype=np.float32),
         )
         self.step(np.zeros(count, dtype=np.int64))
-
-    @property
-    def observations(self) -> Singles:
-        """What each robot sees now, (N, F)."""
-        return self.robots.observation
 
     def step(self, motions: Ints) -> tuple[Singles, Bools]:
         """Each robot takes its motion, (N,). Returns the rewards (N,) and which episodes ended (N,).

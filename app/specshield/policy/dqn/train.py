@@ -150,7 +150,7 @@ class Training:
         self.task, self.settings = task, settings
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.environment = Environment(task, settings.robots, seed, literal=settings.reward == "paper")
-        self.inputs, self.outputs = self.environment.observations.shape[1], len(task.robot.motions)
+        self.inputs, self.outputs = self.environment.robots.observation.shape[1], len(task.robot.motions)
         self.random = np.random.default_rng([seed, 2])
         # One core is for the robots. A thread that waits for a core spins: forty times slower at worst.
         torch.set_num_threads(max(cores() - 1, 1))
@@ -172,7 +172,7 @@ class Training:
 
     def advance(self, stepper: ThreadPoolExecutor) -> bool:
         """All robots step while the network learns from earlier steps. False while those are too few."""
-        observation = self.environment.observations.copy()
+        observation = self.environment.robots.observation.copy()
         with torch.no_grad():
             motion = self.q_network(torch.from_numpy(observation).to(self.device)).argmax(1).cpu().numpy()
         explore = self.random.random(len(motion)) < self.epsilon
