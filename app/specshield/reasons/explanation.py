@@ -128,7 +128,7 @@ class _Motion:
             order = (KEEPS_ALL if whole else KEPT), late or 0
             return order, Explanation(str(parts[i]), float(rho[i]), late, detail)
         i = int(np.argmin(rho))
-        late = late_by(parts[i], row, self.prefix.t, SATISFIED_ABOVE) if len(failing) == 1 else None
+        late = late_by(parts[i], row, self.prefix.t) if len(failing) == 1 else None
         told = Explanation(str(parts[i]), float(rho[i]), late, self.fails(parts, i, rho, row, late))
         if late is not None:
             return (LATE, late), told
@@ -164,7 +164,7 @@ class _Motion:
         reserve = dict(zip(parts, early, strict=False)).get(part, 0)
         asked = later(part, -reserve) if reserve else None
         if asked is not None and float(values_of(asked, row)) <= SATISFIED_ABOVE:
-            late = late_by(asked, row, self.prefix.t, SATISFIED_ABOVE)
+            late = late_by(asked, row, self.prefix.t)
             if late is not None:
                 return late, (
                     f"a way was found after it that keeps the rule, but none with the {steps(reserve)} in "

@@ -35,16 +35,16 @@ def values_of(formula: Formula, samples: Mapping[str, Floats]) -> Floats:
         return np.full(some.shape[:-1], -np.inf)
 
 
-def late_by(part: Formula, samples: Mapping[str, Floats], now: int, above: float) -> int | None:
-    """The fewest steps later that the window of an F or U would have to end for its rho to be above `above`,
-    or that of a G over a place to be in to begin; None where no later one that the samples [m] reach would
-    do, or the G has begun by step `now`.
+def late_by(part: Formula, samples: Mapping[str, Floats], now: int) -> int | None:
+    """The fewest steps later that the window of an F or U would have to end for it to be satisfied, or that
+    of a G over a place to be in to begin; None where no later one that the samples [m] reach would do, or the
+    G has begun by step `now`.
     """
     if later(part, 1) is None or not may_be_late(part, samples, now):
         return None
 
     def kept(late: int) -> bool:
-        return float(values_of(later(part, late) or part, samples)) > above
+        return float(values_of(later(part, late) or part, samples)) > SATISFIED_ABOVE
 
     low, high = 0, min(len(values) for values in samples.values()) - 1 - part.horizon
     if isinstance(part, Always) and is_predicate(part.child):

@@ -130,7 +130,7 @@ class _Gathered:
 def _late(part: Formula, samples: Mapping[str, Floats], now: int) -> float:
     if float(values_of(part, samples)) > SATISFIED_ABOVE:
         return 0.0
-    late = late_by(part, samples, now, SATISFIED_ABOVE)
+    late = late_by(part, samples, now)
     return np.inf if late is None else float(late)
 
 

@@ -42,7 +42,7 @@ class Rules(NamedTuple):
     margin: float  # an obligation holds where its predicate's robustness is above this
 
 
-def make_rules(task: Task, margin: float = 0.0) -> Rules:
+def make_rules(task: Task) -> Rules:
     """Compiles the task's formula. Raises FragmentError outside the paper's fragment or MAX_OBLIGATIONS."""
     parts = obligations(task.formula)
     if len(parts) > MAX_OBLIGATIONS:
@@ -51,7 +51,7 @@ def make_rules(task: Task, margin: float = 0.0) -> Rules:
     rows = [(KINDS[p.kind], p.a, p.b, p.c1, p.c2, p.c1 + p.b) for p in parts]
     kind, a, b, c1, c2, last = np.array(rows, np.int64).reshape(-1, 6).T.copy()
     programs = compile_predicates([part.predicate for part in parts], places(task))
-    return Rules(kind, a, b, c1, c2, last, programs, regions_of(task), initial_signals(task), margin)
+    return Rules(kind, a, b, c1, c2, last, programs, regions_of(task), initial_signals(task), 0.0)
 
 
 def goals_of(rules: Rules) -> Ints:
