@@ -14,8 +14,8 @@ import numpy as np
 
 from specshield.arrays import Bools, Floats, Int8s, Ints
 from specshield.compiled import inlined, kernel
-from specshield.policy.progress import ALWAYS, PENDING, SETTLED, Rules, advance
-from specshield.policy.reachability.guide import copy_progress, due, predicate_at, read_due
+from specshield.policy.progress import ALWAYS, PENDING, SETTLED, Rules
+from specshield.policy.reachability.guide import copy_progress, due, predicate_at, update_progress
 from specshield.policy.reachability.tables import UNKNOWN, Guide, Scratch, is_broken, slack_at
 from specshield.policy.tree import is_new, make_tree, pop, push, put, trace
 from specshield.robot.dynamics import around, motion_count, step_from
@@ -74,8 +74,7 @@ def finish(
             if x == x0 and y == y0 and theta == theta0:
                 continue
             copy_progress(tree.status[here], tree.run[here], scratch.status, scratch.run)
-            read_due(rules, now, x, y, theta, scratch)
-            advance(rules, now, scratch.predicates, scratch.status, scratch.run)
+            update_progress(rules, now, x, y, theta, scratch)
             if is_broken(scratch.status):
                 continue
             left = slack_at(guide, x, y, theta, now, scratch, scratch.corners, UNKNOWN)
