@@ -15,8 +15,9 @@ from specshield.lookahead.desirability import UNKEEPABLE, desirability
 from specshield.lookahead.goals import Goals
 from specshield.lookahead.lattice import Planes, is_blocked
 from specshield.lookahead.surrogate import follow, price_left, step_price
-from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, value_count
+from specshield.policy.progress import ALWAYS, Rules, read_predicates, value_count
 from specshield.robot.dynamics import Body, step
+from specshield.stl.program import STACK_SIZE
 
 DEPTH = 2  # exact steps before the lattice is asked; chosen by hand, nothing measured
 
@@ -50,7 +51,7 @@ def expand_all(
         start[d + 1] = start[d] + motions**d
     pose, settled = np.empty((start[-1], 3)), np.full(start[-1], -1)
     blocked = np.zeros((start[-1], motions), np.bool_)
-    values, stack, read = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
+    values, stack, read = np.empty(value_count(rules)), np.empty(STACK_SIZE), np.empty(rules.kind.shape[0])
     pose[0], settled[0] = pose_t, mask
     for d in range(levels):
         for n in range(start[d], start[d + 1]):

@@ -16,7 +16,6 @@ from specshield.policy.progress import (
     EVENTUALLY_ALWAYS,
     PENDING,
     SETTLED,
-    STACK,
     Rules,
     goals_of,
     read_predicates,
@@ -27,6 +26,7 @@ from specshield.policy.reachability.tables import Guide, Tables, slack
 from specshield.policy.shape import heading_count
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
+from specshield.stl.program import STACK_SIZE
 
 COARSE_PITCH = 0.4  # [m] as fine as the stand-ins deserve; chosen by hand, nothing measured
 MOST_HEADINGS = 24  # one for each 15 degrees; chosen by hand, nothing measured
@@ -175,7 +175,7 @@ def blocked_at(body: Body, x: float, y: float, theta: float) -> Bools:
 def _survey(body: Body, rules: Rules, planes: Planes) -> None:
     """Where poses are free, which motions are, and which predicates hold."""
     headings, cells = planes.valid.shape
-    values, stack, read = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
+    values, stack, read = np.empty(value_count(rules)), np.empty(STACK_SIZE), np.empty(rules.kind.shape[0])
     for h in range(headings):
         for c in range(cells):
             x, y, theta = pose_at(body, planes, h, c)

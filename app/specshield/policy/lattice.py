@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from specshield.arrays import Bools, Bytes, Floats, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.policy.progress import Rules
-from specshield.policy.progress.values import fill_place, fill_signals, region_count
+from specshield.policy.progress.values import fill_place, fill_signals
 from specshield.policy.shape import heading_count, side_of
 from specshield.robot.dynamics import (
     TOUCH,
@@ -259,7 +259,7 @@ def values_at(
     ny, nx, headings = lattice.valid.shape
     count = programs.starts.shape[0] - 1
     out = np.full((count, ny, nx, headings), -np.inf, np.float32)
-    values = np.empty(REGIONS + region_count(regions) + signals.shape[0])
+    values = np.empty(REGIONS + regions.plain.shape[0] + signals.shape[0])
     stack, read = np.empty(STACK_SIZE), np.empty(count)
     turns_matter = reads_heading(programs, regions)
     fill_signals(regions, signals, values)

@@ -16,7 +16,6 @@ from specshield.policy.progress import (
     EVENTUALLY_ALWAYS,
     PENDING,
     SETTLED,
-    STACK,
     Rules,
     advance,
     read_predicates,
@@ -24,7 +23,7 @@ from specshield.policy.progress import (
 )
 from specshield.robot.dynamics import Body, displacement, motion_count
 from specshield.rule.values import fill_pose, fill_region
-from specshield.stl.program import evaluate_packed
+from specshield.stl.program import STACK_SIZE, evaluate_packed
 
 GLOBAL, PER_GOAL, PER_ALWAYS, PER_MOTION = 5, 10, 2, 3  # entries of an observation
 
@@ -69,7 +68,7 @@ def make_state(scene: Scene, inputs: int) -> State:
         np.empty((motion_count(scene.body), 3)),
         np.empty(inputs, np.float32),
         np.empty(value_count(scene.rules)),
-        np.empty(STACK),
+        np.empty(STACK_SIZE),
         np.empty(count),
     )
 

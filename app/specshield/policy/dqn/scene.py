@@ -17,7 +17,6 @@ from specshield.policy.geodesic import geodesic_distance
 from specshield.policy.progress import (
     ALWAYS,
     PENDING,
-    STACK,
     Rules,
     goals_of,
     make_rules,
@@ -26,7 +25,7 @@ from specshield.policy.progress import (
 )
 from specshield.robot.dynamics import Body, longest_motions, make_body
 from specshield.rule.values import HEADING, REGIONS
-from specshield.stl.program import VALUE
+from specshield.stl.program import STACK_SIZE, VALUE
 from specshield.task import Task
 
 # The networks that are shipped were trained with these, which were chosen by hand; nothing was measured.
@@ -99,7 +98,7 @@ def _filled(distance: Floats, resolution: float) -> Floats:
 def predicates_at(rules: Rules, poses: Floats) -> Floats:
     """The robustness of each obligation's predicate at each of poses (N, 3). Shape (N, K)."""
     out = np.empty((poses.shape[0], rules.kind.shape[0]))
-    values, stack = np.empty(value_count(rules)), np.empty(STACK)
+    values, stack = np.empty(value_count(rules)), np.empty(STACK_SIZE)
     for n in range(poses.shape[0]):
         read_predicates(rules, poses[n, 0], poses[n, 1], poses[n, 2], values, stack, out[n])
     return out

@@ -12,7 +12,7 @@ from specshield.policy.planner.due_dates import foresee, is_open, make_bounds, r
 from specshield.policy.planner.exact import search_exactly
 from specshield.policy.planner.search import MAX_DEPTH, Nodes, search, value
 from specshield.policy.planner.way import Way, World, move, read_at, stay
-from specshield.policy.progress.values import fill_signals, region_count
+from specshield.policy.progress.values import fill_signals
 from specshield.policy.undo import IMPOSSIBLE, undo_motion
 from specshield.robot.dynamics import motion_count
 from specshield.rule.values import REGIONS
@@ -27,7 +27,7 @@ SHARE, IN_VAIN, USUAL_MOTIONS, GOLDEN = 0.25, 16.0, 7, 0.618
 def make_way(world: World, t: int, steps: int, signals: Floats) -> Way:
     """Room for a way of so many steps from x_t, with the signals (S,) at what they are held at."""
     literals, size = world.literals, world.literals.formula.tree.size
-    values = np.zeros(REGIONS + region_count(literals.formula.regions) + signals.shape[0])
+    values = np.zeros(REGIONS + literals.formula.regions.plain.shape[0] + signals.shape[0])
     fill_signals(literals.formula.regions, signals, values)
     stack, held = np.empty(STACK_SIZE), np.empty(literals.leaf.shape[0])
     read_signals(literals, values, stack, held)

@@ -24,7 +24,6 @@ EVENTUALLY, ALWAYS, EVENTUALLY_ALWAYS = 0, 1, 2
 KINDS = {"eventually": EVENTUALLY, "always": ALWAYS, "eventually_always": EVENTUALLY_ALWAYS}
 PENDING, SETTLED, BROKEN = 0, 1, 2
 MAX_OBLIGATIONS = 8
-STACK = STACK_SIZE
 
 
 class Rules(NamedTuple):
@@ -61,7 +60,7 @@ def goals_of(rules: Rules) -> Ints:
 
 @leaf
 def value_count(rules: Rules) -> int:
-    return int(REGIONS + rules.regions.starts.shape[0] - 1 + rules.signals.shape[0])
+    return int(REGIONS + rules.regions.plain.shape[0] + rules.signals.shape[0])
 
 
 @leaf
@@ -114,7 +113,7 @@ def replay(rules: Rules, past: float, poses: Floats, signals: Floats) -> tuple[I
     """
     count = rules.kind.shape[0]
     status, run = np.full(count, PENDING, np.int8), np.zeros(count, np.int64)
-    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK), np.empty(count)
+    values, stack, predicates = np.empty(value_count(rules)), np.empty(STACK_SIZE), np.empty(count)
     for t in range(poses.shape[0]):
         copy_row(signals[t], rules.signals)
         read_predicates(rules, poses[t, 0], poses[t, 1], poses[t, 2], values, stack, predicates)

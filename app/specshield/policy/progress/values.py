@@ -17,21 +17,16 @@ def initial_signals(task: Task) -> Floats:
 
 
 @inlined
-def region_count(regions: PackedRegions) -> int:
-    return int(regions.starts.shape[0] - 1)
-
-
-@inlined
 def fill_place(regions: PackedRegions, x: float, y: float, theta: float, values: Floats) -> None:
     """The pose and every region; the signals are left as they are."""
     fill_pose(x, y, theta, values)
-    for r in range(region_count(regions)):
+    for r in range(regions.plain.shape[0]):
         fill_region(regions, r, values)
 
 
 @inlined
 def fill_signals(regions: PackedRegions, signals: Floats, values: Floats) -> None:
     """signals (S,)."""
-    first = REGIONS + region_count(regions)
+    first = REGIONS + regions.plain.shape[0]
     for s in range(signals.shape[0]):
         values[first + s] = signals[s]

@@ -12,16 +12,14 @@ from specshield.policy.progress import (
     EVENTUALLY,
     EVENTUALLY_ALWAYS,
     PENDING,
-    STACK,
     Rules,
     advance,
     value_count,
 )
 from specshield.policy.progress.recall import Past, recall
-from specshield.policy.progress.values import region_count
 from specshield.policy.reachability.tables import Guide, Scratch, Tables, goals_settled, slack
 from specshield.rule.values import REGIONS, fill_pose, fill_region
-from specshield.stl.program import VALUE, evaluate_packed
+from specshield.stl.program import STACK_SIZE, VALUE, evaluate_packed
 
 # [steps] of slack: how late an earlier deadline may seem for a way to be looked for. Of 8,200 first motions
 # that came later by the tables, 63 had a way, and 474 of 1,100 others (docs/decisions.md).
@@ -33,7 +31,7 @@ def make_scratch(rules: Rules, motions: int) -> Scratch:
     k = rules.kind.shape[0]
     return Scratch(
         values=np.empty(value_count(rules)),
-        stack=np.empty(STACK),
+        stack=np.empty(STACK_SIZE),
         predicates=np.empty(k),
         scores=np.empty(motions),
         status=np.empty(k, np.int8),
@@ -56,7 +54,7 @@ def predicate_at(rules: Rules, k: int, x: float, y: float, theta: float, scratch
     """The robustness of one obligation's predicate at a pose: only the regions that it names are measured."""
     values = scratch.values
     fill_pose(x, y, theta, values)
-    programs, first_signal = rules.programs, REGIONS + region_count(rules.regions)
+    programs, first_signal = rules.programs, REGIONS + rules.regions.plain.shape[0]
     for i in range(programs.starts[k], programs.starts[k + 1]):
         if programs.ops[i] == VALUE:
             place = int(programs.args[i])

@@ -16,11 +16,10 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Floats, pooled
 from specshield.compiled import kernel
 from specshield.policy.lattice import Lattice, pose_of
-from specshield.policy.progress import ALWAYS, STACK, Rules, read_predicates, value_count
-from specshield.policy.progress.values import region_count
+from specshield.policy.progress import ALWAYS, Rules, read_predicates, value_count
 from specshield.robot.dynamics import Body
 from specshield.rule.values import HEADING, REGIONS
-from specshield.stl.program import VALUE
+from specshield.stl.program import STACK_SIZE, VALUE
 
 # Chosen by hand. A crossing is at most 0.71 cells from any place.
 BESIDE = 0.75  # [cells] by which a place may be missed
@@ -69,7 +68,7 @@ def reads(rules: Rules, k: int) -> tuple[bool, bool, bool]:
     """Whether predicate k reads the place; its heading; areas that turn with the robot."""
     code = slice(int(rules.programs.starts[k]), int(rules.programs.starts[k + 1]))
     read = rules.programs.args[code][rules.programs.ops[code] == VALUE].astype(int)
-    areas = [p - REGIONS for p in read if REGIONS <= p < REGIONS + region_count(rules.regions)]
+    areas = [p - REGIONS for p in read if REGIONS <= p < REGIONS + len(rules.regions.plain)]
     place = bool(areas) or bool(np.any(read < HEADING))
     return place, bool(np.any(read == HEADING)), bool(np.any(rules.regions.carried[areas, :2] != 0.0))
 
@@ -93,7 +92,7 @@ def look(
     headings: of the whole lattice; spread: those that are looked at about each, as shares of the way to the
     next.
     """
-    values, stack, out = np.empty(value_count(rules)), np.empty(STACK), np.empty(rules.kind.shape[0])
+    values, stack, out = np.empty(value_count(rules)), np.empty(STACK_SIZE), np.empty(rules.kind.shape[0])
     for j in range(outer.shape[0]):
         for i in range(outer.shape[1]):
             if not free[j, i]:
