@@ -243,15 +243,19 @@ class Best(NamedTuple):
     row: Ints
 
 
-@kernel
-def best_of(motions: Ints, values: Floats, count: int) -> Best:
-    """The future of each of `count` motions with the highest of `values` (N,), the lowest row on ties.
+def best_of(tried: Futures, values: Floats, motions: int) -> Best:
+    """The future of each motion with the highest of `values` (N,), the lowest row on ties."""
+    best = Best(np.empty(motions), np.empty(motions, np.int64))
+    best_rows(tried.motions, values, best)
+    return best
 
-    motions [N, T - t]: as in `Futures`.
-    """
-    best = Best(np.full(count, -np.inf), np.full(count, -1))
+
+@kernel
+def best_rows(motions: Ints, values: Floats, best: Best) -> None:
+    """Writes `best_of`."""
+    best.row[:] = -1
+    best.robustness[:] = -np.inf
     for f in range(motions.shape[0]):
         m = motions[f, 0]
         if best.row[m] < 0 or values[f] > best.robustness[m]:
             best.row[m], best.robustness[m] = f, values[f]
-    return best

@@ -77,12 +77,12 @@ def judge(shield: Shield, now: Situation) -> Judged:
     if violated:
         tried, part = _left(shield, prefix, tried)
         kept, leaves = rho_of(part, tried.poses)
-    best, left_out = best_of(tried.motions, kept, motions), np.zeros(motions, np.bool_)
+    best, left_out = best_of(tried, kept, motions), np.zeros(motions, np.bool_)
     if care.barred is not None:
         others = _aside(shield, care.barred, prefix, tried, kept)
         vain = others.max() <= SATISFIED_ABOVE
         if not vain:
-            without_it = best_of(tried.motions, others, motions)
+            without_it = best_of(tried, others, motions)
             left_out = (best.robustness > SATISFIED_ABOVE) & (without_it.robustness <= SATISFIED_ABOVE)
             kept, best = others, without_it
     follows, had = recovers(shield.config) and tail is not None and len(tail) == prefix.steps, None
@@ -94,7 +94,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
             none = aim(shield, care, part, tried, kept, leaves, follows)
             roomy, had = (True, had) if had.slack >= none.slack else (False, none)
         kept = apart if roomy else kept
-        best = best_of(tried.motions, kept, motions)
+        best = best_of(tried, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and best.robustness.max() > SATISFIED_ABOVE):
@@ -114,7 +114,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
                     kept = _aside(shield, care.barred, prefix, tried, kept)
                 kept = _with_room(shield, prefix, tried, kept) if roomy else kept
                 aimed = aim(shield, care, part, tried, kept, tried.leaves, follows, before)
-                values = best_of(tried.motions, kept, motions).robustness
+                values = best_of(tried, kept, motions).robustness
         best, feasible = aimed.best, aimed.kept
     some, first = True in feasible.tolist(), tried.preferred
     if violated and recovers(shield.config):
@@ -171,7 +171,7 @@ def without(judged: Judged, shield: Shield, doubtful: Bools, risky: Bools) -> Ju
     if not sure.any():
         sure = judged.feasible_motion & ~risky
     if not sure.any():
-        keeps = best_of(judged.tried.motions, judged.kept, len(risky))
+        keeps = best_of(judged.tried, judged.kept, len(risky))
         sure = (keeps.robustness > SATISFIED_ABOVE) & ~doubtful
         if sure.any():
             rho = np.where(keeps.row >= 0, judged.tried.rho[keeps.row], -np.inf)

@@ -16,7 +16,7 @@ from specshield.arrays import Bools, Floats, Ints
 from specshield.compiled import kernel
 from specshield.rule.early import Conjuncts, conjunction_of, find_open, rate_open
 from specshield.shield.decision import Shield
-from specshield.shield.feasibility import Best, Futures, Prefix, best_of, rho_of
+from specshield.shield.feasibility import Best, Futures, Prefix, best_rows, rho_of
 from specshield.shield.uncertainty import Care, Noise, slack_for
 from specshield.stl import SATISFIED_ABOVE
 from specshield.stl.tree import ALWAYS, EVENTUALLY
@@ -64,27 +64,30 @@ def aim(
         _, leaves = rho_of(prefix, tried.poses)
     count, motions = len(parts.kind), len(task.robot.motions)
     early, due = np.zeros((2, count), np.int64)
-    still = np.empty(count, np.bool_)
-    now = Open(parts, still, early, due, prefix.t, leaves, whole, tried.motions, motions, follows)
+    still, best = np.empty(count, np.bool_), Best(np.empty(motions), np.empty(motions, np.int64))
+    now = Open(parts, still, early, due, prefix.t, leaves, whole, tried.motions, follows)
     asking = care.noise, care.stride, care.least, care.chance
-    best = _best_asked(now, prefix.known, asking, margin)
+    had = _best_asked(now, prefix.known, asking, margin, best) > margin
+
+    def at(early: Ints) -> tuple[Best, bool]:
+        best = Best(np.empty(motions), np.empty(motions, np.int64))
+        return best, _best_open(now, early, margin, best) > margin
+
     if before is not None:
         margin = min(margin, SATISFIED_ABOVE + before.margin)
-        best = _best_open(now, before.early, margin)
+        best, _ = at(before.early)
         return before._replace(best=best, kept=best.robustness > margin)
-    if not max(best.robustness.tolist()) > margin:
+    if not had:
         early = np.zeros(count, np.int64)
-        best = _best_open(now, early, margin)
-        highest = float(best.robustness.max())
-        if not highest > margin:  # nor the margin: ask for all that can be had of it, and for slack beside
-            margin = max(float(np.nextafter(highest, -np.inf)), SATISFIED_ABOVE)
+        best, had = at(early)
+        if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
+            margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
         for of in (early == 0, *(np.arange(count) == k for k in np.argsort(now.due, kind="stable"))):
             low, high = int(early[of].max()), int(now.asked[of].max()) + 1
             while high - low > 1:
                 middle = (low + high) // 2
                 more = np.where(of, np.minimum(now.asked, middle), early)
-                tighter = _best_open(now, more, margin)
-                had = bool(tighter.robustness.max() > margin)
+                tighter, had = at(more)
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
     margin_had, slack = margin - SATISFIED_ABOVE, int(early[now.due.argmin()])
@@ -95,7 +98,7 @@ def aim(
 
 class Open(NamedTuple):
     """The conjuncts at step t: which are still open (K,), how early each is asked for (K,), and in how many
-    steps it is due (K,), NEVER where it is not. number: of the robot's motions. The rest is as in `aim`.
+    steps it is due (K,), NEVER where it is not. The rest is as in `aim`.
     """
 
     parts: Conjuncts
@@ -106,14 +109,15 @@ class Open(NamedTuple):
     leaves: Floats
     whole: Floats
     motions: Ints
-    number: int
     follows: bool
 
 
 @kernel
-def _best_asked(now: Open, known: Floats, care: tuple[Noise, float, int, float], margin: float) -> Best:
-    """Fills in `still`, `asked` and `due` of `now`, whose `asked` is 0; `_best_open` for what is asked. care:
-    its noise, stride, least and chance. A window keeps half its length.
+def _best_asked(
+    now: Open, known: Floats, care: tuple[Noise, float, int, float], margin: float, best: Best
+) -> float:
+    """Fills in `still`, `asked` and `due` of `now`, whose `asked` is 0, and then writes as `_best_open` does
+    for what is asked. care: its noise, stride, least and chance. A window keeps half its length.
     """
     parts, still, asked, due, t = now[:5]
     noise, stride, least, chance = care
@@ -126,16 +130,17 @@ def _best_asked(now: Open, known: Floats, care: tuple[Noise, float, int, float],
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             due[k] = left
-            # What an earlier step asks for, and is still open, is due first.
             for i in range(parts.a[k], min(t, parts.b[k]) + 1 if parts.kind[k] == ALWAYS else 0):
-                if not low[parts.at[k] - parts.a[k] + i] > SATISFIED_ABOVE:
+                if (
+                    not low[parts.at[k] - parts.a[k] + i] > SATISFIED_ABOVE
+                ):  # what step i asks for is due first
                     due[k] = min(due[k], i + parts.horizon[k] - t)
-    return _best_open(now, asked, margin)
+    return _best_open(now, asked, margin, best)
 
 
 @kernel
-def _best_open(now: Open, early: Ints, margin: float) -> Best:
-    """The best future of each motion by what is open.
+def _best_open(now: Open, early: Ints, margin: float, best: Best) -> float:
+    """Writes the best future of each motion by what is open, and its robustness; the highest of them.
 
     The way that the robot is on stays its motion's future (`row`) where it keeps enough, though another may
     be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
@@ -143,7 +148,7 @@ def _best_open(now: Open, early: Ints, margin: float) -> Best:
     rho = np.empty(now.whole.shape[0])
     rate_open(now.parts, now.still, now.t, early, now.leaves, rho)
     rho[~(now.whole > SATISFIED_ABOVE)] = -np.inf
-    best = best_of(now.motions, rho, now.number)
+    best_rows(now.motions, rho, best)
     if now.follows and rho[0] > margin:
         best.row[now.motions[0, 0]] = 0
-    return best
+    return float(best.robustness.max())
