@@ -130,10 +130,9 @@ def _best_asked(
                 left = min(left, max(parts.a[k] - t, 1) + parts.horizon[k])
             asked[k] = half if least >= half else min(slack_for(noise, stride, left, chance, least), half)
             due[k] = left
+            # What an earlier step asks for, and is still open, is due first.
             for i in range(parts.a[k], min(t, parts.b[k]) + 1 if parts.kind[k] == ALWAYS else 0):
-                if (
-                    not low[parts.at[k] - parts.a[k] + i] > SATISFIED_ABOVE
-                ):  # what step i asks for is due first
+                if not low[parts.at[k] - parts.a[k] + i] > SATISFIED_ABOVE:
                     due[k] = min(due[k], i + parts.horizon[k] - t)
     return _best_open(now, asked, margin, best)
 
