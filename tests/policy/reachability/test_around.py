@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from specshield.policy.progress import PENDING, SETTLED, make_rules
-from specshield.policy.reachability.around.field import distances, goal_cells, spare_on
-from specshield.policy.reachability.around.search import _slot_of
+from specshield.policy.progress.recall import pasts
+from specshield.policy.reachability.around.field import NO_FIELDS, distances, goal_cells, spare_on
+from specshield.policy.reachability.around.search import GAVE_UP, NO_WAY, POSES, _slot_of, go_around
 from specshield.policy.reachability.policy import synthesise
 from specshield.policy.reachability.tables import Guide
 from specshield.policy.tree import make_tree
@@ -172,8 +173,31 @@ def test_distances_lead_through_the_door_that_is_open():
     # From (0.7, 1.5) over the upper door, about (2.05, 2.75), to East's corner (3.1, 1.9).
     over = np.hypot(2.05 - 0.7, 2.75 - 1.5) + np.hypot(3.1 - 2.05, 2.75 - 1.9)
     status = np.array([PENDING, PENDING], np.int8)
-    spare = spare_on(guide, fields, 0.2, 0.7, 1.5, 0.0, 10, status)
+    spare, most = spare_on(guide, fields, 0.2, 0.7, 1.5, 0.0, 10, status)
     assert spare == pytest.approx(60 - 10 - over / 0.2, abs=2.0)
-    assert spare_on(guide, fields, 0.2, 3.5, 1.5, 0.0, 10, status) == 50.0
+    assert spare <= most < 60 - 10 - np.hypot(3.0 - 0.7, 0.0) / 0.2
+    assert spare_on(guide, fields, 0.2, 3.5, 1.5, 0.0, 10, status) == (50.0, np.inf)
     status[0] = SETTLED
-    assert spare_on(guide, fields, 0.2, 0.7, 1.5, 0.0, 10, status) == np.inf
+    assert spare_on(guide, fields, 0.2, 0.7, 1.5, 0.0, 10, status) == (np.inf, np.inf)
+
+
+@pytest.mark.parametrize(("shut", "due", "found"), [(0, 60, True), (0, 12, False), (10, 60, False)])
+def test_no_pose_is_tried_where_distances_show_that_a_goal_cannot_be_reached_in_time(shut, due, found):
+    """The upper door leads to East in some 15 steps; where it is shut as well, nothing does. Tables for the
+    map without any wall know nothing of that, and lead a search through all of the room.
+    """
+    task, body = two_rooms(f"F[0,{due}] East")
+    occupied = body.occupied.astype(bool)
+    occupied[25:, 20] = shut > 0
+    body = make_body(task.robot, replace(task.grid, occupied=occupied))
+    rules, wait = make_rules(task), task.robot.wait_motion
+    guide = Guide(body, rules, synthesise(task).tables, wait, NOTHING_BARRED)
+    fields = distances(body, goal_cells(body, rules))
+    past = pasts(rules, np.array([[0.7, 1.5, 0.0]]), np.empty((1, 0)))[0]
+    motions = np.empty((len(task.robot.motions), due), np.int64)
+    poses = np.empty((*motions.shape, 3))
+    most = POSES if found else 32  # enough for what is found; else it gives up
+    assert (go_around(guide, past, fields, poses, motions, most) >= 0) == found
+    if not found:
+        assert go_around(guide, past, fields, poses, motions, most) == NO_WAY
+        assert go_around(guide, past, NO_FIELDS, poses, motions, most) == GAVE_UP

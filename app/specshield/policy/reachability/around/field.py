@@ -2,7 +2,7 @@
 
 Where a passage is blocked, the tables still lead to it, and a search that they alone guide fills all of the
 space before it. These distances lead around. They are of a coarse grid and of places without headings: they
-say in which order to search, and neither what counts nor what is left out.
+say in which order to search, and what is left out since it comes too late, whatever errors the grid has.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from specshield.arrays import Bools, Floats, Int8s, pooled
 from specshield.compiled import inlined, kernel
 from specshield.policy.geodesic import geodesic_distance
+from specshield.policy.lattice import pose_of
 from specshield.policy.progress import ALWAYS, PENDING, Rules
 from specshield.policy.reachability.guide import due, make_scratch, predicate_at
 from specshield.policy.reachability.tables import Guide
@@ -21,6 +22,10 @@ from specshield.robot.body import Body, centre
 
 COARSE = 2  # cells of the map to a side of a field's, at least: 10 cm where the map has 5. By hand.
 MOST = 20_000  # cells of a field, which take some 2 ms; on larger maps they are larger
+SURE, ERROR = (
+    0.95,
+    5.0,
+)  # a share of a distance that is surely left, once so many cells are taken off. By hand.
 NO_FIELDS = np.empty((0, 1, 1))  # for a search that the tables alone lead
 
 
@@ -38,51 +43,49 @@ def goal_cells(body: Body, rules: Rules) -> Bools:
 @kernel
 def _fill_goals(body: Body, rules: Rules, side: float, held: Bools) -> None:
     scratch = make_scratch(rules, 1)
-    for k in range(held.shape[0]):
-        if rules.kind[k] == ALWAYS:
-            continue
+    for k in np.flatnonzero(rules.kind != ALWAYS):
         for j in range(held.shape[1]):
             for i in range(held.shape[2]):
-                u, v = (i + 0.5) * side, (j + 0.5) * side
-                x = body.origin_x + body.cos_yaw * u - body.sin_yaw * v
-                y = body.origin_y + body.sin_yaw * u + body.cos_yaw * v
-                held[k, j, i] = predicate_at(rules, k, x, y, 0.0, scratch) > 0.0
+                x, y, theta = pose_of(body, side, 1, j, i, 0.0)
+                held[k, j, i] = predicate_at(rules, int(k), x, y, theta, scratch) > 0.0
 
 
 def distances(body: Body, goals: Bools) -> Floats:
     """Metres from each cell to the goals [K, ny, nx] through what is free for the footprint; inf where there
-    is no way. Shape [K, ny, nx].
+    is no way, NaN where no cell is known to be a goal. Shape [K, ny, nx].
     """
     h, (ny, nx), (height, width) = body.resolution, goals.shape[1:], body.clearance.shape
     coarse = -(-height // ny)
     fine = np.zeros((coarse * ny, coarse * nx), np.bool_)
     fine[:height, :width] = body.clearance > body.radius - 0.5 * h
     free: Bools = np.any(fine.reshape(ny, coarse, nx, coarse), axis=(1, 3))
-    found = np.full(goals.shape, np.inf)
-    for goal, far in zip(goals, found, strict=True):
-        if goal.any():
-            far[:] = geodesic_distance(free, goal, coarse * h)
-            beside = pooled(pooled(far, np.minimum, 1, 0), np.minimum, 1, 1)
-            far[:] = np.where(np.isinf(far), beside + coarse * h, far)  # of a cell whose centre is not free
+    found = np.full(goals.shape, np.nan)
+    for k in np.flatnonzero(goals.any(axis=(1, 2))):
+        far = geodesic_distance(free, goals[k], coarse * h)
+        beside = pooled(pooled(far, np.minimum, 1, 0), np.minimum, 1, 1)
+        found[k] = np.where(np.isinf(far), beside + coarse * h, far)  # of a cell whose centre is not free
     return found
 
 
 @inlined
 def spare_on(
     guide: Guide, fields: Floats, stride: float, x: float, y: float, theta: float, t: int, status: Int8s
-) -> float:
+) -> tuple[float, float]:
     """The steps that moves of `stride` [m] straight to any one pending goal leave, at the least; inf where
-    no distance is known. fields [K, ny, nx]: as `distances` gives them.
+    no distance is known. And the same at the most, whatever errors the grid has: below 0 where some goal
+    cannot be reached in time. fields [K, ny, nx]: as `distances` gives them.
     """
-    body, rules, least = guide.body, guide.rules, math.inf
-    if fields.shape[0] == 0 or stride == 0.0:
-        return least
+    body, rules, least, most = guide.body, guide.rules, math.inf, math.inf
     u, v = centre(body, x, y, theta)
-    coarse = -(-body.occupied.shape[0] // fields.shape[1])
-    j, i = math.floor(v / (coarse * body.resolution)), math.floor(u / (coarse * body.resolution))
-    if j < 0 or j >= fields.shape[1] or i < 0 or i >= fields.shape[2]:
-        return least
+    side = -(-body.occupied.shape[0] // fields.shape[1]) * body.resolution
+    j, i = math.floor(v / side), math.floor(u / side)
+    if stride == 0.0 or j < 0 or j >= fields.shape[1] or i < 0 or i >= fields.shape[2]:
+        return least, most
     for k in range(fields.shape[0]):
-        if rules.kind[k] != ALWAYS and status[k] == PENDING and fields[k, j, i] < math.inf:
-            least = min(least, due(rules, k) - t - fields[k, j, i] / stride)
-    return least
+        if rules.kind[k] != ALWAYS and status[k] == PENDING:
+            far, left = fields[k, j, i], due(rules, k) - t
+            least = min(least, left - far / stride) if far < math.inf else least
+            surely = SURE * far - ERROR * side
+            # A robot that dwells at a goal may be there after it was due to come.
+            most = min(most, left - surely / stride) if surely > 0.0 else most
+    return least, most

@@ -109,32 +109,25 @@ def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: 
         simulate(guide.body, here, way[n : n + length], led[n : n + length])
         n += length
         copy_progress(tree.status[found], tree.run[found], scratch.status, scratch.run)
-        if n == 0:
-            return NO_WAY
         if guide.wait < 0:
             outcome, n = _linger(guide, t, n, way, led, scratch)
             if outcome == STUCK:
                 continue
         else:
             outcome, n = climb(guide, t, n, way, led, scratch, False)
-        if outcome == SETTLED_ALL:
+        if outcome != STUCK:
             break
-        if outcome == FAILED:
-            return NO_WAY
         copy_progress(scratch.high_status, scratch.high_run, scratch.status, scratch.run)
     if outcome != SETTLED_ALL:
         return NO_WAY
     for m in range(count):
+        motions[m, 1:] = guide.wait if guide.wait >= 0 else m
         if m == way[0]:
-            for i in range(steps):
-                motions[m, i] = way[i]
-        elif guide.wait < 0:
-            motions[m, 1:] = m
-            if starts.turn[m] != IMPOSSIBLE:
-                join(starts.turn[m], starts.move[m], way, 0, guide.wait, motions[m])
-        else:
-            motions[m, 1:] = guide.wait
+            motions[m] = way
+        elif guide.wait >= 0:
             go_back(guide, t, m, way, led, starts, scratch)
+        elif starts.turn[m] != IMPOSSIBLE:
+            join(starts.turn[m], starts.move[m], way, 0, guide.wait, motions[m])
     return int(way[0])
 
 
@@ -179,6 +172,9 @@ def _reach(
     copy_progress(scratch.status, scratch.run, tree.status[0], tree.run[0])
     # The tables know no way out of places narrower than their lattice: they do not bound a search from there.
     bounded = slack_at(guide, pose[0], pose[1], pose[2], t, scratch, scratch.ahead, UNKNOWN) >= BAND
+    # Distances bound it where no signal and no heading decides what a goal is. What overlaps goes no deeper.
+    near = 0.5 * body.resolution
+    timed = overlap(body, pose[0], pose[1], pose[2]) <= near and len(rules.signals) == 0 and not turns_matter
     count, size = 1, push(tree.heap, 0, 0, 0.0)
     while size > 0:
         here, rank = tree.heap.row[0], -tree.heap.rank[0]
@@ -215,10 +211,10 @@ def _reach(
                 corners = find_corners(tables.cell, v, u, scratch.corners)
             about, known = (scratch.corners, corners) if stays else (scratch.ahead, UNKNOWN)
             ahead = slack_at(guide, x, y, theta, t + s + 1, scratch, about, known)
-            if ahead < BAND and bounded:
+            spare, most = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
+            if (ahead < BAND and bounded) or (most < 0.0 and timed):
                 tree.table[slot] = -1  # the end of its chain; its row goes to the next pose
                 continue
-            spare = spare_on(guide, fields, stride, x, y, theta, t + s + 1, scratch.status)
             ahead = max(ahead, BAND) if guide.wait >= 0 or ahead >= SAFE or spare == math.inf else spare
             size = push(tree.heap, size, count, -(min(ahead, spare) + ONWARD * (s + 1)))
             count += 1
