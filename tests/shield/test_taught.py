@@ -435,6 +435,23 @@ def test_where_no_part_can_be_kept_alone_no_ways_are_asked_for_that_keep_two(mon
     assert [len(lost) for lost in asked] == [2, 2, 2]
 
 
+@pytest.mark.parametrize(("wall", "margins"), [(2.0, [0.0]), (1.0, [0.0, 0.2])])
+def test_what_cannot_be_kept_on_a_learned_map_is_not_asked_for_with_a_margin(wall, margins, monkeypatch):
+    """A wall across the room leaves no way, and one across half of it does. A search in vain takes long."""
+    policy = room(40)
+    asked, propose = [], type(policy).propose
+    monkeypatch.setattr(
+        type(policy),
+        "propose",
+        lambda self, h, s, margin: asked.append(margin) or propose(self, h, s, margin),
+    )
+    points = [(1.2, y) for y in np.arange(0.025, wall, 0.05)]
+    decision = decide(make_shield([policy], Config(margin=0.2)), [START], None, True, occupied=points)
+    assert (decision.reason == "infeasible") == (len(margins) == 1)
+    assert asked[: len(margins)] == margins
+    assert wall < 2.0 or 0.2 not in asked
+
+
 @pytest.mark.parametrize("uncertainty", [None, Uncertainty()])
 @pytest.mark.parametrize("steps", [17, 19, 22])
 def test_whoever_pauses_within_the_time_that_is_left_is_there_in_time(steps, uncertainty):

@@ -72,7 +72,11 @@ def judge(shield: Shield, now: Situation) -> Judged:
         clear = tuple(policy for each, policy in both if policy is not each)
         shield = replace(shield, proposers=(*shield.proposers, *clear))
     motions = len(robot.motions)
-    tried = futures(prefix, shield.body, shield.proposers, tail, (asked, 0.0))
+    # On a learned map, where a search in vain takes long, what cannot be kept is not asked for with a margin.
+    margins = (0.0,) if care.own > 0 and not violated else (asked, 0.0)
+    tried = futures(prefix, shield.body, shield.proposers, tail, margins)
+    if asked not in margins and tried.rho.max() > SATISFIED_ABOVE:
+        tried = together(tried, futures(prefix, shield.body, shield.proposers, None, (asked,)))
     kept, leaves, part, vain = tried.rho, tried.leaves, prefix, False
     if violated:
         tried, part = _left(shield, prefix, tried)
@@ -277,10 +281,9 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
     """Each motion's certified continuation, as the motions that follow it."""
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
-    motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()
-    rows = motions[judged.aimed.best.row, 1:].astype(np.uint8)
-    content, n = rows.tobytes(), rows.shape[1]
-    return tuple([content[m * n : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
+    rows = judged.tried.motions[judged.aimed.best.row, 1:].astype(np.uint8)
+    known = zip(rows, judged.feasible_motion.tolist(), strict=True)
+    return tuple([row.tobytes() if ok else None for row, ok in known])
 
 
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:

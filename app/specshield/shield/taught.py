@@ -85,8 +85,7 @@ class Taught(NamedTuple):
 
     def to_bytes(self) -> bytes:
         known = self.followed
-        chances = known.by_chance, known.going, known.standing
-        head = HEAD.pack(known.drawn, known.follows, known.halted, min(known.met, MOST_MET), *chances)
+        head = HEAD.pack(*known._replace(met=min(known.met, MOST_MET)))
         return head + self.map.to_bytes()
 
     @staticmethod
@@ -178,24 +177,21 @@ def _covers(body: Body, before: Floats, after: Floats, half_way: Floats) -> tupl
 @kernel
 def _goes_as_told(body: Body, before: Floats, foreseen: Floats, after: Floats) -> bool:
     """Whether the robot is where f leads, but for rounding, and covers no obstacle. Poses (3,)."""
-    near = abs(foreseen[0] - after[0]) <= SAME_PLACE and abs(foreseen[1] - after[1]) <= SAME_PLACE
-    if not near or abs(wrap(foreseen[2] - after[2])) > SAME_PLACE:
-        return False
     half, whole = _covers(body, before, after, np.empty(3))
-    return not half and not whole
+    return is_near(foreseen.reshape(1, 3), after, (SAME_PLACE, SAME_PLACE)) and not (half or whole)
 
 
 def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
     """What J asks for where the map may be wrong: time for a way around, room beside it, and not by what led
     nowhere. on_way: as `Care` has it.
     """
-    config, room, uncertain = shield.config, False, shield.config.uncertainty is not None
+    config, room, unsure = shield.config, False, shield.config.uncertainty is not None
     least, barred = care.least, taught.barred if config.learn_map and len(taught.barred) else None
-    if config.learn_map and uncertain:
+    if config.learn_map and unsure:
         room = not shield.task.robot.goes_back
         turn = np.abs(displacements(shield.body)[1]).max() if room else 0.0  # it turns round, twice
         least = max(least, AROUND + (min(2 * math.ceil(math.pi / turn - 1e-9), AROUND) if turn else 0))
-    return Care(care.margin, least, care.noise, care.stride, care.chance, barred, on_way and uncertain, room)
+    return care._replace(least=least, barred=barred, on_way=on_way and unsure, room=room, own=len(taught.map))
 
 
 def doubtful(

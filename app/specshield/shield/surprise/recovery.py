@@ -31,12 +31,11 @@ def most_kept(
     whole[-1] = prefix.poses[-1]
     for motions, poses in zip(tried.motions, whole[:-1], strict=True):
         simulate(shield.body, prefix.poses[-1], motions, poses)
-    futures = tried._replace(poses=whole, motions=np.append(tried.motions, tried.motions[:1], 0))
     left, said, lost = np.ones(len(whole), np.bool_), list[str](), list[Formula]()
     nearest = np.zeros(len(whole))
     safest = sorted(conjuncts(prefix.formula), key=lambda each: (not isinstance(each, Always), each.horizon))
     for part in safest:
-        rho, _ = rho_of(prefix.of(part), futures.poses)
+        rho, _ = rho_of(prefix.of(part), whole)
         keeps = left & (rho > SATISFIED_ABOVE)
         if keeps.any():
             left = keeps
