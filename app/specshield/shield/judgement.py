@@ -281,9 +281,10 @@ def witnesses_of(shield: Shield, judged: Judged | None) -> tuple[bytes | None, .
     """Each motion's certified continuation, as the motions that follow it."""
     if judged is None:
         return (None,) * len(shield.task.robot.motions)
-    rows = judged.tried.motions[judged.aimed.best.row, 1:].astype(np.uint8)
-    known = zip(rows, judged.feasible_motion.tolist(), strict=True)
-    return tuple([row.tobytes() if ok else None for row, ok in known])
+    motions, feasible = judged.tried.motions, judged.feasible_motion.tolist()
+    rows = motions[judged.aimed.best.row, 1:].astype(np.uint8)
+    content, n = rows.tobytes(), rows.shape[1]
+    return tuple([content[m * n : (m + 1) * n] if ok else None for m, ok in enumerate(feasible)])
 
 
 def as_actions(shield: Shield, certified: tuple[bytes | None, ...], action: int) -> tuple[int, ...] | None:
