@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
 
 from specshield.errors import MapError
-from specshield.world.map_server import dump_map, load_map
+from specshield.world.map_server import FORMAT, dump_map, load_map
 from specshield.world.nav_msgs import from_occupancy_grid
 from specshield.world.occupancy import OccupancyGrid
 
@@ -90,6 +90,15 @@ def test_sixteen_bits_and_plain_pgm():
 def test_origin_and_numbers_as_ros_writes_them():
     grid = load_map(metadata(resolution="5e-2", origin="[-1e1, 2, 0.5]"), pgm([[255]]))
     assert (grid.resolution, grid.origin) == (0.05, (-10.0, 2.0, 0.5))
+
+
+def test_a_yaw_in_degrees_is_refused_where_a_map_is_sent():
+    image = pgm([[255]])
+    with pytest.raises(MapError, match="radians") as caught:
+        FORMAT.parse(metadata(origin="[0, 0, 90]").encode(), image)
+    assert caught.value.path == "origin[2]"
+    grid, _ = FORMAT.parse(metadata(origin=f"[0, 0, {2 * math.pi}]").encode(), image)
+    assert load_map(*dump_map(grid)) == grid
 
 
 @settings(deadline=None)  # numba compiles on the first call

@@ -7,6 +7,7 @@ publishes it; FREE_AT_MOST then says which cells are free. Everything else, the 
 from __future__ import annotations
 
 import io
+import math
 from contextlib import suppress
 from typing import Any
 
@@ -23,6 +24,7 @@ from specshield.world.occupancy import MAX_SIDE, OccupancyGrid, check_size
 
 FREE_AT_MOST = 25  # percent: what nav2's map_saver writes as free by default
 MAX_YAML = 16_384  # characters; a map's YAML has some 150
+FULL_TURN = 2.0 * math.pi + 1e-6  # [rad] a map's yaw beyond it is one in degrees
 UNKNOWN = -1
 MODES = ("trinary", "scale", "raw")
 
@@ -40,12 +42,8 @@ def load_map(yaml_text: str, image: bytes) -> OccupancyGrid:
     free_thresh = _scalar(document, "free_thresh", 0.0, 1.0)
     occupied_thresh = _scalar(document, "occupied_thresh", 0.0, 1.0)
     if free_thresh >= occupied_thresh:
-        raise MapError(
-            "free_thresh has to be below occupied_thresh",
-            path="free_thresh",
-            got=free_thresh,
-            expected=f"< {occupied_thresh:g}",
-        )
+        below = f"a number below occupied_thresh, {occupied_thresh:g}"
+        raise checks.wrong("number", "free_thresh", free_thresh, below)
     negate = checks.member(document, "negate", "")
     if negate not in (0, 1):  # True and False as well
         raise checks.wrong("flag", "negate", negate, "0 or 1")
@@ -94,9 +92,8 @@ class _Loader(yaml.SafeLoader):
 
 def read_yaml(text: str) -> dict[str, Any]:
     if len(text) > MAX_YAML:
-        raise MapError(
-            "the YAML is too long", path="metadata", got=len(text), expected=f"at most {MAX_YAML} characters"
-        )
+        expected = f"at most {MAX_YAML} characters"
+        raise MapError("the YAML is too long", path="metadata", got=len(text), expected=expected)
     try:
         document = yaml.load(text, Loader=_Loader)
     except Exception as error:  # tags on text that they do not fit raise anything
@@ -159,10 +156,11 @@ def _parse(metadata: bytes, image: bytes) -> tuple[OccupancyGrid, Rooms]:
     try:
         text = metadata.decode()
     except UnicodeDecodeError as error:
-        raise MapError(
-            "the metadata is not text", path="metadata", got=str(error), expected="YAML in UTF-8"
-        ) from None
-    return load_map(text, image), {}
+        raise checks.wrong("text", "metadata", str(error), "YAML in UTF-8") from None
+    grid = load_map(text, image)
+    if abs(grid.origin[2]) > FULL_TURN:
+        raise checks.wrong("yaw", "origin[2]", grid.origin[2], "radians, from -2 pi to 2 pi")
+    return grid, {}
 
 
 FORMAT = MapFormat(
