@@ -19,10 +19,12 @@ def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
     MapError, and ValueError where the areas are no JSON.
     """
     try:
-        text = path.read_text()
+        text = path.read_text() if path.suffix.lower() in (".yaml", ".yml") else None
     except (OSError, UnicodeDecodeError):
+        text = None
+    if text is None:
         expected = "a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it"
-        raise MapError("no map can be read there", path="world", got=str(path), expected=expected) from None
+        raise MapError("no map can be read there", path="world", got=str(path), expected=expected)
     own = path.parent / Path(str(read_yaml(text).get("image", ""))).name
     images = own, path.with_suffix(".pgm"), path.with_suffix(".png")
     found = [each for each in images if each.suffix.lower() in (".pgm", ".png") and each.is_file()]

@@ -361,7 +361,8 @@ def test_a_map_has_the_image_that_its_yaml_names(tmp_path: Path) -> None:
         (tmp_path / "floor.yaml").write_text(metadata.replace("newer.pgm", named))
         with pytest.raises(MapError, match="its image is not beside it"):
             read_map_files(tmp_path / "floor.yaml")
-    for nothing in (tmp_path, tmp_path / "none.yaml"):
+    (tmp_path / "house.json").write_text('{"rooms": []}')  # which is YAML too, and no map_server's
+    for nothing in (tmp_path, tmp_path / "none.yaml", tmp_path / "house.json"):
         with pytest.raises(MapError, match="no map can be read there"):
             LocalShield.make(nothing, "F[0,9] x > 1")
 
