@@ -56,7 +56,7 @@ function about(session) {
       pair("Policy", ...policies),
       pair("Robot", session.robot.name),
       pair("Threshold", String(session.threshold)),
-      pair("Kept until", new Date(session.expires_at).toLocaleString()),
+      pair("Stored until", new Date(session.expires_at).toLocaleString()),
     ),
     el("p", {}, el("a", { href: "#/floor?sessions=" + session.id }, "Show it with others on one floor")),
   );
