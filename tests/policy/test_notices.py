@@ -12,7 +12,10 @@ from specshield.shield.proposal import Proposal
 from specshield.task import make_task
 from specshield.world.occupancy import OccupancyGrid
 
-REGIONS = {"Dock": {"type": "circle", "center": [1.5, 1.5], "radius": 0.4}}
+REGIONS = {
+    "Dock": {"type": "circle", "center": [1.5, 1.5], "radius": 0.4},
+    "Far": {"type": "circle", "center": [20.0, 20.0], "radius": 1.0},
+}
 ACTIONS = [{"name": "go", "translate": 0.2}, {"name": "turn", "rotate": 0.7853981633974483}, {"name": "wait"}]
 
 
@@ -44,6 +47,17 @@ def test_a_policy_that_misses_what_a_search_finds_is_said_to():
     policy.settings = Settings()
     (said,) = notices(policy)
     assert "it hardly sees some predicate of the formula; a smaller options.pitch or another method" in said
+
+
+@pytest.mark.parametrize(
+    "part", ["not Far", "not touches(Far)", "abs(theta) < 45", "theta < 90 or Dock", "(Far -> Dock)"]
+)
+def test_a_part_of_the_rule_that_asks_for_nothing_is_told(part):
+    """A place that is off the map forbids nothing there, nor does an angle that was meant in degrees."""
+    (said,) = notices(Policy(f"F[0,40] Dock and G[0,40] {part}", searches=True))
+    assert "holds wherever the robot fits, so it asks for nothing" in said
+    asked = "F[0,40] Dock and G[0,40] (not Dock or abs(theta) < 3 or y > 1.5)"
+    assert notices(Policy(asked, searches=True)) == ()
 
 
 def test_a_contradiction_is_said_to_be_one():

@@ -1,4 +1,4 @@
-"""What there is to warn of when a policy is made: a rule that no start keeps, and starts that it misses."""
+"""What there is to warn of when a policy is made: a rule that no start keeps, or a part that asks nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from specshield.arrays import Floats
 from specshield.errors import InfeasibleStart, MapError, SampleError
 from specshield.policy.dqn.environment import free_poses
-from specshield.reasons.bound import contradiction
+from specshield.reasons.bound import contradiction, idle
 from specshield.reasons.relaxation import way
 from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Config, Shield, make_shield
@@ -44,7 +44,8 @@ def notices(policy: Proposer) -> tuple[str, ...]:
         )
     if len(refused) == STARTS:
         return (f"no future that satisfies the formula was found from any of {STARTS} random starts",)
-    return _of_signals(shield, poses, STARTS - len(refused)) if task.signals else ()
+    of_signals = _of_signals(shield, poses, STARTS - len(refused)) if task.signals else ()
+    return (*dict.fromkeys(idle(task, shield.body)), *of_signals)
 
 
 def _of_signals(shield: Shield, poses: Floats, silent: int) -> tuple[str, ...]:

@@ -9,19 +9,20 @@ order. Where not even that can be in time, there is no future; else nothing is k
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from specshield.arrays import Floats, Ints
-from specshield.reasons.course import Goal, course
+from specshield.reasons.course import Goal, course, possible
 from specshield.reasons.ground import Ground, make_ground
 from specshield.reasons.known import Known
-from specshield.reasons.needs import Need, Reader
+from specshield.reasons.needs import Need, Reader, positive
 from specshield.robot.dynamics import Body, in_collision, motion_count
 from specshield.shield.escape import spread
-from specshield.stl import Always
+from specshield.stl import Always, Atom, Comparison, Not
+from specshield.stl.formula import Node
 from specshield.task import Task
 
 # Chosen by hand: what is looked at stays within a second.
@@ -37,9 +38,7 @@ def proof(task: Task, body: Body, history: Floats, signals: Mapping[str, Floats]
 
     signals {name: [t + 1]}. They are taken to hold their last values.
     """
-    if in_collision(
-        body, *history[-1]
-    ):  # f lets the robot out of an obstacle by ways that no free floor shows
+    if in_collision(body, *history[-1]):  # f leads out of obstacles by ways that no free floor shows
         return None
     known = Known(task, history, signals)
     ways = Reader(known.now, known.constant).alternatives(task.formula)
@@ -66,6 +65,19 @@ def contradiction(task: Task, body: Body) -> str | None:
             return None
         said.append(asked)
     return said[0] if said else "the values that the signals hold rule it out"
+
+
+def idle(task: Task, body: Body) -> Iterator[str]:
+    """What to say of each part of the formula that holds wherever the robot fits, and so asks for nothing:
+    it may be a place to keep out of that is off the map, or an angle in degrees.
+    """
+    ground, nodes = make_ground(task, body, {}), list[Node]([positive(task.formula)])
+    for node in nodes:
+        if not isinstance(node, Not | Atom | Comparison):
+            nodes.extend(node.parts)
+        elif task.signals.keys().isdisjoint(node.names) and not possible(positive(node, True), ground).any():
+            right = "are its place and its units right (metres, radians, the map's frame)?"
+            yield f"'{node}' holds wherever the robot fits, so it asks for nothing; {right}"
 
 
 def _refuted(needs: Sequence[Need], known: Known, ground: Ground, body: Body) -> str | None:
@@ -109,14 +121,8 @@ class _Ahead(NamedTuple):
         `soonest` [goals]: the first step at which each goal's place is reached, in its window or not.
         """
         further, also = spread(self.body, poses), np.repeat(met, motion_count(self.body))
-        keys = np.column_stack(
-            [
-                np.round(SAME * further[:, :2]),
-                np.round(SAME * np.cos(further[:, 2])),
-                np.round(SAME * np.sin(further[:, 2])),
-                also,
-            ]
-        )
+        alike = np.column_stack([further[:, :2], np.cos(further[:, 2]), np.sin(further[:, 2])])
+        keys = np.column_stack([np.round(SAME * alike), also])
         _, first = np.unique(keys, axis=0, return_index=True)
         further, also = further[np.sort(first)], also[np.sort(first)]
         keeps = np.ones(len(further), np.bool_)

@@ -50,9 +50,9 @@ def course(needs: Sequence[Need], known: Known, ground: Ground, late: int = 0) -
     found: list[tuple[Need, Bools]] = []
     for need in pending:
         for asked in (need.predicate, _together(need, guards, need.last)):
-            if not _possible(asked, ground).any():
+            if not possible(asked, ground).any():
                 return f"{need.formula} asks for '{asked}', which holds nowhere that the robot fits"
-        where = _possible(_together(need, guards, need.end), ground)
+        where = possible(_together(need, guards, need.end), ground)
         begun = need.first == need.last == known.now + 1
         everywhere = np.array_equal(where, ground.free) and not _turns(need.predicate, known)
         if not begun and not everywhere:
@@ -69,7 +69,7 @@ def _turns(predicate: Formula, known: Known) -> bool:
     return carried or "theta" in predicate.names
 
 
-def _possible(predicate: Formula, ground: Ground) -> Bools:
+def possible(predicate: Formula, ground: Ground) -> Bools:
     """The squares where a predicate may hold."""
     possible: Bools = (ground.highest(predicate) > SATISFIED_ABOVE) & ground.free
     return possible

@@ -27,9 +27,7 @@ from specshield.world.regions import area_distance, pack_areas
 MOST_SQUARES = 150_000  # a larger map has larger squares
 MOST_WORK = 50_000_000  # squares times the numbers that describe the regions: as well
 SPARE = 2e-3  # [m] that a footprint counts as smaller: above what f allows it to overlap in its turns
-LONGER = 1.0 / math.cos(
-    math.atan(0.5) / 2.0
-)  # than the shortest are ways along 16 directions, at most: 2.8 %
+LONGER = 1.0 / math.cos(math.atan(0.5) / 2.0)  # than the shortest are ways along 16 directions: by 2.8 %
 Interval = tuple[Floats, Floats]
 
 

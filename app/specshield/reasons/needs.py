@@ -44,9 +44,8 @@ class Need:
             return self.part
         if self.first == self.last:
             return Always(self.first, self.end, self.predicate)
-        return Eventually(
-            self.first, self.last, Always(0, self.stay, self.predicate) if self.stay else self.predicate
-        )
+        stays = Always(0, self.stay, self.predicate) if self.stay else self.predicate
+        return Eventually(self.first, self.last, stays)
 
 
 Alternatives = tuple[tuple[Need, ...], ...]

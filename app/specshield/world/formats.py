@@ -58,9 +58,8 @@ def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tupl
     wrong way, MapError for a member that is missing, unknown or wrong.
     """
     if name is None:
-        raise InputError(
-            "the body does not say which format the map has", path="format", expected=_one_of(FORMATS.names())
-        )
+        said, names = "the body does not say which format the map has", _one_of(FORMATS.names())
+        raise InputError(said, path="format", expected=names)
     format = FORMATS.get(str(name))
     if format.files != files:
         ways = {True: "files (multipart/form-data)", False: "a JSON object"}

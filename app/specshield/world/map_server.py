@@ -100,9 +100,8 @@ def read_yaml(text: str) -> dict[str, Any]:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "it is not YAML"
-        raise MapError(
-            f"the YAML cannot be read{where}: {problem}", path="metadata", expected="a map_server YAML"
-        ) from error
+        said = f"the YAML cannot be read{where}: {problem}"
+        raise MapError(said, path="metadata", expected="a map_server YAML") from error
     if not isinstance(document, dict):
         raise checks.wrong("map_server YAML", "metadata", document, "resolution, origin, negate, ...")
     return document
@@ -128,10 +127,8 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
         if picture.mode == "F":
             raise ValueError("PFM, which Pillow counts as PPM")
     except Image.DecompressionBombError as error:
-        most = f"at most {MAX_SIDE} x {MAX_SIDE} pixels"
-        raise MapError(
-            "the image is too large", path="image", got=f"{got}, {error}", expected=most
-        ) from error
+        got, most = f"{got}, {error}", f"at most {MAX_SIDE} x {MAX_SIDE} pixels"
+        raise MapError("the image is too large", path="image", got=got, expected=most) from error
     except Exception as error:  # decoders raise whatever the bytes lead to
         problem = "the image has no header of a PGM or PNG"
         raise MapError(problem, path="image", got=got, expected="PGM or PNG") from error

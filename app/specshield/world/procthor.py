@@ -144,9 +144,7 @@ def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Floats, Floats]]:
     pending = list(_items(house, "objects"))
     for path, thing in pending:  # grows by the children
         if len(pending) > MAX_ITEMS:
-            raise MapError(
-                "too many objects", path="objects", got=len(pending), expected=f"at most {MAX_ITEMS}"
-            )
+            raise checks.wrong("list", "objects", len(pending), f"at most {MAX_ITEMS} objects")
         pending += _items(thing, "children", path) if "children" in thing else []
         asset = checks.text(checks.member(thing, "assetId", path), f"{path}.assetId")
         if asset not in sizes:
