@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import httpx
@@ -26,7 +26,7 @@ from specshield.service.storage.store import Change, Record, Store
 from tests.service.test_events import END, read
 from tests.service.world import ROBOT, SPEC, grid_json, send_policy
 from tests.serving import HUNG, RunningServer, serving, wait_for
-from tests.stores import behind_tls, cluster, watched
+from tests.stores import Cluster, behind_tls, cluster, watched
 
 pytestmark = pytest.mark.skipif(
     shutil.which("redis-server") is None, reason="redis-server is not installed: stores of one's own need it"
@@ -291,6 +291,32 @@ def test_a_session_goes_with_its_slot_to_another_node(tmp_path):
 
     with cluster(tmp_path / "store") as there:
         asyncio.run(scene(there.nodes, there.url))
+
+
+def test_a_replica_that_took_over_from_a_node_that_only_fell_silent_is_found(tmp_path):
+    """As one whose machine has lost its network: no connection to it ends, and nobody is refused one."""
+
+    async def scene(there: Cluster) -> None:
+        surely, store = Store(there.url, 60.0, ttl=60, replicas=1), Store(there.url, timeout=0.5, ttl=60)
+        id = next(id for id in map(str, range(1000)) if key_slot(id.encode()) < FIRST)
+        version = await surely.create(id, b"config", Change(b"state", bytes(24)))
+        assert await store.load(id) is not None
+        there.first.send_signal(signal.SIGSTOP)
+        with pytest.raises(StoreError, match="TimeoutError"):
+            await store.load(id)
+        await asyncio.to_thread(wait_for, there.promoted)
+        async with asyncio.timeout(60.0):
+            while True:
+                with suppress(StoreError):
+                    found = await store.load(id)
+                    break
+        assert found is not None
+        assert found.version == version
+        await store.aclose()
+        await surely.aclose()
+
+    with cluster(tmp_path / "store") as there:
+        asyncio.run(scene(there))
 
 
 def test_a_node_that_serves_nothing_for_now_is_told_at_once(tmp_path):

@@ -260,9 +260,8 @@ def install(app: FastAPI) -> None:
         reason = UNREADABLE.get(type(error.__cause__))
         if reason is not None:
             return ProblemResponse(InputError(f"the body is not JSON: {reason}", expected="a JSON object"))
-        return ProblemResponse(
-            InputError(str(error.detail), expected="a request in the form that /docs describes")
-        )
+        told, expected = str(error.detail), "a request in the form that /docs describes"
+        return ProblemResponse(InputError(told, expected=expected))
 
     @app.exception_handler(ClientGone)
     async def gone(request: Request, error: Exception) -> Response:
@@ -273,9 +272,8 @@ def install(app: FastAPI) -> None:
     async def disk(request: Request, error: OSError) -> Response:
         if not is_full(error):
             raise error
-        return ProblemResponse(
-            errors.InsufficientStorage("the server's disk is full", expected="a disk with room")
-        )
+        full = errors.InsufficientStorage("the server's disk is full", expected="a disk with room")
+        return ProblemResponse(full)
 
     @app.exception_handler(Exception)
     async def unknown(request: Request, error: Exception) -> Response:

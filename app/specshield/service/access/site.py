@@ -47,7 +47,8 @@ def check_site(scope: Mapping[str, Any], headers: Headers, allowed: frozenset[st
         expected = "a program, or a page that comes from this server"
         origin = headers.get(b"origin", b"").decode("latin-1") or None
         raise CrossSite(told, path="Origin", got=origin, expected=expected)
-    if scope.get("method") in WITH_BODY and scope["path"].startswith("/v1/") and _has_body(headers):
+    with_body = headers.get(b"content-length", b"0") != b"0" or b"transfer-encoding" in headers
+    if scope.get("method") in WITH_BODY and scope["path"].startswith("/v1/") and with_body:
         _check_type(scope["path"], headers.get(b"content-type", b"").decode("latin-1"))
 
 
@@ -94,10 +95,6 @@ def _from_elsewhere(method: str, headers: Headers, host: str, allowed: frozenset
         return False
     fetched = (method, headers.get(b"sec-fetch-mode"), headers.get(b"sec-fetch-dest"))
     return fetched != ("GET", b"navigate", b"document")  # a link that somebody follows, not a frame
-
-
-def _has_body(headers: Headers) -> bool:
-    return headers.get(b"content-length", b"0") != b"0" or b"transfer-encoding" in headers
 
 
 def _check_type(path: str, declared: str) -> None:

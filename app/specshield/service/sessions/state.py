@@ -5,7 +5,6 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from specshield.arrays import Floats
 from specshield.shield.decision import Carry
 from specshield.shield.taught import HEAD, Taught
 from specshield.world.learned import LearnedMap
@@ -57,9 +56,5 @@ def own(carry: Carry | None) -> Carry | None:
     return None if carry is None else carry._replace(next_poses=carry.next_poses.copy())
 
 
-def _poses(_: type, stored: bytes) -> Floats:
-    return np.frombuffer(stored, "<f8").reshape(-1, 3)
-
-
 _encoder = msgspec.msgpack.Encoder(enc_hook=lambda poses: poses.astype("<f8", copy=False).tobytes())
-_decoder = msgspec.msgpack.Decoder(State, dec_hook=_poses)
+_decoder = msgspec.msgpack.Decoder(State, dec_hook=lambda _, raw: np.frombuffer(raw, "<f8").reshape(-1, 3))

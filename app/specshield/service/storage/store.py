@@ -17,7 +17,7 @@ import anyio
 
 from specshield.errors import LimitReached, SessionExists
 from specshield.service.access.owners import between, shown
-from specshield.service.storage.connect import FAILURES, away, connect, is_cluster, reaching
+from specshield.service.storage.connect import connect, is_cluster, reaching
 from specshield.service.storage.wire import Script, Wire
 from specshield.service.storage.wires import Wires
 
@@ -80,11 +80,9 @@ class Store:
         self.redis: Any = connect(url, socket_timeout=timeout)
         self._claim = self.redis.register_script(Path(__file__).with_name("claim.lua").read_text())
         self._in_cluster = is_cluster(url)
-        self._wire: Wire | Wires = (
-            Wires(self.redis, timeout, replicas)
-            if self._in_cluster
-            else Wire(self.redis.connection_pool.make_connection, timeout, replicas)
-        )
+        self._wire: Wire | Wires = Wires(self.redis, timeout, replicas)
+        if not self._in_cluster:
+            self._wire = Wire(self.redis.connection_pool.make_connection, timeout, replicas)
         self._timeout, self._ttl, self._replicas = timeout, ttl, replicas
 
     async def aclose(self) -> None:
@@ -154,10 +152,8 @@ class Store:
         field = "" if change.t is None else change.t
         args: list[Any] = [version, change.offset, change.rows, field, change.step, change.state, config]
         args.append(self._ttl * 1000)
-        try:
+        with reaching():
             written = await self._wire.run(APPEND, keys(id), args)
-        except FAILURES as error:
-            raise away(error) from error
         if isinstance(written, bytes):
             return written
         config, state, version, rows, step = written

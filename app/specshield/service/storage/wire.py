@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import anyio
 import hiredis
 import redis
 
@@ -50,7 +51,9 @@ class Wire:
         while True:
             link = self._link
             if link is None or link.closed:
-                link = await self._open(deadline)  # redis-py tries several times by itself
+                # anyio says again that the time is over: redis-py may miss it once, by asyncio.wait_for.
+                with anyio.fail_after(deadline - asyncio.get_running_loop().time()):
+                    link = await self._open()  # redis-py tries several times by itself
             try:
                 return await _run(link, script, keys, args, deadline)
             except redis.ConnectionError:
@@ -58,8 +61,8 @@ class Wire:
                     raise
                 tries_left -= 1
 
-    async def _open(self, deadline: float) -> _Link:
-        async with asyncio.timeout_at(deadline), self._opening:
+    async def _open(self) -> _Link:
+        async with self._opening:
             if self._link is None or self._link.closed:
                 connection = self._make()
                 try:

@@ -49,8 +49,7 @@ class Jobs:
     @cached_property
     def redis(self) -> Any:
         """Opened when it is first asked: a cluster is asked at once for its nodes, and may be away."""
-        settings = self._settings
-        return connect(settings.store_url, blocking=True, socket_timeout=settings.store_timeout)
+        return connect(self._settings.store_url, blocking=True, socket_timeout=self._settings.store_timeout)
 
     @cached_property
     def _write(self) -> Any:
