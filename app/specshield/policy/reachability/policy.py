@@ -117,7 +117,7 @@ class ReachabilityPolicy(Carded):
         return other
 
     @cached_property
-    def _goals(self) -> Bools:
+    def _goals(self) -> Floats:
         return goal_cells(self._body, self._rules)
 
     @cached_property

@@ -22,48 +22,48 @@ from specshield.robot.body import Body, centre
 
 COARSE = 2  # cells of the map to a side of a field's, at least: 10 cm where the map has 5. By hand.
 MOST = 20_000  # cells of a field, which take some 2 ms; on larger maps they are larger
-SURE, ERROR = (
-    0.95,
-    5.0,
-)  # a share of a distance that is surely left, once so many cells are taken off. By hand.
+SURE, ERROR = 0.95, 5.0  # the share of a distance that is surely left, once so many cells are off. By hand.
+REACH = 0.71  # [sides of a cell] that no place in a cell is farther from its centre
 NO_FIELDS = np.empty((0, 1, 1))  # for a search that the tables alone lead
 
 
-def goal_cells(body: Body, rules: Rules) -> Bools:
-    """Where each goal's predicate holds for a robot whose heading is 0, by what signals hold at first. Shape
-    [K, ny, nx]; nowhere for an `always`.
+def goal_cells(body: Body, rules: Rules) -> Floats:
+    """The value of each goal's predicate for a robot whose heading is 0, by what signals hold at first. Shape
+    [K, ny, nx]; -inf for an `always`.
     """
     coarse = max(COARSE, math.ceil(math.sqrt(body.occupied.size / MOST)))
     ny, nx = (-(-side // coarse) for side in body.occupied.shape)
-    held = np.zeros((len(rules.kind), ny, nx), np.bool_)
-    _fill_goals(body, rules, coarse * body.resolution, held)
-    return held
+    values = np.full((len(rules.kind), ny, nx), -np.inf)
+    _fill_goals(body, rules, coarse * body.resolution, values)
+    return values
 
 
 @kernel
-def _fill_goals(body: Body, rules: Rules, side: float, held: Bools) -> None:
+def _fill_goals(body: Body, rules: Rules, side: float, values: Floats) -> None:
     scratch = make_scratch(rules, 1)
     for k in np.flatnonzero(rules.kind != ALWAYS):
-        for j in range(held.shape[1]):
-            for i in range(held.shape[2]):
+        for j in range(values.shape[1]):
+            for i in range(values.shape[2]):
                 x, y, theta = pose_of(body, side, 1, j, i, 0.0)
-                held[k, j, i] = predicate_at(rules, int(k), x, y, theta, scratch) > 0.0
+                values[k, j, i] = predicate_at(rules, int(k), x, y, theta, scratch)
 
 
-def distances(body: Body, goals: Bools) -> Floats:
+def distances(body: Body, goals: Floats) -> Floats:
     """Metres from each cell to the goals [K, ny, nx] through what is free for the footprint; inf where there
-    is no way, NaN where no cell is known to be a goal. Shape [K, ny, nx].
+    is no way, NaN where the centres of free cells do not tell where all of a goal is. Shape [K, ny, nx].
     """
     h, (ny, nx), (height, width) = body.resolution, goals.shape[1:], body.clearance.shape
-    coarse = -(-height // ny)
+    coarse, apart = -(-height // ny), math.hypot(body.offset_x, body.offset_y)
     fine = np.zeros((coarse * ny, coarse * nx), np.bool_)
-    fine[:height, :width] = body.clearance > body.radius - 0.5 * h
+    fine[:height, :width] = body.clearance > body.radius - REACH * h
     free: Bools = np.any(fine.reshape(ny, coarse, nx, coarse), axis=(1, 3))
     found = np.full(goals.shape, np.nan)
-    for k in np.flatnonzero(goals.any(axis=(1, 2))):
-        far = geodesic_distance(free, goals[k], coarse * h)
-        beside = pooled(pooled(far, np.minimum, 1, 0), np.minimum, 1, 1)
-        found[k] = np.where(np.isinf(far), beside + coarse * h, far)  # of a cell whose centre is not free
+    for k in range(len(goals)):
+        far = geodesic_distance(free, goals[k] > 0.0, coarse * h)
+        about = far[free & (goals[k] > -REACH * coarse * h - apart)]  # where a robot in the goal may be
+        if len(about) and about.max() <= (ERROR - 2.0) * coarse * h + apart:
+            beside = pooled(pooled(far, np.minimum, 1, 0), np.minimum, 1, 1)
+            found[k] = np.where(np.isinf(far), beside + coarse * h, far)  # of a cell whose centre is not free
     return found
 
 
@@ -78,14 +78,14 @@ def spare_on(
     body, rules, least, most = guide.body, guide.rules, math.inf, math.inf
     u, v = centre(body, x, y, theta)
     side = -(-body.occupied.shape[0] // fields.shape[1]) * body.resolution
-    j, i = math.floor(v / side), math.floor(u / side)
+    j, i, apart = math.floor(v / side), math.floor(u / side), math.hypot(body.offset_x, body.offset_y)
     if stride == 0.0 or j < 0 or j >= fields.shape[1] or i < 0 or i >= fields.shape[2]:
         return least, most
     for k in range(fields.shape[0]):
         if rules.kind[k] != ALWAYS and status[k] == PENDING:
             far, left = fields[k, j, i], due(rules, k) - t
             least = min(least, left - far / stride) if far < math.inf else least
-            surely = SURE * far - ERROR * side
+            surely = SURE * far - ERROR * side - apart
             # A robot that dwells at a goal may be there after it was due to come.
             most = min(most, left - surely / stride) if surely > 0.0 else most
     return least, most
