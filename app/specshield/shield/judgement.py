@@ -72,8 +72,8 @@ def judge(shield: Shield, now: Situation) -> Judged:
         clear = tuple(policy for each, policy in both if policy is not each)
         shield = replace(shield, proposers=(*shield.proposers, *clear))
     motions = len(robot.motions)
-    # On a learned map, where a search in vain takes long, what cannot be kept is not asked for with a margin.
-    margins = (0.0,) if care.own > 0 and not violated else (asked, 0.0)
+    # On a guess about the map, one of several, what cannot be kept is not asked for with a margin as well.
+    margins = (0.0,) if care.guess and not violated else (asked, 0.0)
     tried = futures(prefix, shield.body, shield.proposers, tail, margins)
     if asked not in margins and tried.rho.max() > SATISFIED_ABOVE:
         tried = together(tried, futures(prefix, shield.body, shield.proposers, None, (asked,)))

@@ -191,7 +191,7 @@ def wary(shield: Shield, care: Care, taught: Taught, on_way: bool) -> Care:
         room = not shield.task.robot.goes_back
         turn = np.abs(displacements(shield.body)[1]).max() if room else 0.0  # it turns round, twice
         least = max(least, AROUND + (min(2 * math.ceil(math.pi / turn - 1e-9), AROUND) if turn else 0))
-    return care._replace(least=least, barred=barred, on_way=on_way and unsure, room=room, own=len(taught.map))
+    return care._replace(least=least, barred=barred, on_way=on_way and unsure, room=room)
 
 
 def doubtful(

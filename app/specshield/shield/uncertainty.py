@@ -79,7 +79,7 @@ class Care(NamedTuple):
     [n, 6]: what no future goes by where another keeps the rule (robot/barred.py); None where nothing is.
     on_way: whether the robot is where the last answer had it, on a way that keeps what was asked for then.
     room: whether to go where a larger robot could too, where another future with room keeps the rule.
-    own: how many cells of the map the session has learned; policies may have no tables for such a map.
+    guess: whether the map is one of several that one decision tries.
     """
 
     margin: float
@@ -90,7 +90,7 @@ class Care(NamedTuple):
     barred: Floats | None = None
     on_way: bool = False
     room: bool = False
-    own: int = 0
+    guess: bool = False
 
     @property
     def has_slack(self) -> bool:

@@ -34,7 +34,7 @@ def tried_again(
     """
     if judged.some and not judged.vain:
         return None
-    vain = None
+    vain, now = None, now._replace(care=now.care._replace(guess=True))
     for guess in doubted(told, taught, now.prefix):
         found = judged_by_signals(on_map(told, guess.map, True, taught.barred), now)
         if found[2].some and not found[2].vain:
