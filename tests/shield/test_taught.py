@@ -22,6 +22,7 @@ from specshield.robot.dynamics import in_collision, make_body, step
 from specshield.shield import episode
 from specshield.shield.caution.experience import FORMAT, Seen
 from specshield.shield.episode import Carry, Config, decide, make_shield
+from specshield.shield.surprise.contact import Followed, contact_of
 from specshield.shield.surprise.doubt import recovered
 from specshield.shield.surprise.vain import barred_by
 from specshield.shield.taught import Taught, on_map, wary
@@ -538,3 +539,23 @@ def test_a_robot_that_has_passed_what_the_map_has_beside_it_is_not_shut_in_there
         carry = decision.carry
     assert decision.mode == "completion"
     assert decision.next_poses[decision.action][0] < 1.8
+
+
+@pytest.mark.parametrize(
+    ("by_chance", "drawn", "follows"), [(1e-4, 1, True), (1e-4, 2, False), (0.5, 1, False)]
+)
+def test_an_arc_that_something_stops_before_its_turn_does_not_tell_a_caller_that_goes_its_own_ways(
+    by_chance, drawn, follows
+):
+    """It ends where the straight motion does. That is known of a caller who followed for long alone, and of
+    no motion that backs off.
+    """
+    robot = Robot(
+        "arcs", 0.2, (0.0, 0.0), "stop", (Action("on", 0.2), Action("arc", 0.2, 0.5), Action("b", -0.2))
+    )
+    body = make_body(robot, room().task.grid)
+    before, after = np.array([1.0, 1.0, 0.0]), np.array([1.18, 1.0, 0.0])
+    foreseen = np.array([step(body, *before, motion) for motion in range(3)])
+    met, now = contact_of(body, Followed(drawn=drawn, by_chance=by_chance), before, after, foreseen)
+    assert met == -1
+    assert now.follows == follows

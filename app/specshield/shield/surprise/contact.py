@@ -77,8 +77,9 @@ def contact_of(
         if followed.halted == drawn or followed.met or again:  # what stopped it a moment ago does so again
             return drawn, followed._replace(halted=-1, met=followed.met + 1)
         return -1, followed._replace(halted=drawn)
-    if is_near(foreseen, after, near):
-        return -1, followed._replace(follows=False, halted=-1, met=0)
+    if is_near(foreseen, after, near):  # who surely follows may have met something before an arc's turn
+        began = drawn >= 0 and is_near(np.append(foreseen[drawn, :2], before[2])[None], after, near)
+        return -1, followed._replace(follows=followed.surely and began, halted=-1, met=0)
     short = _short(body, before, after, foreseen, near)
     if not short.any():
         return -1, moved_on(followed)
@@ -145,8 +146,7 @@ def _direction(body: Body, pose: Floats, motion: int) -> float:
     """Where the footprint's centre goes [rad]."""
     far, turn = displacement(body, motion)
     if far == 0.0:
-        swing: float = pose[2] + math.atan2(body.offset_y, body.offset_x) + math.copysign(0.5 * math.pi, turn)
-        return swing
+        return float(pose[2] + math.atan2(body.offset_y, body.offset_x) + math.copysign(0.5 * math.pi, turn))
     return float(pose[2]) + (0.0 if far > 0.0 else math.pi)
 
 
