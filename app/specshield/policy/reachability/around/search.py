@@ -172,7 +172,7 @@ def _reach(
     copy_progress(scratch.status, scratch.run, tree.status[0], tree.run[0])
     # The tables know no way out of places narrower than their lattice: they do not bound a search from there.
     bounded = slack_at(guide, pose[0], pose[1], pose[2], t, scratch, scratch.ahead, UNKNOWN) >= BAND
-    # Distances bound it where no signal and no heading decides what a goal is. What overlaps goes no deeper.
+    # Distances bound it too, where goals are places alone and the robot overlaps no obstacle by much.
     near = 0.5 * body.resolution
     timed = overlap(body, pose[0], pose[1], pose[2]) <= near and len(rules.signals) == 0 and not turns_matter
     count, size = 1, push(tree.heap, 0, 0, 0.0)
