@@ -254,6 +254,57 @@ def test_a_decision_whose_question_was_cancelled_is_passed_over_too(on_failure):
     assert isinstance(step(state, 0.4, conflict)[0], errors.StepConflict), "this one nobody asked for here"
 
 
+def taken(t, x):
+    """The service has another x_t already."""
+    return problem(409, "history-conflict", t=t, stored=[x, 0, 0])
+
+
+SWITCHED = answer({**SESSION, "actions": ["m", "b", "end"], "terminal_actions": [END], "next_t": 1})
+
+
+@pytest.mark.parametrize("answers", [[SWITCHED], AWAY])
+def test_a_robot_that_stood_since_a_switch_goes_on_from_where_it_is_measured_now(answers):
+    """Two measurements of a robot that stands are never the same, and the service has the first."""
+    state = robust()
+    step(state, 0.0, decided(0, M))
+    drive(state._switch("p2", pose=(0.2, 0, 0)), *answers)
+    decision, bodies = step(state, 0.203, taken(1, 0.2), decided(2, M))
+    assert (decision.source, decision.t, state.t) == ("service", 2, 3)
+    assert [(body["t"], body["poses"][-1][0]) for body in bodies] == [(1, 0.203), (2, 0.203)]
+    assert isinstance(step(state, 0.4, taken(3, 0.5))[0], errors.HistoryConflict), "nobody told of this one"
+
+
+@pytest.mark.parametrize("ask", ["_switch", "_end"])
+def test_a_switch_and_a_close_pass_over_a_decision_that_was_never_heard(ask):
+    state = robust("stop")
+    step(state, 0.0, decided(0, M))
+    step(state, 0.2, *AWAY)
+    asked = {"_switch": ("p2", None), "_end": ()}[ask]
+    conflict = {"_switch": problem(409, "step-conflict", expected_t=2), "_end": taken(1, 0.2)}[ask]
+    done = {
+        "_switch": SWITCHED,
+        "_end": answer({"spec_status": "pending", "robustness_bounds": [None, None]}),
+    }
+    result, sent, _ = drive(getattr(state, ask)(*asked, pose=(0.203, 0, 0)), conflict, done[ask])
+    assert not isinstance(result, Exception)
+    assert [json.loads(request.body)["t"] for request in sent] == [1, 2]
+    assert state.t == 2
+
+
+def test_a_session_read_back_passes_over_a_pose_that_came_with_a_switch():
+    """The process that told of it is gone, and the robot has been measured anew."""
+    state = robust(initial_pose=None, next_t=5)
+    decision, bodies = step(state, 0.203, taken(5, 0.2), decided(6, M))
+    assert (decision.t, [body["t"] for body in bodies]) == (6, [5, 6])
+
+
+def test_a_main_task_taken_back_is_told_to_the_caller_and_passes_nothing_over():
+    state = robust(initial_pose=None, next_t=5)
+    conflict = problem(409, "step-conflict", path="main_task_done")
+    error, bodies = step(state, 0.2, conflict, main_task_done=False)
+    assert (type(error), len(bodies), state.t) == (errors.StepConflict, 1, 5)
+
+
 def test_after_a_step_is_passed_over_the_continuation_that_began_before_it_is_not_followed():
     """It would come a step late, and its rule may not have one to spare."""
     state = robust()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from specshield.client import wire
 from specshield.client.away import Branch, Circuit, Continuation, OnFailure, is_away
 from specshield.client.calls import policies_asked
-from specshield.client.core import Flow, Within, call, deliver, fetch
+from specshield.client.core import Flow, T, Within, call, deliver, fetch
 from specshield.client.events import Events
 from specshield.client.models import (
     Decision,
@@ -68,7 +68,9 @@ class SessionState:
         self._poses: dict[int, Pose] = {} if initial_pose is None else {0: wire.pose_values(initial_pose)}
         self._continuation = Continuation(info.margin)
         self._circuit = Circuit()
-        self._unanswered = -1  # the step that was asked for last without an answer, and not passed over
+        # The step, not passed over, of which the service may have an x_t that nobody here was told of: it was
+        # asked for without an answer, by whoever had the session before, or came with a switch.
+        self._unanswered = info.next_t if initial_pose is None else -1
 
     def __repr__(self) -> str:
         over = "over" if self.finished else f"next step {self.t}"
@@ -145,7 +147,8 @@ class SessionState:
         error: SpecshieldError | None = None
         if self._circuit.due:
             try:
-                decision = yield from self._ask(x_t, body, own, 1 if self._circuit.open else TRIES)
+                tries = 1 if self._circuit.open else TRIES
+                decision = yield from self._ask(x_t, lambda x_t: self._decided(x_t, body, own, tries))
                 self._circuit.answered()
                 return decision
             except SpecshieldError as failed:
@@ -175,23 +178,26 @@ class SessionState:
             t, "witness", way.plan[0], reason, self.spec_status, way.plan[1:], leads, error=error
         )
 
-    def _ask(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
-        """The service's decision at t. One that it took here unheard, for another pose or other logits, is
-        passed over: the robot stood meanwhile, so x_t is the pose of the step after.
+    def _ask(self, pose: Numbers | None, asking: Callable[[Pose | None], Flow[T]]) -> Flow[T]:
+        """What `asking` brings at t. Where the service has taken x_t here unheard, from another pose or with
+        other logits, the step is passed over: the robot stood, so its pose now is that of the step after.
         """
+        x_t = None if pose is None else wire.pose_values(pose)
         asked, self._unanswered = self._unanswered, self.t  # until it is heard: a caller may cancel the step
         try:
-            return (yield from self._decided(x_t, body, own, tries))
+            return (yield from asking(x_t))
         except SpecshieldError as error:
             self._unanswered = self.t if is_away(error) else asked
-            if not isinstance(error, StepConflict) or asked != self.t:
+            stored = isinstance(error, HistoryConflict) and error.details.get("t") == self.t
+            taken = isinstance(error, StepConflict) and error.path != "main_task_done"
+            if asked != self.t or x_t is None or not (stored or taken):
                 raise
         self.record(x_t)
         self._stored = max(self._stored, self.t)
-        return (yield from self._ask(x_t, body, own, tries))
+        return (yield from self._ask(x_t, asking))
 
-    def _decided(self, x_t: Pose, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
-        t, over, poses = self.t, body["main_task_done"], {**self._poses, self.t: x_t}
+    def _decided(self, x_t: Pose | None, body: Mapping[str, Any], own: bool, tries: int) -> Flow[Decision]:
+        t, over, poses = self.t, body["main_task_done"], self._with(x_t)
         reply = yield from self._send("steps", poses, t, body, tries)
         decision = decision_of(wire.json_object(reply), self.info, over, wire.timings(reply))
         self._poses, self._stored, self.t, self._unanswered = poses, t + 1, t + 1, -1
@@ -200,7 +206,7 @@ class SessionState:
         self.main_task_done = over or ends
         self.finished = decision.finished or (ends and decision.spec_status != "pending")
         if self.on_failure == "witness":
-            self._continuation.learn(decision, x_t)
+            self._continuation.learn(decision, poses[t])
         return decision
 
     def _recall(self) -> Flow[None]:
@@ -230,30 +236,26 @@ class SessionState:
         Raises InfeasibleSwitch where the new rule cannot be kept from there; nothing is changed then.
         """
         body = {**policies_asked(policy_id, policy_ids), "clock": clock}
-        poses = self._poses if pose is None else {**self._poses, self.t: wire.pose_values(pose)}
-        if pose is None:
-            told = wire.post("sessions", self.id, "switch", body={"t": self.t, **body}, slow=True)
-            reply = (yield from deliver(told)).reply
-        else:
-            reply = yield from self._send("switch", poses, self.t, body, slow=True)
+        return (yield from self._ask(pose, lambda x_t: self._switched(x_t, body)))
+
+    def _switched(self, x_t: Pose | None, body: Mapping[str, Any]) -> Flow[SessionInfo]:
+        poses = self._with(x_t)
+        reply = yield from self._send("switch", poses, self.t, {"t": self.t, **body})
         info = build(SessionInfo, wire.json_object(reply))
         self.info, self.spec_status, self.finished = info, info.spec_status, info.finished
         self._poses, self._continuation = poses, Continuation(info.margin)
-        self._stored = max(self._stored, self.t + (pose is not None))
+        self._stored = max(self._stored, self.t + (x_t is not None))
         return info
 
     def _end(self, pose: Numbers | None = None) -> Flow[Verdict]:
         """End the session; `pose` is the state the last action led to."""
-        return (yield from self._close(pose, TRIES))
+        return (yield from self._ask(pose, lambda x_t: self._close(x_t, TRIES)))
 
-    def _close(self, pose: Numbers | None, tries: int) -> Flow[Verdict]:
+    def _close(self, x_t: Pose | None, tries: int) -> Flow[Verdict]:
         """With no pose at hand (a session read back, not stepped) it closes on what the server has."""
         yield Within(None)
-        poses = self._poses if pose is None else {**self._poses, self.t: wire.pose_values(pose)}
-        if poses:
-            reply = yield from self._send("close", poses, max(poses), {}, tries)
-        else:
-            reply = (yield from deliver(wire.post("sessions", self.id, "close", body={}, tries=tries))).reply
+        poses = self._with(x_t)
+        reply = yield from self._send("close", poses, max(poses, default=self.t), {}, tries)
         verdict = build(Verdict, wire.json_object(reply))
         self.closed = self.finished = True
         self.spec_status = verdict.spec_status
@@ -280,8 +282,7 @@ class SessionState:
     def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
         """The states x_0..x_t that the server has, and its answers."""
         body = yield from call(wire.get("sessions", self.id, "trajectory", slow=True))
-        raw: Page[Any] = build(Page, body)
-        return tuple(build(TrajectoryItem, item) for item in raw.items)
+        return tuple(build(TrajectoryItem, item) for item in build(Page, body).items)
 
     def _learned(self) -> Flow[Learned]:
         """The cells that the session found occupied or free though the map says otherwise."""
@@ -303,29 +304,28 @@ class SessionState:
     save_record = stepping(_save_record)
     close = stepping(_end)
 
+    def _with(self, x_t: Pose | None) -> dict[int, Pose]:
+        """The poses known, and x_t where it is given."""
+        return self._poses if x_t is None else {**self._poses, self.t: x_t}
+
     def _send(
-        self,
-        action: str,
-        poses: Mapping[int, Pose],
-        t: int,
-        body: Mapping[str, Any],
-        tries: int = TRIES,
-        slow: bool = False,
+        self, action: str, poses: Mapping[int, Pose], t: int, body: Mapping[str, Any], tries: int = TRIES
     ) -> Flow[Reply]:
         """Post the poses the server lacks up to x_t; on a gap once more, from where it says it stands. A pose
         that it took with a step whose answer was lost stands, whatever was recorded of that step since.
         """
         poses, start, gaps, joined = dict(poses), min(self._stored, t), 0, -1
         while True:
-            sent = {"t": t, "poses": [poses[i] for i in range(start, t + 1)], **body}
-            step = t if action == "steps" else None
+            known = {"t": t, "poses": [poses[i] for i in range(start, t + 1)]} if t in poses else {}
+            sent = {**known, **body}
+            step, slow = t if action == "steps" else None, action == "switch"
             request = wire.post("sessions", self.id, action, body=sent, slow=slow, tries=tries, t=step)
             reply = (yield from deliver(request)).reply
             try:
                 wire.check(reply)
             except HistoryGap as gap:
                 start, gaps = gap.details.get("expected_t", -1), gaps + 1
-                if gaps > 1 or not isinstance(start, int) or not all(i in poses for i in range(start, t)):
+                if gaps > 1 or not isinstance(start, int) or not all(i in poses for i in range(start, t + 1)):
                     raise  # it lacks poses that this session, once read back, never had
             except HistoryConflict as conflict:
                 start = conflict.details.get("t", -1)
