@@ -1,15 +1,17 @@
 """The client's connections."""
 
 import asyncio
+import math
 import multiprocessing
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import httpx
+import pytest
 
 from specshield.client import bounded
-from tests.serving import HUNG
+from tests.serving import HUNG, wait_for
 
 
 class _Port(BaseHTTPRequestHandler):
@@ -83,3 +85,19 @@ def test_another_event_loop_opens_connections_of_its_own():
     asyncio.run(client.aclose())  # in a third one, in which it has none
     server.shutdown()
     server.server_close()
+
+
+def test_what_is_made_after_an_interrupt_is_given_to_be_left(monkeypatch):
+    """Ctrl-C, or a signal handler that raises, while a stream connects: nobody waits for it any more."""
+
+    def interrupted(futures, timeout):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bounded, "wait", interrupted)
+    going_on, left = threading.Event(), []
+    with pytest.raises(KeyboardInterrupt):
+        bounded.in_thread(lambda: going_on.wait(10.0), math.inf, left.append)
+    assert left == []
+    going_on.set()
+    wait_for(lambda: left)
+    assert left[0].result()

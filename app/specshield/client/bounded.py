@@ -126,11 +126,12 @@ def look_up(host: str, port: int, by: float) -> list[str]:
         raise httpcore.ConnectError(str(error)) from error
 
 
-def in_thread(function: Callable[[], T], by: float) -> Future[T]:
+def in_thread(function: Callable[[], T], by: float, late: Callable[[Future[T]], object] = id) -> Future[T]:
     """Runs a function in a thread, and waits until `by` (time.monotonic() [s]) for its future to be done. The
-    interpreter does not wait for the thread at its exit, as it would for an executor's.
+    interpreter does not wait for the thread at its exit, as it would for an executor's. late: takes a future
+    that is done only after the wait, which an interrupt (Ctrl-C) may end as well.
     """
-    given = Future[T]()
+    given, done = Future[T](), set[Future[T]]()
 
     def run() -> None:
         try:
@@ -138,8 +139,12 @@ def in_thread(function: Callable[[], T], by: float) -> Future[T]:
         except BaseException as error:
             given.set_exception(error)
 
-    threading.Thread(target=run, daemon=True, name="specshield-client").start()
-    wait([given], max(by - time.monotonic(), 0.0))
+    try:  # an interrupt may come while the thread is started, too
+        threading.Thread(target=run, daemon=True, name="specshield-client").start()
+        done = wait([given], max(by - time.monotonic(), 0.0)).done
+    finally:
+        if not done:
+            given.add_done_callback(late)
     return given
 
 

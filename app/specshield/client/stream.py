@@ -90,17 +90,16 @@ class Streams:
         if over or self._open.setdefault((self._here(), path), connection) is not connection:
             self._leave(connection)
 
-    def _address(self, request: Request) -> str:
+    def _options(self, exchange: Exchange) -> dict[str, Any]:
+        """Of websockets' `connect`."""
         base = str(self._http.base_url.copy_with(scheme=self._http.base_url.scheme.replace("http", "ws")))
-        return base.rstrip("/") + request.path.removesuffix("/steps") + "/stream"
-
-    def _options(self, seconds: float) -> dict[str, Any]:
         key = self._http.headers.get("Authorization")
         return {
+            "uri": base.rstrip("/") + exchange.request.path.removesuffix("/steps") + "/stream",
             "additional_headers": {} if key is None else {"Authorization": key},
             "compression": None,
             "ping_interval": None,
-            "open_timeout": seconds,
+            "open_timeout": exchange.seconds,
             "max_size": LONGEST,
         }
 
@@ -153,17 +152,15 @@ class SyncStreams(Streams):
         """In a thread, since nothing can limit the time in which a name is looked up."""
         from websockets.sync.client import connect
 
-        address, options = self._address(exchange.request), self._options(exchange.seconds)
-        made: Future[Socket] = in_thread(lambda: connect(address, **options).__enter__(), exchange.ends)
+        def late(made: Future[Socket]) -> None:
+            if made.exception() is None:
+                leave(made.result())
+
+        options = self._options(exchange)
+        made: Future[Socket] = in_thread(lambda: connect(**options).__enter__(), exchange.ends, late)
         if not made.done():
-            made.add_done_callback(_leave_late)
             raise TimeoutError
         return made.result()
-
-
-def _leave_late(made: Future[Socket]) -> None:
-    if made.exception() is None:
-        leave(made.result())
 
 
 class AsyncStreams(Streams):
@@ -173,9 +170,8 @@ class AsyncStreams(Streams):
         import websockets
 
         try:
-            reply = await asyncio.wait_for(
-                self._asked(exchange, message), max(exchange.ends - time.monotonic(), 0.0)
-            )
+            seconds = max(exchange.ends - time.monotonic(), 0.0)
+            reply = await asyncio.wait_for(self._asked(exchange, message), seconds)
         except (asyncio.TimeoutError, TimeoutError):  # one and the same from Python 3.11 on
             return exchange.failure(httpx.ReadTimeout("the time of this try is over"))
         except (websockets.WebSocketException, OSError, UnicodeError) as error:
@@ -191,8 +187,7 @@ class AsyncStreams(Streams):
         if connection is None:
             for other in [kept for kept in list(self._open) if kept[0].is_closed()]:
                 self._open.pop(other, None)  # each asyncio.run has a loop of its own
-            options = self._options(exchange.seconds)
-            connection = await connect(self._address(exchange.request), **options).__aenter__()
+            connection = await connect(**self._options(exchange)).__aenter__()
         try:
             await connection.send(message)
             reply = self._read(exchange, await connection.recv())
