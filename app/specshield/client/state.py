@@ -183,6 +183,8 @@ class SessionState:
         other logits, the step is passed over: the robot stood, so its pose now is that of the step after.
         """
         x_t = None if pose is None else wire.pose_values(pose)
+        if self.on_failure == "raise":  # the caller is told what the service has, and goes on with `record`
+            return (yield from asking(x_t))
         asked, self._unanswered = self._unanswered, self.t  # until it is heard: a caller may cancel the step
         try:
             return (yield from asking(x_t))

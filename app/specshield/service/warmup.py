@@ -32,7 +32,7 @@ from specshield.policy.reachability.policy import synthesise
 from specshield.reasons.explanation import explanations
 from specshield.reasons.refusal import refusal
 from specshield.robot import STRETCH
-from specshield.robot.dynamics import make_body, motion_count, step, successors
+from specshield.robot.dynamics import make_body, motion_count, overlap, step, successors
 from specshield.service.sessions import record
 from specshield.service.storage.keeper import at_end_of_input
 from specshield.shield import episode
@@ -99,6 +99,7 @@ def _in_trouble(policy: Policy, logits: np.ndarray) -> None:
     was_stopped(shield, first.carry, np.array([START, START]))
     successors(shield.body, np.array(START), np.empty((motion_count(shield.body), 3)))
     step(shield.body, *START, 0)
+    overlap(shield.body, *START)
     for config in (Config(0.5), Config(0.5, uncertainty=Uncertainty(), threshold_over="episode")):
         episode.decide(make_shield([policy], config), [START], logits)
 
