@@ -21,7 +21,7 @@ from specshield.shield.taught import Taught, body_on, on_map
 from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, learn, revised
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
-DOUBTED_AFTER = 4  # [steps] what was run into is tried again where nothing else is left; chosen by hand
+DOUBTED_AFTER = 4  # [steps] then what was met is tried again where nothing else is left; chosen by hand
 MOST_PARTS = 4  # of those that no way keeps together: for which ways are asked that keep one; chosen by hand
 
 
@@ -51,7 +51,7 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
     lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
     before was wrong, and the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
-    forgotten, since no contact shows that a thing is gone. Last, all that the robot has passed is free.
+    forgotten, since no contact shows that a thing is gone. Last, all that the robot has just passed is free.
     """
     known, t = taught.map, prefix.t
     young = t - known.step < DOUBTED_AFTER
@@ -64,7 +64,7 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     if not (seen | young).all():
         yield taught._replace(map=revised(known, forget(known, ~(seen | young))))
     if told.config.learn_map:
-        body, poses = body_on(told, known), np.unique(prefix.poses, axis=0)
+        body, poses = body_on(told, known), prefix.poses[-1 - DOUBTED_AFTER :]  # earlier: maybe another map
         under = [cells_under(body, pose, 0.0) for pose in poses if overlap(body, *pose) > 0.0]
         passed = np.setdiff1d(np.concatenate([known.cell, *under]), known.cell)  # not what came there later
         free = learn(told.task.grid, known, t, passed, False, CONTACT)
