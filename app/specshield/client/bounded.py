@@ -126,7 +126,9 @@ def look_up(host: str, port: int, by: float) -> list[str]:
         raise httpcore.ConnectError(str(error)) from error
 
 
-def in_thread(function: Callable[[], T], by: float, late: Callable[[Future[T]], object] = id) -> Future[T]:
+def in_thread(
+    function: Callable[[], T], by: float, late: Callable[[Future[T]], object] | None = None
+) -> Future[T]:
     """Runs a function in a thread, and waits until `by` (time.monotonic() [s]) for its future to be done. The
     interpreter does not wait for the thread at its exit, as it would for an executor's. late: takes a future
     that is done only after the wait, which an interrupt (Ctrl-C) may end as well.
@@ -143,7 +145,7 @@ def in_thread(function: Callable[[], T], by: float, late: Callable[[Future[T]], 
         threading.Thread(target=run, daemon=True, name="specshield-client").start()
         done = wait([given], max(by - time.monotonic(), 0.0)).done
     finally:
-        if not done:
+        if not done and late is not None:
             given.add_done_callback(late)
     return given
 

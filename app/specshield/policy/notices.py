@@ -1,4 +1,4 @@
-"""What there is to warn of when a policy is made: a rule that no start keeps, or a part that asks nothing."""
+"""The warnings of a new policy: no start keeps its rule, it misses starts, or a part asks for nothing."""
 
 from __future__ import annotations
 

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import anyio
-import redis
-from redis.asyncio.retry import Retry
+import redis.asyncio
 from redis.backoff import NoBackoff
 
 from specshield.service.storage.wire import PART, Script, Wire, too_few
@@ -38,8 +37,7 @@ class Wires:
     def _look_again(self) -> None:
         """Has it asked which node has which keys, by a task: a silent node takes all the time of a caller."""
         if self._looking is None or self._looking.done():
-            looked = self._cluster.nodes_manager.initialize()
-            self._looking = asyncio.gather(looked, return_exceptions=True)
+            self._looking = asyncio.gather(self._cluster.nodes_manager.initialize(), return_exceptions=True)
 
     async def _run(self, script: Script, keys: Sequence[str], args: Sequence[Any]) -> Any:
         if not self._cluster.get_nodes():
@@ -61,7 +59,7 @@ class Wires:
             for gone in self._wires.keys() - {each.name for each in self._cluster.get_nodes()}:
                 self._wires.pop(gone).close()
             # As redis-py does: who asks a cluster tries again, not each connection.
-            options = {**node.connection_kwargs, "retry": Retry(NoBackoff(), 0)}
+            options = {**node.connection_kwargs, "retry": redis.asyncio.retry.Retry(NoBackoff(), 0)}
             wire = Wire(lambda: node.connection_class(**options), self._timeout, self._replicas)
             self._wires[node.name] = wire
         return wire

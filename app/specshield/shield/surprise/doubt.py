@@ -53,7 +53,7 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     before was wrong, and the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
     forgotten, since no contact shows that a thing is gone. Last, all that the robot has just passed is free.
     """
-    known, t = taught.map, prefix.t
+    known, t, body = taught.map, prefix.t, body_on(told, taught.map)
     young = t - known.step < DOUBTED_AFTER
     seen = ~known.occupied | (known.by == SENT)
     first = max(taught.followed.met - 1, 0) % len(GUESSES)
@@ -64,8 +64,8 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     if not (seen | young).all():
         yield taught._replace(map=revised(known, forget(known, ~(seen | young))))
     if told.config.learn_map:
-        body, poses = body_on(told, known), prefix.poses[-1 - DOUBTED_AFTER :]  # earlier: maybe another map
-        under = [cells_under(body, pose, 0.0) for pose in poses if overlap(body, *pose) > 0.0]
+        recent = prefix.poses[-1 - DOUBTED_AFTER :]  # older ones may be of a map before a switch
+        under = [cells_under(body, pose, 0.0) for pose in recent if overlap(body, *pose) > 0.0]
         passed = np.setdiff1d(np.concatenate([known.cell, *under]), known.cell)  # not what came there later
         free = learn(told.task.grid, known, t, passed, False, CONTACT)
         if len(free) > len(known):

@@ -22,7 +22,7 @@ from specshield.robot.body import Body, centre
 
 COARSE = 2  # cells of the map to a side of a field's, at least: 10 cm where the map has 5. By hand.
 MOST = 20_000  # cells of a field, which take some 2 ms; on larger maps they are larger
-SURE, ERROR = 0.95, 5.0  # the share of a distance that is surely left, once so many cells are off. By hand.
+SURE, ERROR = 0.95, 5.0  # any way is at least this share of the grid's distance, less so many cells; by hand
 REACH = 0.71  # [sides of a cell] that no place in a cell is farther from its centre
 NO_FIELDS = np.empty((0, 1, 1))  # for a search that the tables alone lead
 
