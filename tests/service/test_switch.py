@@ -300,6 +300,7 @@ def test_the_sdk_switches_and_watches(server, client, begin, step):
         info = session.switch(policy_ids=[crawling], clock="restart", pose=poses[4])
         assert session.info is info
         assert info.actions == ("crawl", "done", "rest")
+        assert [session.rule_at(t) for t in (3, 4)] == [rule["formula"] for rule in info.rules]
         decision = session.step(poses[4], [0.0, 9.0, 0.0])
         assert (decision.t, decision.execute in (0, 2)) == (4, True)
         events = session.events(-1)

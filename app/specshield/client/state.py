@@ -245,6 +245,7 @@ class SessionState:
         reply = yield from self._send("switch", poses, self.t, {"t": self.t, **body})
         info = build(SessionInfo, wire.json_object(reply))
         self.info, self.spec_status, self.finished = info, info.spec_status, info.finished
+        self._heard[:] = info.rules
         self._poses, self._continuation = poses, Continuation(info.margin)
         self._stored = max(self._stored, self.t + (x_t is not None))
         return info
