@@ -1,14 +1,16 @@
 """What is said of the conjuncts of a rule that cannot be kept is true: held against every future on cells."""
 
 import math
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 
 from specshield.handover import begun
 from specshield.policy.reachability.policy import synthesise
+from specshield.reasons.lateness import driven
 from specshield.reasons.refusal import begin, refusal
-from specshield.reasons.relaxation import relaxations
+from specshield.reasons.relaxation import relaxations, way
 from specshield.robot import robot_from_json
 from specshield.shield.episode import decide, make_shield
 from specshield.task import make_task
@@ -130,6 +132,39 @@ def test_whoever_lands_exactly_on_an_edge_is_one_step_short():
     found = relaxations(make_shield([synthesise(task)]), np.array([[1.5, 1.5, 0.0]]), {})
     assert found.way is None
     assert (found.conjuncts[0].late_by, found.conjuncts[0].feasible_alone) == (1, False)
+
+
+def test_two_places_that_can_just_be_visited_in_time_are():
+    """A step later the search met the first place too late, took that for a way, and looked no further."""
+    turns = [("go", 0.2, 0.0), ("left", 0.0, math.pi / 6), ("right", 0.0, -math.pi / 6)]
+    actions = [{"name": name, "translate": far, "rotate": turn} for name, far, turn in turns]
+    robot = robot_from_json({"footprint": {"radius": 0.1}, "actions": actions})
+    random, start, seen = np.random.default_rng(0), np.array([[2.0, 2.0, 0.0]]), 0
+
+    def asked(formula, *places):
+        regions = {
+            name: {"type": "circle", "center": place.tolist(), "radius": 0.12}
+            for name, place in zip("AB", places, strict=True)
+        }
+        task = make_task(OccupancyGrid(np.zeros((80, 80), bool), 0.05), robot, formula, regions)
+        return make_shield([Scripted(SimpleNamespace(task=task), waits)])
+
+    every = np.array(list(product(range(3), repeat=8)))
+    poses = driven(asked("F[0,8] A or F[0,8] B", *start[[0, 0], :2]), start, every)[..., :2]
+    for _ in range(300):
+        a = start[0, :2] + random.uniform(-0.8, 0.8, 2)
+        b = a + random.uniform(-0.8, 0.8, 2)
+        in_a, in_b = (np.linalg.norm(poses - place, axis=2) < 0.12 - 1e-9 for place in (a, b))
+        if not in_a[:, 1:].any():
+            continue
+        first = int(np.argmax(in_a.any(axis=0)))
+        after = in_b[in_a[:, first], first:].any(axis=0)
+        if after.any():
+            seen += 1
+            both = f"F[0,{first}] A and F[{first},{first + int(np.argmax(after))}] B"
+            found = way(asked(both, a, b), start, {})
+            assert found is not None, both
+    assert seen > 30
 
 
 def test_a_heading_that_can_be_had_is_feasible_alone():

@@ -94,7 +94,7 @@ def search(
         for k, goal in enumerate(goals):
             holds = known.at(goal.need.predicate, poses, SATISFIED_ABOVE) & (met >> k & 1 == 0)
             run[:, k] = np.where(holds & (step >= goal.need.first), run[:, k] + 1, 0)
-            met[run[:, k] > goal.need.stay] |= 1 << k
+            met[(run[:, k] > goal.need.stay) & (step - goal.need.stay <= goal.due)] |= 1 << k
             waiting |= holds & (step < goal.need.first)
         keep = _so_far(known, goals, poses, met)
         if not keep.all():
@@ -154,7 +154,7 @@ def _best(
     spare, hopeless = np.full(len(poses), np.inf), np.zeros(len(poses), np.bool_)
     for k, goal in enumerate(goals):
         ahead = np.ceil(goal.far[at] / ground.travel - 1e-9) if ground.travel > 0.0 else goal.far[at]
-        ahead = np.where(run[:, k] > 0, -run[:, k], ahead)  # what is being met was begun in time
+        ahead = np.where(run[:, k] > 0, 1 - run[:, k], ahead)  # what is being met was begun in time
         is_open = met >> k & 1 == 0
         hopeless |= is_open & (step + ahead > goal.due)
         spare = np.where(is_open, np.minimum(spare, goal.due - step - ahead), spare)
