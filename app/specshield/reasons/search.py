@@ -163,6 +163,5 @@ def _best(
     chosen = []
     for one in np.unique(met[order]):
         same = order[met[order] == one]
-        near = same[spare[same] >= spare[same[0]] - BEHIND]
-        chosen.append(near[:width])
+        chosen.append(same[spare[same] >= spare[same[0]] - BEHIND][:width])
     return np.concatenate(chosen) if chosen else np.empty(0, np.int64)
