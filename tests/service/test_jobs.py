@@ -9,11 +9,12 @@ import httpx
 import pytest
 from rq import Queue
 from rq.exceptions import DequeueTimeout
+from rq.serializers import JSONSerializer
 
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.training.children import TrainingWorker
-from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs
+from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, _alive
 from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
 from tests.serving import children, command_line, free_port, serving, wait_for
@@ -240,5 +241,26 @@ def test_a_worker_waits_for_work_longer_than_the_store_may_take_to_answer(tmp_pa
         with pytest.raises(DequeueTimeout):  # rq's word for an empty queue
             Queue.dequeue_any(worker.queues, 1, connection=worker.connection)
         assert worker.connection.connection_pool.get_connection().socket_timeout > worker.dequeue_timeout
+    finally:
+        store.leave()
+
+
+def test_a_run_that_left_the_queue_and_never_began_fails_and_can_be_asked_for_again(tmp_path):
+    """Its worker was killed in the moment between taking it and the first sign of life."""
+    store = EmbeddedStore(tmp_path)
+    store.join()
+    try:
+        jobs, id = Jobs(Settings(data_dir=tmp_path)), "a" * 64
+        jobs.worker_lives(["planner"])
+        jobs.start(id, "planner")
+        wait_for(lambda: not jobs.redis.exists(_alive(id)))
+        assert jobs.get(id).status == "queued"  # it waits, for however long
+        worker = _Worker(store.url, jobs, ["planner"], [])
+        job, _ = Queue.dequeue_any(worker.queues, 1, connection=worker.connection, serializer=JSONSerializer)
+        wait_for(lambda: jobs.get(id).status == "failed")
+        assert "worker is gone" in jobs.get(id).error
+        jobs.start(id, "planner")
+        assert jobs.get(id).status == "queued"
+        assert not jobs.report(*job.args, status="training")  # the worker was only slow, and comes too late
     finally:
         store.leave()

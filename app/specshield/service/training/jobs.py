@@ -1,7 +1,8 @@
 """Training runs: queued with rq, followed in `specshield:training:{id}`. Blocking.
 
 A run writes there only while its `attempt` is the latest, so cancelling or asking again is one write. A run
-that stops giving signs of life is reported as failed, whatever happened to its worker.
+that stops giving signs of life is reported as failed, whatever happened to its worker; so is one that has left
+the queue, where its attempt names its job, and never gave one.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from specshield.service.watch import logs
 ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
 SIGN_OF_LIFE = 5  # seconds without one after which a run, or the last worker, is taken for dead
 WRITE = """
-if redis.call('HGET', KEYS[1], 'attempt') ~= ARGV[1] then return 0 end
+local attempt, status = unpack(redis.call('HMGET', KEYS[1], 'attempt', 'status'))
+if attempt ~= ARGV[1] or status == 'ready' or status == 'failed' then return 0 end
 redis.call('HSET', KEYS[1], unpack(ARGV, 2))
 return 1
 """
@@ -62,6 +64,7 @@ class Jobs:
         """Queue a run for this policy."""
         attempt = secrets.token_hex(8)
         state = {"attempt": attempt, "status": "queued", "progress": 0, "eta_s": "", "error": ""}
+        self.sign_of_life(id, attempt)  # for as long as it is noted and not in the queue yet
         with reaching():
             self.redis.hset(_key(id), mapping={**state, "method": method})
             self._enqueue(id, attempt, method)
@@ -69,15 +72,19 @@ class Jobs:
 
     def _enqueue(self, id: str, attempt: str, method: str, at_front: bool = False) -> None:
         settings = self._settings
-        Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer).enqueue(
+        self._queue(method).enqueue(
             "specshield.service.training.worker.train",
             id,
             attempt,
+            job_id=attempt,
             job_timeout=settings.training_timeout if learns(method) else settings.synthesis_timeout,
             result_ttl=0,
             failure_ttl=24 * 3600,
             at_front=at_front,
         )
+
+    def _queue(self, method: str) -> Queue:
+        return Queue(queue_of(method), connection=self.redis, serializer=JSONSerializer)
 
     def get(self, id: str) -> Training:
         """How the training of a policy stands. One that the store knows nothing of counts as failed."""
@@ -86,13 +93,20 @@ class Jobs:
         status, error = state.get("status", "failed"), state.get("error") or None
         if status == "failed" and not state:
             error = "the store knows nothing of its training any more; ask for it again"
-        if status == "training" and not alive:
+        if status == "queued" and not alive and self._taken(state["method"], state["attempt"]):
+            self.sign_of_life(id, state["attempt"])  # a worker has it, which may be dead: so it has this long
+            self.report(id, state["attempt"], status="training")
+            status = "training"
+        elif status == "training" and not alive:
             status = "failed"
             error = "its worker is gone; ask for it again: what learns goes on from its last checkpoint"
-        if status == "queued" and "method" in state and not self.worker_there(state["method"]):
+        if status == "queued" and not self.worker_there(state["method"]):
             error = "it waits for a worker that makes such policies: none is running"
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
+
+    def _taken(self, method: str, attempt: str) -> bool:
+        return reached(lambda: self.redis.lpos(self._queue(method).key, attempt)) is None
 
     def cancel(self, id: str) -> None:
         """Cancels the run. One that has begun stops within about a second, a queued one at its turn."""
@@ -110,7 +124,7 @@ class Jobs:
         def ask() -> tuple[list[int], dict[bytes, bytes]]:
             with self.redis.pipeline(transaction=False) as pipe:
                 for name in methods:
-                    queue = Queue(queue_of(name), connection=self.redis, serializer=JSONSerializer)
+                    queue = self._queue(name)
                     pipe.llen(queue.key)
                     pipe.zcard(queue.started_job_registry.key)
                 pipe.hgetall(ENDED)
@@ -128,12 +142,13 @@ class Jobs:
 
     def hand_back(self, id: str, attempt: str, method: str) -> None:
         """Queue a run whose worker stops before all others, unless it was cancelled or asked for again."""
-        if self.report(id, attempt, status="queued", eta_s=""):
-            reached(lambda: self._enqueue(id, attempt, method, at_front=True))
+        again = secrets.token_hex(8)
+        if self.report(id, attempt, attempt=again, status="queued", eta_s=""):
+            reached(lambda: self._enqueue(id, again, method, at_front=True))
 
     # --- for the run itself
 
-    def report(self, id: str, attempt: str, **fields: Any) -> bool:
+    def report(self, id: str, attempt: str, /, **fields: Any) -> bool:
         """Notes how the run stands. False, with nothing noted, once it was cancelled or asked for again."""
         pairs = [part for pair in fields.items() for part in pair]
         return bool(reached(lambda: self._write(keys=[_key(id)], args=[attempt, *pairs])))
