@@ -3,10 +3,12 @@
 import os
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import httpx
 import pytest
+import redis
 from rq import Queue
 from rq.exceptions import DequeueTimeout
 from rq.serializers import JSONSerializer
@@ -17,7 +19,8 @@ from specshield.service.training.children import TrainingWorker
 from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, _alive
 from specshield.service.training.worker import _Worker
 from tests.service.world import ROBOT, START, grid_json
-from tests.serving import children, command_line, free_port, serving, wait_for
+from tests.serving import children, command_line, free_port, runs, serving, wait_for
+from tests.stores import DURABLE, answers, running
 
 pytest.importorskip("torch")
 
@@ -175,6 +178,30 @@ def test_a_run_that_gets_no_time_of_the_processor_is_not_taken_for_dead(server, 
     time.sleep(SIGN_OF_LIFE + 2.0)  # its last sign of its own has passed
     assert read(client, policy)["status"] == "training"
     os.kill(run, signal.SIGCONT)
+
+
+def test_a_run_goes_on_when_the_store_comes_back(tmp_path):
+    """Its notes of how far it is are lost meanwhile."""
+    port = free_port()
+    url, options = f"redis://127.0.0.1:{port}", ("--port", str(port), *DURABLE)
+    with ExitStack() as stack:
+        store = stack.enter_context(running(tmp_path / "store", *options))
+        node = stack.enter_context(redis.Redis(port=port))
+        wait_for(lambda: answers(node))
+        training = {"SPECSHIELD_WORKER": "true", "REDIS_URL": url}
+        server = stack.enter_context(serving(tmp_path / "data", **training))
+        client = stack.enter_context(httpx.Client(base_url=server.url, verify=False, timeout=None))
+        policy = ask(client, options=LONG)
+        wait_for(lambda: read(client, policy)["eta_s"])
+        (run,) = children(learner_of(server))
+        store.terminate()
+        store.wait()
+        time.sleep(1.0)  # several notes, and fewer seconds than without which it is taken for dead
+        stack.enter_context(running(tmp_path / "store", *options))
+        before = read(client, policy)["progress"]
+        wait_for(lambda: read(client, policy)["progress"] > before or not runs(run))
+        assert runs(run)
+        assert read(client, policy)["status"] == "training"
 
 
 def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait(server, client):

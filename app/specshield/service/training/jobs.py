@@ -1,8 +1,7 @@
 """Training runs: queued with rq, followed in `specshield:training:{id}`. Blocking.
 
-A run writes there only while its `attempt` is the latest, so cancelling or asking again is one write. A run
-that stops giving signs of life is reported as failed, whatever happened to its worker; so is one that has left
-the queue, where its attempt names its job, and never gave one.
+A run writes there only while its `attempt`, the name of its job, is the latest, so cancelling or asking
+again is one write. One that stops giving signs of life, or gave none since it left the queue, has failed.
 """
 
 from __future__ import annotations
@@ -93,7 +92,7 @@ class Jobs:
         status, error = state.get("status", "failed"), state.get("error") or None
         if status == "failed" and not state:
             error = "the store knows nothing of its training any more; ask for it again"
-        if status == "queued" and not alive and self._taken(state["method"], state["attempt"]):
+        if status == "queued" and not alive and not self._waits(state):
             self.sign_of_life(id, state["attempt"])  # a worker has it, which may be dead: so it has this long
             self.report(id, state["attempt"], status="training")
             status = "training"
@@ -105,8 +104,9 @@ class Jobs:
         eta = state.get("eta_s")
         return Training(status, float(state.get("progress", 0.0)), float(eta) if eta else None, error)
 
-    def _taken(self, method: str, attempt: str) -> bool:
-        return reached(lambda: self.redis.lpos(self._queue(method).key, attempt)) is None
+    def _waits(self, state: dict[str, str]) -> bool:
+        key = self._queue(state["method"]).key
+        return reached(lambda: self.redis.lpos(key, state["attempt"])) is not None
 
     def cancel(self, id: str) -> None:
         """Cancels the run. One that has begun stops within about a second, a queued one at its turn."""

@@ -192,7 +192,8 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: thr
     about = policies.record(id).about
 
     def on_progress(done: float, seconds_left: float, said: str) -> None:
-        jobs.report(id, attempt, progress=round(done, 4), eta_s=round(seconds_left, 1))
+        with suppress(StoreError):  # it is told the next time; a run of hours does not end for it
+            jobs.report(id, attempt, progress=round(done, 4), eta_s=round(seconds_left, 1))
 
     method = METHODS.get(about.method)
     run = Run(about.seed, about.spec, policies.checkpoints(id), on_progress, cancelled.is_set)
