@@ -32,7 +32,7 @@ def pooled(array: NDArray[Kind], join: np.ufunc, reach: int, axis: int, mode: An
 
 
 @inlined
-def copy_row(row: Floats, to: Floats) -> None:
+def copy_row(row: NDArray[Kind], to: NDArray[Kind]) -> None:
     """to[:] = row, for rows of one length. For that, numba compiles a message about other lengths: 1.6 s."""
     for i in range(row.shape[0]):
         to[i] = row[i]

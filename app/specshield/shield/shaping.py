@@ -35,28 +35,17 @@ def log_prior_of(robot: Robot, logits: ArrayLike | None, main_task_done: bool) -
     if logits is None:
         if main_task_done:
             return None
-        raise LogitsError(
-            "logits are missing",
-            path="logits",
-            got=None,
-            expected=f"{n} numbers; null once main_task_done is true",
-        )
+        expected = f"{n} numbers; null once main_task_done is true"
+        raise LogitsError("logits are missing", path="logits", got=None, expected=expected)
     array = np.asarray(logits, dtype=np.float64)
     if array.shape != (n,):
-        raise LogitsError(
-            "the wrong number of logits",
-            path="logits",
-            got=array.shape[0] if array.ndim == 1 else list(array.shape),
-            expected=f"{n}, one for each of {', '.join(robot.action_names)}",
-        )
+        got = array.shape[0] if array.ndim == 1 else list(array.shape)
+        expected = f"{n}, one for each of {', '.join(robot.action_names)}"
+        raise LogitsError("the wrong number of logits", path="logits", got=got, expected=expected)
     i = _wrong(array)
     if 0 <= i < n:
-        raise LogitsError(
-            "a logit is NaN or +infinity",
-            path=f"logits[{i}]",
-            got=str(array[i]),
-            expected="a number, or null for -inf",
-        )
+        wrong, expected = "a logit is NaN or +infinity", "a number, or null for -inf"
+        raise LogitsError(wrong, path=f"logits[{i}]", got=str(array[i]), expected=expected)
     if i == n:
         raise LogitsError(
             "every logit is null", path="logits", got="all null", expected="at least one finite logit"
@@ -82,16 +71,28 @@ def going_on(log_prior: Floats, terminal: Bools) -> tuple[Floats | None, float]:
     None where it ends for certain.
     """
     ending = min(np.sum(np.exp(log_prior[terminal])), 1.0)  # a sum may be rounded up
-    kept = np.where(terminal, -np.inf, log_prior)
-    if np.max(kept) == -np.inf:
-        return None, ending
-    return log_softmax(kept), ending
+    return conditional(log_prior, ~terminal), ending
+
+
+@kernel
+def conditional(log_prior: Floats, allowed: Bools) -> Floats | None:
+    """Log-probabilities given that an allowed action is drawn; None where those have no mass. Shapes (A,)."""
+    kept, some = log_prior.copy(), False
+    for a in range(kept.shape[0]):  # numba takes a second to compile np.where
+        if not allowed[a]:
+            kept[a] = -np.inf
+        some |= kept[a] > -np.inf
+    return log_softmax(kept) if some else None
 
 
 @kernel
 def with_ending(body: Floats, log_prior: Floats, ending: float, terminal: Bools) -> Floats:
     """`body`, for if the model does not end, with the prior's own mass on what ends its task. Shapes (A,)."""
-    return np.where(terminal, np.exp(log_prior), (1.0 - ending) * body)
+    result = (1.0 - ending) * body
+    for a in range(result.shape[0]):
+        if terminal[a]:
+            result[a] = np.exp(log_prior[a])
+    return result
 
 
 @kernel
@@ -100,13 +101,10 @@ def feasible_mass(log_prior: Floats, feasible: Bools) -> float:
     return float(min(np.sum(np.exp(log_prior[feasible])), 1.0))
 
 
-@kernel
 def restrict(log_prior: Floats, feasible: Bools) -> Floats | None:
     """Threshold 1: the prior on S_t, renormalised (the limit of eq. 16). None if it has no mass there."""
-    logits = np.where(feasible, log_prior, -np.inf)
-    if not np.any(np.isfinite(logits)):
-        return None
-    return np.exp(log_softmax(logits))
+    kept = conditional(log_prior, feasible)
+    return None if kept is None else exp(kept)
 
 
 def soften(log_prior: Floats, feasible: Bools, threshold: float) -> Floats | None:
@@ -116,11 +114,10 @@ def soften(log_prior: Floats, feasible: Bools, threshold: float) -> Floats | Non
     """
     if feasible_mass(log_prior, feasible) >= threshold:
         return exp(log_prior)
-    on = restrict(log_prior, feasible)
-    off = restrict(log_prior, ~feasible)
-    if on is None:
-        return None
-    return on if off is None else threshold * on + (1.0 - threshold) * off
+    on, off = restrict(log_prior, feasible), restrict(log_prior, ~feasible)
+    if on is None or off is None:
+        return on
+    return threshold * on + (1.0 - threshold) * off
 
 
 def tilt(log_prior: Floats, values: Floats, threshold: float) -> Floats | None:

@@ -84,7 +84,13 @@ def begin(guide: Guide, past: Past, wanted: Bools, motions: Ints, poses: Floats)
         copy_progress(scratch.status, scratch.run, status[m], run[m])
         slacks[m] = slack(guide, x, y, theta, now.t + 1, scratch)
     find_twins(poses, twin)
-    order, settled = np.argsort(-slacks, kind="mergesort"), np.zeros(count, np.bool_)
+    order, settled = np.empty(count, np.int64), np.zeros(count, np.bool_)
+    for m in range(count):  # numba takes a second to compile a sort
+        k = m
+        while k > 0 and slacks[order[k - 1]] < slacks[m]:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = m
     if not np.any(wanted):
         waits = guide.wait >= 0 and slacks[guide.wait] == slacks[order[0]]
         wanted[guide.wait if waits else order[0]] = True

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from specshield.arrays import Floats, Int8s, Ints
+from specshield.arrays import Floats, Int8s, Ints, copy_row
 from specshield.compiled import kernel, leaf
 from specshield.policy.detour import join
 from specshield.policy.lattice import coordinates, find_corners, reads_heading
@@ -123,7 +123,7 @@ def go_around(guide: Guide, past: Past, fields: Floats, poses: Floats, motions: 
     for m in range(count):
         motions[m, 1:] = guide.wait if guide.wait >= 0 else m
         if m == way[0]:
-            motions[m] = way
+            copy_row(way, motions[m])
         elif guide.wait >= 0:
             go_back(guide, t, m, way, led, starts, scratch)
         elif starts.turn[m] != IMPOSSIBLE:
