@@ -10,7 +10,7 @@ import numpy as np
 from specshield.arrays import Bools, Bytes, Int32s, Ints, Singles
 from specshield.compiled import inlined, kernel, leaf
 from specshield.errors import Unsupported
-from specshield.policy.lattice import pose_of
+from specshield.policy.lattice import coordinates, find_corners, pose_of
 from specshield.policy.progress import (
     ALWAYS,
     EVENTUALLY_ALWAYS,
@@ -22,7 +22,7 @@ from specshield.policy.progress import (
     value_count,
 )
 from specshield.policy.reachability.guide import make_scratch
-from specshield.policy.reachability.tables import Guide, Tables, slack
+from specshield.policy.reachability.tables import Guide, Tables, slack_at
 from specshield.policy.shape import heading_count
 from specshield.robot.barred import NOTHING_BARRED
 from specshield.robot.dynamics import Body, displacement, in_collision, longest_motions, motion_count, step
@@ -193,7 +193,7 @@ def _survey(body: Body, rules: Rules, planes: Planes) -> None:
 @kernel
 def _rule_out(guide: Guide, planes: Planes) -> None:
     """Leaves `possible` 0 where the tables leave no slack, for each set of settled goals at each step."""
-    headings, cells = planes.valid.shape
+    (headings, cells), tables = planes.valid.shape, guide.tables
     scratch = make_scratch(guide.rules, 1)
     scratch.status[:], scratch.run[:] = PENDING, 0
     for t in range(planes.slot.shape[0] - 1):
@@ -203,8 +203,13 @@ def _rule_out(guide: Guide, planes: Planes) -> None:
                 continue
             for g in range(planes.goal.shape[0]):
                 scratch.status[planes.goal[g]] = SETTLED if mask >> g & 1 else PENDING
-            for h in range(headings):
-                for c in range(cells):
+            for c in range(cells):
+                if planes.row[c] < 0:
+                    continue
+                v, u, _ = coordinates(guide.body, tables.pitch, headings, *pose_at(guide.body, planes, 0, c))
+                known = find_corners(tables.cell, v, u, scratch.corners)  # the same for each heading
+                for h in range(headings):
                     if planes.valid[h, c]:
                         x, y, theta = pose_at(guide.body, planes, h, c)
-                        planes.possible[slot, h, c] = slack(guide, x, y, theta, t, scratch) >= 0.0
+                        left = slack_at(guide, x, y, theta, t, scratch, scratch.corners, known)
+                        planes.possible[slot, h, c] = left >= 0.0

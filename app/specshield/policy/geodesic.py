@@ -96,12 +96,12 @@ def _upwind(distance: Floats, done: Bools, i: int, j: int) -> float:
     return (a + b + math.sqrt(2.0 - (a - b) ** 2)) / 2.0
 
 
-def falling(free: Bools, onward: Floats, resolution: float) -> Floats:
+def falling(onward: Floats, off: Floats, resolution: float) -> Floats:
     """A height [height, width] that falls along the way to a goal: the distance `onward` to it through roomy
-    space; where that is inf, beside an obstacle, higher, so that the way first leads off it.
+    space; where that is inf, beside an obstacle, higher by the distance `off` to where it is not, so that the
+    way first leads off the obstacle.
     """
     reached = np.isfinite(onward)
-    off = geodesic_distance(free, reached, resolution)
     return np.where(reached, onward, onward[reached].max(initial=0.0) + resolution + off)
 
 

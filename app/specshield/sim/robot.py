@@ -100,5 +100,6 @@ def waypoints(case: Case) -> Floats:
     if not np.isfinite(onward[comfortable]).any():  # or where it is narrow all around
         narrow = free & (case.distance <= case.distance[comfortable].min(initial=np.inf))
         onward = geodesic_distance(comfortable | narrow, goal, grid.resolution)
-    cell = downhill(falling(free, onward, grid.resolution), LOOK_AHEAD)
+    off = geodesic_distance(free, np.isfinite(onward), grid.resolution)
+    cell = downhill(falling(onward, off, grid.resolution), LOOK_AHEAD)
     return grid.centres.reshape(-1, 2)[cell].reshape(*free.shape, 2)
