@@ -13,7 +13,7 @@ from specshield.shield.episode import decide, make_shield
 from specshield.shield.uncertainty import Uncertainty
 from specshield.sim.cases import load_case
 
-STEPS, SLOW_STEPS = 40, 10  # the latter of a look-ahead, which takes 0.1 s for each of its decisions
+STEPS = 40  # after which the look-ahead has weighed some of its decisions
 SETTINGS = {
     "projection": Config(),
     "cautious": Config(uncertainty=Uncertainty(), learn_map=True),
@@ -30,7 +30,7 @@ for name, config in SETTINGS.items():
     preference = prepare(case.task, [policy]) if name == "lookahead" else None
     shield, random = make_shield([policy], config, preference), np.random.default_rng(1)
     poses, carry, told = [begun], None, hashlib.sha256()
-    for _ in range(STEPS if preference is None else SLOW_STEPS):
+    for _ in range(STEPS):
         logits = 4.0 * random.normal(size=len(case.task.robot.actions))
         logits[case.task.robot.terminal] = -20.0
         decision = decide(shield, poses, logits, carry=carry)
