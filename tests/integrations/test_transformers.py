@@ -9,17 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-os.environ.setdefault("HF_HUB_OFFLINE", "1")
-torch = pytest.importorskip("torch")
-transformers = pytest.importorskip("transformers")
-
-from examples import action_tokens  # noqa: E402
-from specshield.client import LocalDecision  # noqa: E402
-from specshield.errors import InputError, LogitsError  # noqa: E402
-from specshield.integrations.transformers import ShieldLogitsProcessor, score_actions  # noqa: E402
+from specshield.client import LocalDecision
+from specshield.errors import InputError, LogitsError
 
 SEVERAL = [[3, 4, 5], [3, 4, 6], [3, 7], [8], [9, 3], [9]]  # with tokens that begin others'
 EOS = 1
+
+
+def setup_module() -> None:
+    """Not at the top, which every process of pytest runs: it takes 4 s."""
+    global action_tokens, torch, transformers, ShieldLogitsProcessor, score_actions
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")
+    torch, transformers = pytest.importorskip("torch"), pytest.importorskip("transformers")
+    from examples import action_tokens
+    from specshield.integrations.transformers import ShieldLogitsProcessor, score_actions
 
 
 @pytest.fixture(scope="module")

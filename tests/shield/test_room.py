@@ -77,18 +77,18 @@ def test_it_goes_round_by_the_wide_gap():
 
 
 @pytest.mark.parametrize(
-    ("made", "config"),
+    ("of", "config"),
     [
-        (policy(), {"uncertainty": None, "learn_map": False}),  # as in the paper
-        (policy(), {"learn_map": False}),  # the map is known to be right
-        (policy(BACK), {}),
-        (policy(steps=20), {}),  # there is no time to go round
-        (policy(steps=28), {}),  # there is, with 3 steps to spare in place of 14
-        (policy(wide=False), {}),
+        ({}, {"uncertainty": None, "learn_map": False}),  # as in the paper
+        ({}, {"learn_map": False}),  # the map is known to be right
+        ({"robot": BACK}, {}),
+        ({"steps": 20}, {}),  # there is no time to go round
+        ({"steps": 28}, {}),  # there is, with 3 steps to spare in place of 14
+        ({"wide": False}, {}),
     ],
 )
-def test_it_takes_the_narrow_gap_where_nothing_speaks_against_it_or_no_other_way_keeps_the_rule(made, config):
-    poses, status = way_of(shield_of(made, **config))
+def test_it_takes_the_narrow_gap_where_nothing_speaks_against_it_or_no_other_way_keeps_the_rule(of, config):
+    poses, status = way_of(shield_of(policy(**of), **config))
     assert status == "satisfied"
     assert 0.5 < crossing(poses) < 1.0
 
