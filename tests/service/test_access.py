@@ -2,8 +2,6 @@
 
 import http.client
 import json
-import subprocess
-import sys
 
 import pytest
 
@@ -12,7 +10,7 @@ from specshield.service.access.site import is_loopback, names_server
 from specshield.service.settings import read_settings
 from tests.service.test_bad_input import PGM, YAML, problem
 from tests.service.world import grid_json
-from tests.serving import HUNG
+from tests.serving import run_specshield
 
 ALLOWED = frozenset({"robots.example", "lab:8443"})
 
@@ -134,13 +132,7 @@ def test_types_that_a_route_does_not_take(client, kept):
 
 def serve(*options, **environment):
     """What a server that must not start says."""
-    done = subprocess.run(
-        [sys.executable, "-m", "specshield.cli", "serve", "--port", "0", *options],
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": ":".join(sys.path), **environment},
-        capture_output=True,
-        text=True,
-        timeout=HUNG,
-    )
+    done = run_specshield("serve", "--port", "0", *options, **environment)
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
     return done.stderr

@@ -1,13 +1,12 @@
 """The command without its parts, and with settings that cannot be."""
 
-import os
 import socket
 import subprocess
 import sys
 
 import pytest
 
-from tests.serving import HUNG, free_port
+from tests.serving import HUNG, free_port, run_specshield
 
 WITHOUT = """
 import sys
@@ -137,15 +136,7 @@ def test_what_is_not_installed_is_said(parts, arguments, told):
 def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environment, told, expected):
     (tmp_path / "file").touch()
     given = {name: value.replace("{folder}", str(tmp_path)) for name, value in environment.items()}
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
-    run = subprocess.run(
-        [sys.executable, "-m", "specshield.cli", command],
-        env={**kept, **given},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=HUNG,
-    )
+    run = run_specshield(command, cwd=tmp_path, **given)
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
     assert told in line
@@ -154,14 +145,7 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
 
 
 def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path):
-    run = subprocess.run(
-        [sys.executable, "-m", "specshield.cli", "worker"],
-        env={**os.environ, "REDIS_URL": f"redis://127.0.0.1:{free_port()}"},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=HUNG,
-    )
+    run = run_specshield("worker", cwd=tmp_path, REDIS_URL=f"redis://127.0.0.1:{free_port()}")
     assert run.returncode == 1
     assert run.stderr.splitlines()[-1] == "the store cannot be reached: ConnectionError"
     assert "Traceback" not in run.stderr
@@ -169,17 +153,10 @@ def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path):
 
 @pytest.mark.parametrize("more", [[], ["--workers", "2"]])
 def test_why_the_store_does_not_start_is_said_in_one_line(tmp_path, more):
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("SPECSHIELD_") and k != "REDIS_URL"}
     folder = tmp_path / "store" / "appendonlydir"
     folder.mkdir(parents=True)
     (folder / "appendonly.aof.manifest").write_text("not a manifest\n")
-    run = subprocess.run(
-        [sys.executable, "-m", "specshield.cli", "serve", "--port", "0", *more],
-        env={**kept, "SPECSHIELD_DATA_DIR": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=HUNG,
-    )
+    run = run_specshield("serve", "--port", "0", *more, SPECSHIELD_DATA_DIR=str(tmp_path))
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
     assert line.startswith("the embedded store does not start: Invalid AOF manifest file format; see ")
@@ -189,13 +166,7 @@ def test_why_the_store_does_not_start_is_said_in_one_line(tmp_path, more):
 def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        run = subprocess.run(
-            [sys.executable, "-m", "specshield.cli", "serve", "--port", port],
-            env={**os.environ, "SPECSHIELD_DATA_DIR": str(tmp_path)},
-            capture_output=True,
-            text=True,
-            timeout=HUNG,
-        )
+        run = run_specshield("serve", "--port", port, SPECSHIELD_DATA_DIR=str(tmp_path))
     assert run.returncode == 1
     (line,) = run.stderr.splitlines()
     assert line.startswith(f"the server cannot listen on 127.0.0.1 at port {port}: Address already in use;")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -40,12 +41,16 @@ def fewest_steps_out(body, pose):
     raise AssertionError("more than four steps")
 
 
+@cache
+def policy_of(method):
+    return planner.synthesise(CASE.task) if method == "planner" else shipped(CASE, method)
+
+
 @pytest.mark.parametrize("method", ["reachability", "dqn", "planner"])
 @pytest.mark.parametrize("pose", [(6.65, 4.7, 0.0), (6.45, 4.7, 0.0), (6.7, 5.2, -0.5)])
 @pytest.mark.parametrize("when", [0, 20])
 def test_it_leaves_at_once_and_keeps_the_rest(method, pose, when):
-    policy = planner.synthesise(CASE.task) if method == "planner" else shipped(CASE, method)
-    shield, random = make_shield([policy]), np.random.default_rng(3)
+    shield, random = make_shield([policy_of(method)]), np.random.default_rng(3)
     x, history, carry = ELSEWHERE, [], None
     for t in range(CASE.task.horizon):
         history.append(pose if t == when else x)  # a localisation that jumps
