@@ -169,13 +169,10 @@ def serving(
 def run_specshield(
     *arguments: object, cwd: Path | None = None, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    """`specshield` to its end, forked where that will do. environment: settings beside this process's own."""
-    words, given = [str(each) for each in arguments], {**_environment(), **environment}
-    if READ_AT_IMPORT & environment.keys():
-        program = [sys.executable, "-m", "specshield.cli", *words]
-        return subprocess.run(program, cwd=cwd, env=given, capture_output=True, text=True, timeout=HUNG)
+    """`specshield`, forked, to its end. environment: settings beside this process's variables."""
     with tempfile.TemporaryDirectory() as folder:
         out, err = Path(folder, "stdout"), Path(folder, "stderr")
+        words, given = [str(each) for each in arguments], {**_environment(), **environment}
         process = Forked(words, given, stdout=out, stderr=err, cwd=cwd or Path.cwd())
         try:
             code = process.wait(HUNG)
