@@ -25,11 +25,6 @@ def shown(key: str) -> str:
     return key.partition("@")[2]
 
 
-def between(owner: str) -> tuple[str, str]:
-    """The first key that this owner may have, and the first one after all of them, in lexical order."""
-    return f"{owner}@", f"{owner}A"  # A follows @
-
-
 def _owner(request: Request) -> str:
     return str(request.scope["state"].get("owner", ""))
 

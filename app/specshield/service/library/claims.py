@@ -13,7 +13,6 @@ import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +35,6 @@ class Claims:
         be away before.
         """
         self._store, self._settings = connected, settings
-
-    @cached_property
-    def _script(self) -> Any:
-        return self._store().register_script(SCRIPT)
 
     def ids(self, kind: str, owner: str) -> list[str]:
         return sorted(id.decode() for id in reached(lambda: self._store().hkeys(_key(kind, owner))))
@@ -164,7 +159,8 @@ class Claims:
         places += [("uses", about, owner), ("maps", owner), ("mark", "maps", about)]
         places += [("names", kind, owner), ("named", kind, owner), ("policies", owner), ("sizes", kind)]
         keys = [_key(*place) for place in places]
-        said = reached(lambda: self._script(keys=keys, args=[what, kind, id, owner, token, *more]))
+        args = [what, kind, id, owner, token, *more]
+        said = reached(lambda: self._store().eval(SCRIPT, len(keys), *keys, *args))
         return str(said.decode())
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import anyio
 
 from specshield.errors import LimitReached, SessionExists
-from specshield.service.access.owners import between, shown
+from specshield.service.access.owners import shown
 from specshield.service.storage.connect import connect, is_cluster, reaching
 from specshield.service.storage.wire import Script, Wire
 from specshield.service.storage.wires import Wires
@@ -235,10 +235,8 @@ class Store:
 
 
 def _range(owner: str | None) -> tuple[str, str]:
-    if owner is None:
-        return "-", "+"
-    first, end = between(owner)
-    return f"[{first}", f"({end}"
+    """Where INDEX has an owner's sessions, or with None all: from owner@ to before ownerA. A follows @."""
+    return ("-", "+") if owner is None else (f"[{owner}@", f"({owner}A")
 
 
 def keys(id: str) -> list[str]:

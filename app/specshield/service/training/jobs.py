@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 from rq import Queue
 from rq.serializers import JSONSerializer
 
+from specshield.errors import StoreError
 from specshield.policy.methods import METHODS
 from specshield.service.library.claims import reached
 from specshield.service.settings import Settings
@@ -22,12 +24,13 @@ from specshield.service.storage.connect import connect, reaching
 from specshield.service.watch import logs
 
 ENDED = "specshield:jobs:ended"  # a hash: "method state" to how many
+AGAIN = "ask for it again: what learns goes on from its last checkpoint"
 SIGN_OF_LIFE = 5  # seconds without one after which a run, or the last worker, is taken for dead
 WRITE = """
-local attempt, status = unpack(redis.call('HMGET', KEYS[1], 'attempt', 'status'))
-if attempt ~= ARGV[1] or status == 'ready' or status == 'failed' then return 0 end
+local attempt, status, method = unpack(redis.call('HMGET', KEYS[1], 'attempt', 'status', 'method'))
+if attempt ~= ARGV[1] or status == 'ready' or status == 'failed' then return '' end
 redis.call('HSET', KEYS[1], unpack(ARGV, 2))
-return 1
+return method
 """
 
 
@@ -51,10 +54,6 @@ class Jobs:
     def redis(self) -> Any:
         """Opened when it is first asked: a cluster is asked at once for its nodes, and may be away."""
         return connect(self._settings.store_url, blocking=True, socket_timeout=self._settings.store_timeout)
-
-    @cached_property
-    def _write(self) -> Any:
-        return self.redis.register_script(WRITE)
 
     def worker_there(self, method: str) -> bool:
         return bool(reached(lambda: self.redis.exists(_worker(method))))
@@ -98,7 +97,7 @@ class Jobs:
             status = "training"
         elif status == "training" and not alive:
             status = "failed"
-            error = "its worker is gone; ask for it again: what learns goes on from its last checkpoint"
+            error = f"its worker is gone; {AGAIN}"
         if status == "queued" and not self.worker_there(state["method"]):
             error = "it waits for a worker that makes such policies: none is running"
         eta = state.get("eta_s")
@@ -120,38 +119,41 @@ class Jobs:
     def counts(self) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], int]]:
         """By method and state: the runs that are queued or training now, and all that have ended."""
         methods = METHODS.names()
-
-        def ask() -> tuple[list[int], dict[bytes, bytes]]:
-            with self.redis.pipeline(transaction=False) as pipe:
-                for name in methods:
-                    queue = self._queue(name)
-                    pipe.llen(queue.key)
-                    pipe.zcard(queue.started_job_registry.key)
-                pipe.hgetall(ENDED)
-                *now, ended = pipe.execute()
-            return now, ended
-
-        now, ended = reached(ask)
+        with reaching(), self.redis.pipeline(transaction=False) as pipe:
+            for name in methods:
+                queue = self._queue(name)
+                pipe.llen(queue.key)
+                pipe.zcard(queue.started_job_registry.key)
+            pipe.hgetall(ENDED)
+            *now, ended = pipe.execute()
         live = [(name, state) for name in methods for state in ("queued", "training")]
         told = {tuple(key.decode().split(" ", 1)): int(count) for key, count in ended.items()}
         return dict(zip(live, now, strict=True)), told
 
-    def ended(self, method: str, state: str) -> None:
-        """Counts a run that came to its end, `ready` or `failed`."""
-        reached(lambda: self.redis.hincrby(ENDED, f"{method} {state}", 1))
-
-    def hand_back(self, id: str, attempt: str, method: str) -> None:
+    def hand_back(self, id: str, attempt: str) -> None:
         """Queue a run whose worker stops before all others, unless it was cancelled or asked for again."""
         again = secrets.token_hex(8)
-        if self.report(id, attempt, attempt=again, status="queued", eta_s=""):
+        if method := self.report(id, attempt, attempt=again, status="queued", eta_s=""):
             reached(lambda: self._enqueue(id, again, method, at_front=True))
+
+    def end(self, id: str, attempt: str, error: str | None) -> None:
+        """Notes that a run made its policy, or why it did not; of no effect once it was cancelled."""
+        told: dict[str, Any] = {} if error is None else {"error": error}
+        state, said = ("ready", "policy made") if error is None else ("failed", "policy not made")
+        if method := self.report(id, attempt, status=state, eta_s="", **(told or {"progress": 1})):
+            with suppress(StoreError):  # a count that is lost is no reason to fail
+                reached(lambda: self.redis.hincrby(ENDED, f"{method} {state}", 1))
+            logs.tell(said, policy_id=id, method=method, **told)
 
     # --- for the run itself
 
-    def report(self, id: str, attempt: str, /, **fields: Any) -> bool:
-        """Notes how the run stands. False, with nothing noted, once it was cancelled or asked for again."""
+    def report(self, id: str, attempt: str, /, **fields: Any) -> str:
+        """Notes how the run stands, and gives its method: "", with nothing noted, once it was cancelled or
+        asked for again.
+        """
         pairs = [part for pair in fields.items() for part in pair]
-        return bool(reached(lambda: self._write(keys=[_key(id)], args=[attempt, *pairs])))
+        method: bytes = reached(lambda: self.redis.eval(WRITE, 1, _key(id), attempt, *pairs))
+        return method.decode()
 
     def sign_of_life(self, id: str, attempt: str) -> bool:
         """Says that the run is alive. False once it was cancelled or asked for again."""

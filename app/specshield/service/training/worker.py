@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
-from rq import Worker, get_current_job
+from rq import Worker
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
@@ -25,7 +25,7 @@ from specshield.service.storage.connect import connect_to_jobs, reaching
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import at_end_of_input, follow_parent
 from specshield.service.storage.marker import check_files
-from specshield.service.training.jobs import SIGN_OF_LIFE, Jobs, learns, queue_of
+from specshield.service.training.jobs import AGAIN, SIGN_OF_LIFE, Jobs, learns, queue_of
 from specshield.service.watch import logs
 
 CONNECT = 5.0  # [s] for a connection to the store; its answers may take as long as there is no work
@@ -121,9 +121,7 @@ class _Worker(Worker):
         if self._running is not None:
             self.kill_horse()
             if self._running.origin in self._training:
-                method = self._running.origin.removeprefix(queue_of(""))
-                id, attempt = self._running.args
-                self._jobs.hand_back(id, attempt, method)
+                self._jobs.hand_back(*self._running.args)
         raise SystemExit(0)
 
     def _killed(self, job: Job, pid: int, status: int, usage: Any) -> None:
@@ -133,8 +131,8 @@ class _Worker(Worker):
         how = f"by signal {os.WTERMSIG(status)}" if killed else f"with status {status}"
         if killed and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
-        reason = f"the process that made it ended {how}"
-        _end(self._jobs, job, f"{reason}; ask for it again: what learns goes on from its last checkpoint")
+        id, attempt = job.args
+        self._jobs.end(id, attempt, f"the process that made it ended {how}; {AGAIN}")
 
 
 def train(id: str, attempt: str) -> None:
@@ -166,19 +164,7 @@ def train(id: str, attempt: str) -> None:
             log.exception("training of %s", id)
             name = type(error).__name__  # its text may tell of the inside: paths, lines of code
             reason = f"an unexpected {name}; the worker's log says more"
-        _end(jobs, get_current_job(), reason)
-
-
-def _end(jobs: Jobs, job: Any, error: str | None) -> None:
-    """Notes that a run made its policy, or why it did not; of no effect once it was cancelled."""
-    (id, attempt), method = job.args, job.origin.removeprefix(queue_of(""))
-    state, progress = ("ready", {"progress": 1}) if error is None else ("failed", {})
-    told = {} if error is None else {"error": error}
-    if jobs.report(id, attempt, status=state, eta_s=0 if error is None else "", **progress, **told):
-        with suppress(StoreError):  # a count that is lost is no reason to fail
-            jobs.ended(method, state)
-        said = "policy made" if error is None else "policy not made"
-        logs.tell(said, policy_id=id, method=method, **told)
+        jobs.end(id, attempt, reason)
 
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
