@@ -150,6 +150,18 @@ def test_a_run_tells_how_far_it_is_and_can_be_cancelled(server, client):
     assert client.get(f"/v1/policies/{policy['id']}").status_code == 404
 
 
+def test_a_cancelled_run_ends_whatever_it_is_doing(server, client):
+    """It may import, compile or compute for long and look at nothing else; here it stands still."""
+    policy = ask(client, options=LONG, seed=9)
+    reach(client, policy, "training")
+    (run,) = children(learner_of(server))
+    os.kill(run, signal.SIGSTOP)
+    assert client.delete(f"/v1/policies/{policy['id']}").status_code == 204
+    wait_for(lambda: not runs(run))
+    reach(client, ask(client, seed=10), "ready")  # by the same worker, which went on
+    assert read(client, policy)["error"] == "cancelled"
+
+
 def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, client):
     policy = ask(client, options=LONG, seed=2)
     reach(client, policy, "training")

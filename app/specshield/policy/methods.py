@@ -39,14 +39,12 @@ class Run:
 
     spec: the rule as it was asked for, for the card. checkpoints: a folder to save to, and to go on from.
     on_progress: told the share that is done, the seconds that are left, and what there is to say of it.
-    should_stop: whether to give up.
     """
 
     seed: int = 0
     spec: dict[str, Any] | None = None
     checkpoints: Path | None = None
     on_progress: Callable[[float, float, str], None] = lambda done, seconds_left, said: None
-    should_stop: Callable[[], bool] = lambda: False
 
 
 @dataclass(frozen=True)

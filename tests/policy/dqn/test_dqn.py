@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from specshield.errors import FragmentError
+from specshield.policy.dqn import train as training
 from specshield.policy.dqn.method import Settings
 from specshield.policy.dqn.network import NAMES
-from specshield.policy.dqn.train import Replay, Stopped, Training, measure, train, weights_of
+from specshield.policy.dqn.train import Replay, Training, measure, train, weights_of
 from specshield.policy.methods import Run, load_policy
 from specshield.policy.options import read_options
 from tests.policy.rooms import flat
@@ -55,10 +56,15 @@ def test_one_seed_one_policy(reward):
     assert not same(first, other)
 
 
-def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path):
-    asked = iter(range(1000))
-    with pytest.raises(Stopped):  # the replay buffer fills for 40 steps first, then updates 1 to 30
-        train(TASK, TINY, Run(3, checkpoints=tmp_path, should_stop=lambda: next(asked) >= 70))
+def test_a_stopped_training_resumes_where_its_checkpoint_was(tmp_path, monkeypatch):
+    def stop(done: float, *_: object) -> None:
+        if done * TINY.updates == 30:
+            raise InterruptedError
+
+    monkeypatch.setattr(training, "REPORT_EVERY", 10)
+    with pytest.raises(InterruptedError):
+        train(TASK, TINY, Run(3, checkpoints=tmp_path, on_progress=stop))
+    monkeypatch.undo()
     resumed = Training(TASK, TINY, 3)
     resumed.resume(tmp_path)
     assert (resumed.update, resumed.best_rate) == (20, resumed.latest)

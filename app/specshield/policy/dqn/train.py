@@ -41,16 +41,11 @@ LEAST_RATE = 0.02  # share of the learning rate that it falls to, linearly, by t
 REPORT_EVERY = 100  # updates
 
 
-class Stopped(Exception):
-    """`should_stop` ended the training."""
-
-
 def train(task: Task, settings: Settings, run: Run) -> Policy:
     """Trains pi_phi and returns it with its card.
 
     It saves to `run.checkpoints` at every evaluation, and resumes from there after a kill; the replay buffer
-    is not saved but filled anew. Raises FragmentError for a formula outside the fragment, Stopped when
-    `run.should_stop` says so.
+    is not saved but filled anew. Raises FragmentError for a formula outside the fragment.
     """
     training = Training(task, settings, run.seed)
     if run.checkpoints is not None:
@@ -58,8 +53,6 @@ def train(task: Task, settings: Settings, run: Run) -> Policy:
     began, first = time.monotonic(), training.update
     with ThreadPoolExecutor(1) as stepper:
         while training.update < settings.updates:
-            if run.should_stop():
-                raise Stopped
             if not training.advance(stepper):
                 continue
             last = training.update == settings.updates

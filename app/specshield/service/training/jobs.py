@@ -108,7 +108,7 @@ class Jobs:
         return reached(lambda: self.redis.lpos(key, state["attempt"])) is not None
 
     def cancel(self, id: str) -> None:
-        """Cancels the run. One that has begun stops within about a second, a queued one at its turn."""
+        """Cancels the run. One that has begun is ended within about a second, a queued one at its turn."""
         fields = {"attempt": "", "status": "failed", "error": "cancelled", "eta_s": ""}
         reached(lambda: self.redis.hset(_key(id), mapping=fields))
         logs.tell("policy cancelled", policy_id=id)

@@ -110,10 +110,15 @@ class _Worker(Worker):
         self._running: Any = None
 
     def execute_job(self, job: Job, queue: Any) -> None:
-        # The worker gives signs of life too: on a busy machine the run itself may get no time for them.
-        signs = _regularly(lambda: self._jobs.sign_of_life(*job.args))
+        def live() -> None:
+            if not self._jobs.sign_of_life(*job.args) and (run := self.horse_pid):  # 0: not begun, or ended
+                self._stopped_job_id = job.id  # rq then notes that it was meant to end
+                with suppress(ProcessLookupError):
+                    os.killpg(run, signal.SIGKILL)
+
         self._running = job
-        with signs if job.origin in self._training else nullcontext():
+        # The worker gives signs of life too: on a busy machine the run itself may get no time for them.
+        with _regularly(live) if job.origin in self._training else nullcontext():
             super().execute_job(job, queue)
         self._running = None
 
@@ -141,33 +146,26 @@ def train(id: str, attempt: str) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     settings = Settings()
     jobs = Jobs(settings)
-    cancelled = threading.Event()
-
-    def live() -> None:
-        if not jobs.sign_of_life(id, attempt):
-            cancelled.set()
-
-    live()  # first: a run that is said to train without a sign of life is taken for dead
+    # First: a run that is said to train without a sign of life is taken for dead.
+    jobs.sign_of_life(id, attempt)
     if not jobs.report(id, attempt, status="training"):
         return  # cancelled, or asked for again
     logs.tell("making a policy", policy_id=id)
-    with _regularly(live):
+    with _regularly(lambda: jobs.sign_of_life(id, attempt)):
         os.nice(10)  # this thread and those it starts: below servers and heavy/heavy.py; not signs of life
         reason = None
         try:
-            _train(settings, jobs, id, attempt, cancelled)
+            _train(settings, jobs, id, attempt)
         except SpecshieldError as error:
             reason = str(error)
         except Exception as error:
-            if cancelled.is_set():
-                return
             log.exception("training of %s", id)
             name = type(error).__name__  # its text may tell of the inside: paths, lines of code
             reason = f"an unexpected {name}; the worker's log says more"
         jobs.end(id, attempt, reason)
 
 
-def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: threading.Event) -> None:
+def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> None:
     # numba, torch and the rest are for the process of the run alone: the worker stays small.
     from specshield.policy.notices import notices
     from specshield.service.library.claims import Claims
@@ -182,7 +180,7 @@ def _train(settings: Settings, jobs: Jobs, id: str, attempt: str, cancelled: thr
             jobs.report(id, attempt, progress=round(done, 4), eta_s=round(seconds_left, 1))
 
     method = METHODS.get(about.method)
-    run = Run(about.seed, about.spec, policies.checkpoints(id), on_progress, cancelled.is_set)
+    run = Run(about.seed, about.spec, policies.checkpoints(id), on_progress)
     task = policies.task(about)
     policy = method.make(task, read_options(method.options, about.options), run)
     weights = policy.weights()
