@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from contextlib import ExitStack
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import httpx
@@ -171,6 +172,38 @@ def test_a_killed_run_fails_with_its_reason_and_can_be_asked_for_again(server, c
     assert "signal 9" in read(client, policy)["error"]
     assert ask(client, options=LONG, seed=2)["status"] == "queued"
     client.delete(f"/v1/policies/{policy['id']}")
+
+
+def test_a_run_that_takes_too_long_says_so_and_what_lengthens_its_limit(tmp_path):
+    with (
+        serving(tmp_path, SPECSHIELD_WORKER="true", SPECSHIELD_TRAINING_TIMEOUT="2") as server,
+        httpx.Client(base_url=server.url, verify=False, timeout=None) as client,
+    ):
+        policy = ask(client, options=LONG)
+        wait_for(lambda: read(client, policy)["status"] == "failed")
+        error = read(client, policy)["error"]
+    assert "more than the 2 s" in error
+    assert "SPECSHIELD_TRAINING_TIMEOUT" in error
+
+
+@pytest.mark.parametrize("status", [None, signal.SIGKILL])  # None: rq does not say how the run ended
+def test_a_run_that_rq_kills_at_its_limit_says_so_too(tmp_path, status):
+    """It does so a minute later where the run hears nothing: it stands still, or a kernel runs."""
+    store = EmbeddedStore(tmp_path)
+    store.join()
+    try:
+        jobs, id = Jobs(Settings(data_dir=tmp_path, synthesis_timeout=30)), "a" * 64
+        jobs.start(id, "planner")
+        worker = _Worker(store.url, jobs, ["planner"], [])
+        job, _ = Queue.dequeue_any(worker.queues, 1, connection=worker.connection, serializer=JSONSerializer)
+        job.ended_at = datetime.now(timezone.utc)
+        job.started_at = job.ended_at - timedelta(seconds=91)
+        worker._killed(job, 0, status, None)
+        error = jobs.get(id).error
+        assert "more than the 30 s" in error
+        assert "SPECSHIELD_SYNTHESIS_TIMEOUT" in error
+    finally:
+        store.leave()
 
 
 def test_a_run_whose_worker_is_killed_fails_and_another_worker_comes(server, client):

@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
-from rq import Worker
+from rq import Worker, get_current_job
 from rq.job import Job
 from rq.serializers import JSONSerializer
+from rq.timeouts import JobTimeoutException
 
 from specshield.errors import SpecshieldError, StoreError
 from specshield.policy.methods import METHODS, Run, available, missing
@@ -129,15 +130,17 @@ class _Worker(Worker):
                 self._jobs.hand_back(*self._running.args)
         raise SystemExit(0)
 
-    def _killed(self, job: Job, pid: int, status: int, usage: Any) -> None:
+    def _killed(self, job: Any, pid: int, status: int, usage: Any) -> None:
         if job.origin not in self._training:
             return
         killed = status and os.WIFSIGNALED(status)
         how = f"by signal {os.WTERMSIG(status)}" if killed else f"with status {status}"
         if killed and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
-        id, attempt = job.args
-        self._jobs.end(id, attempt, f"the process that made it ended {how}; {AGAIN}")
+        reason = f"the process that made it ended {how}"
+        if (job.ended_at - job.started_at).total_seconds() > job.timeout:
+            reason = _too_long(job)  # rq kills a run that does not hear of its limit
+        self._jobs.end(job.args[0], job.id, f"{reason}; {AGAIN}")
 
 
 def train(id: str, attempt: str) -> None:
@@ -158,11 +161,18 @@ def train(id: str, attempt: str) -> None:
             _train(settings, jobs, id, attempt)
         except SpecshieldError as error:
             reason = str(error)
+        except JobTimeoutException:
+            reason = f"{_too_long(get_current_job())}; {AGAIN}"
         except Exception as error:
             log.exception("training of %s", id)
             name = type(error).__name__  # its text may tell of the inside: paths, lines of code
             reason = f"an unexpected {name}; the worker's log says more"
         jobs.end(id, attempt, reason)
+
+
+def _too_long(job: Any) -> str:
+    setting = "TRAINING" if learns(job.origin.removeprefix(queue_of(""))) else "SYNTHESIS"
+    return f"it took more than the {job.timeout} s that it may, which SPECSHIELD_{setting}_TIMEOUT lengthens"
 
 
 def _train(settings: Settings, jobs: Jobs, id: str, attempt: str) -> None:
