@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -50,12 +49,8 @@ def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
     beside, nearest = distance_transform_edt(~roomy, sampling=pitch, return_indices=True)
     distance = np.empty((len(places), *free.shape), np.uint16)
     way = np.empty((len(places), *free.shape, 2), np.int8)
-    rooms, _ = label(roomy)
-
-    @cache
-    def off(room: int) -> Floats:
-        return geodesic_distance(free, rooms == room, pitch)  # from which the goals in it are reached
-
+    rooms, _ = label(roomy)  # the goals in one room are reached from the same places
+    off = {room: geodesic_distance(free, rooms == room, pitch) for room in {rooms[r, c] for r, c in places}}
     for g, (row, column) in enumerate(places):
         goal = np.zeros_like(free)
         goal[row, column] = True
@@ -64,7 +59,7 @@ def make_goals(body: Body, grid: OccupancyGrid) -> Goals:
         if np.any(free & np.isinf(to_go)):  # through a door too narrow to turn in
             to_go = np.where(np.isinf(to_go), geodesic_distance(free, goal, pitch), to_go)
         distance[g] = np.where(np.isfinite(to_go), np.minimum(100.0 * to_go, NO_PATH - 1), NO_PATH)
-        _steer(falling(onward, off(rooms[row, column]), pitch), way[g])
+        _steer(falling(onward, off[rooms[row, column]], pitch), way[g])
     return Goals(pitch, distance, way)
 
 

@@ -88,11 +88,8 @@ def conditional(log_prior: Floats, allowed: Bools) -> Floats | None:
 @kernel
 def with_ending(body: Floats, log_prior: Floats, ending: float, terminal: Bools) -> Floats:
     """`body`, for if the model does not end, with the prior's own mass on what ends its task. Shapes (A,)."""
-    result = (1.0 - ending) * body
-    for a in range(result.shape[0]):
-        if terminal[a]:
-            result[a] = np.exp(log_prior[a])
-    return result
+    shares: Floats = (1.0 - ending) * body * ~terminal + np.exp(log_prior) * terminal
+    return shares
 
 
 @kernel
