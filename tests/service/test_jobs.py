@@ -249,6 +249,28 @@ def test_a_run_goes_on_when_the_store_comes_back(tmp_path):
         assert read(client, policy)["status"] == "training"
 
 
+def test_a_run_that_fails_while_the_store_is_away_says_why_once_it_is_back(tmp_path):
+    port = free_port()
+    url, options = f"redis://127.0.0.1:{port}", ("--port", str(port), *DURABLE)
+    with ExitStack() as stack:
+        store = stack.enter_context(running(tmp_path / "store", *options))
+        node = stack.enter_context(redis.Redis(port=port))
+        wait_for(lambda: answers(node))
+        training = {"SPECSHIELD_WORKER": "true", "REDIS_URL": url}
+        server = stack.enter_context(serving(tmp_path / "data", **training))
+        client = stack.enter_context(httpx.Client(base_url=server.url, verify=False, timeout=None))
+        policy = ask(client, options=LONG)
+        wait_for(lambda: read(client, policy)["eta_s"])
+        (run,) = children(learner_of(server))
+        store.terminate()
+        store.wait()
+        os.kill(run, signal.SIGALRM)  # as rq tells it that its time is over
+        time.sleep(1.0)  # it tries meanwhile
+        stack.enter_context(running(tmp_path / "store", *options))
+        wait_for(lambda: read(client, policy)["status"] == "failed" and not runs(run))
+        assert "SPECSHIELD_TRAINING_TIMEOUT" in read(client, policy)["error"]
+
+
 def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait(server, client):
     running, waiting = (ask(client, options=LONG, seed=seed) for seed in (7, 8))
     reach(client, running, "training")

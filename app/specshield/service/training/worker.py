@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
@@ -30,6 +31,7 @@ from specshield.service.training.jobs import AGAIN, SIGN_OF_LIFE, Jobs, learns, 
 from specshield.service.watch import logs
 
 CONNECT = 5.0  # [s] for a connection to the store; its answers may take as long as there is no work
+PATIENCE = 60  # tries, a second or more apart, to note how a run ended; chosen by hand
 log = logging.getLogger("specshield")
 
 
@@ -149,8 +151,7 @@ def train(id: str, attempt: str) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     settings = Settings()
     jobs = Jobs(settings)
-    # First: a run that is said to train without a sign of life is taken for dead.
-    jobs.sign_of_life(id, attempt)
+    jobs.sign_of_life(id, attempt)  # first: a run that trains without one is taken for dead
     if not jobs.report(id, attempt, status="training"):
         return  # cancelled, or asked for again
     logs.tell("making a policy", policy_id=id)
@@ -167,7 +168,11 @@ def train(id: str, attempt: str) -> None:
             log.exception("training of %s", id)
             name = type(error).__name__  # its text may tell of the inside: paths, lines of code
             reason = f"an unexpected {name}; the worker's log says more"
-        jobs.end(id, attempt, reason)
+        for _ in range(PATIENCE):  # what it came to would be lost with a store that is away
+            with suppress(StoreError):
+                jobs.end(id, attempt, reason)
+                break
+            time.sleep(1.0)
 
 
 def _too_long(job: Any) -> str:
