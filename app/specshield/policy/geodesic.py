@@ -98,8 +98,7 @@ def _upwind(distance: Floats, done: Bools, i: int, j: int) -> float:
 
 def falling(onward: Floats, off: Floats, resolution: float) -> Floats:
     """A height [height, width] that falls along the way to a goal: the distance `onward` to it through roomy
-    space; where that is inf, beside an obstacle, higher by the distance `off` to where it is not, so that the
-    way first leads off the obstacle.
+    space; beside an obstacle, where that is inf, higher by the distance `off` to where it is finite.
     """
     reached = np.isfinite(onward)
     return np.where(reached, onward, onward[reached].max(initial=0.0) + resolution + off)

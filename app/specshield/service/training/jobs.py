@@ -96,8 +96,7 @@ class Jobs:
             self.report(id, state["attempt"], status="training")
             status = "training"
         elif status == "training" and not alive:
-            status = "failed"
-            error = f"its worker is gone; {AGAIN}"
+            status, error = "failed", f"its worker is gone; {AGAIN}"
         if status == "queued" and not self.worker_there(state["method"]):
             error = "it waits for a worker that makes such policies: none is running"
         eta = state.get("eta_s")
@@ -148,9 +147,7 @@ class Jobs:
     # --- for the run itself
 
     def report(self, id: str, attempt: str, /, **fields: Any) -> str:
-        """Notes how the run stands, and gives its method: "", with nothing noted, once it was cancelled or
-        asked for again.
-        """
+        """Notes how the run stands. Its method, or "" and nothing noted once it was cancelled or replaced."""
         pairs = [part for pair in fields.items() for part in pair]
         method: bytes = reached(lambda: self.redis.eval(WRITE, 1, _key(id), attempt, *pairs))
         return method.decode()

@@ -57,11 +57,9 @@ def serve(settings: Settings, until_eof: bool, others: Sequence[str] = (), learn
         at_end_of_input(lambda: os.kill(os.getpid(), signal.SIGTERM))
     methods = available()  # what is installed later is made by the next worker, whose queues include it
     learning = [name for name in methods if learns(name)]
-    if learner:
-        methods = learning
-    else:
+    if not learner:
         _tell(methods)
-        methods = [name for name in methods if name not in learning]
+    methods = learning if learner else [name for name in methods if name not in learning]
     second: subprocess.Popen[bytes] | None = None
 
     def live() -> None:
