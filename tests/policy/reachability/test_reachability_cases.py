@@ -55,8 +55,7 @@ def wander(shield, pose, random, check=None):
 
 
 @pytest.mark.parametrize("name", case_names())
-def test_wandering_episodes_and_every_witness_keep_the_rule_and_none_falls_back(name):
-    """Of more episodes, under other models and with shipped tables, see sim/test_invariants.py."""
+def test_thirty_wandering_episodes_keep_the_rule_and_never_fall_back(name):
     case = load_case(name)
     policy = synthesise(case.task)
     assert len(policy.weights()) < 10e6
@@ -65,7 +64,7 @@ def test_wandering_episodes_and_every_witness_keep_the_rule_and_none_falls_back(
 
     def check(history, decision):
         """A witness, simulated on from where the robot is, keeps the rule by the oracle."""
-        if random.random() < 0.93:
+        if random.random() < 0.97:
             return
         action = random.choice(
             [a for a, found in enumerate(decision.witnesses) if found is not None and a != END]
@@ -75,7 +74,7 @@ def test_wandering_episodes_and_every_witness_keep_the_rule_and_none_falls_back(
         simulate(shield.body, history[-1], motions, after)
         judged.append(margin(case.spec, np.concatenate([history, after])))
 
-    for pose in feasible_starts(shield, 12, random):
+    for pose in feasible_starts(shield, 30, random):
         history, modes = wander(shield, pose, random, check)
         assert set(modes) <= {"shaped", "prior"}
         assert margin(case.spec, history) > 0.0
