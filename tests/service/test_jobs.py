@@ -225,50 +225,49 @@ def test_a_run_that_gets_no_time_of_the_processor_is_not_taken_for_dead(server, 
     os.kill(run, signal.SIGCONT)
 
 
-def test_a_run_goes_on_when_the_store_comes_back(tmp_path):
+@pytest.fixture
+def orphaned(tmp_path):
+    """A run that learns, and whose store has just ended: its client, policy and process, and what starts the
+    store again.
+    """
+    port = free_port()
+    with ExitStack() as stack:
+
+        def start():
+            options = "--port", str(port), *DURABLE
+            return stack.enter_context(running(tmp_path / "store", *options))
+
+        store, node = start(), stack.enter_context(redis.Redis(port=port))
+        wait_for(lambda: answers(node))
+        training = {"SPECSHIELD_WORKER": "true", "REDIS_URL": f"redis://127.0.0.1:{port}"}
+        server = stack.enter_context(serving(tmp_path / "data", **training))
+        client = stack.enter_context(httpx.Client(base_url=server.url, verify=False, timeout=None))
+        policy = ask(client, options=LONG)
+        wait_for(lambda: read(client, policy)["eta_s"])
+        (run,) = children(learner_of(server))
+        store.terminate()
+        store.wait()
+        yield client, policy, run, start
+
+
+def test_a_run_goes_on_when_the_store_comes_back(orphaned):
     """Its notes of how far it is are lost meanwhile."""
-    port = free_port()
-    url, options = f"redis://127.0.0.1:{port}", ("--port", str(port), *DURABLE)
-    with ExitStack() as stack:
-        store = stack.enter_context(running(tmp_path / "store", *options))
-        node = stack.enter_context(redis.Redis(port=port))
-        wait_for(lambda: answers(node))
-        training = {"SPECSHIELD_WORKER": "true", "REDIS_URL": url}
-        server = stack.enter_context(serving(tmp_path / "data", **training))
-        client = stack.enter_context(httpx.Client(base_url=server.url, verify=False, timeout=None))
-        policy = ask(client, options=LONG)
-        wait_for(lambda: read(client, policy)["eta_s"])
-        (run,) = children(learner_of(server))
-        store.terminate()
-        store.wait()
-        time.sleep(1.0)  # several notes, and fewer seconds than without which it is taken for dead
-        stack.enter_context(running(tmp_path / "store", *options))
-        before = read(client, policy)["progress"]
-        wait_for(lambda: read(client, policy)["progress"] > before or not runs(run))
-        assert runs(run)
-        assert read(client, policy)["status"] == "training"
+    client, policy, run, start = orphaned
+    time.sleep(1.0)  # several notes, and fewer seconds than without which it is taken for dead
+    start()
+    before = read(client, policy)["progress"]
+    wait_for(lambda: read(client, policy)["progress"] > before or not runs(run))
+    assert runs(run)
+    assert read(client, policy)["status"] == "training"
 
 
-def test_a_run_that_fails_while_the_store_is_away_says_why_once_it_is_back(tmp_path):
-    port = free_port()
-    url, options = f"redis://127.0.0.1:{port}", ("--port", str(port), *DURABLE)
-    with ExitStack() as stack:
-        store = stack.enter_context(running(tmp_path / "store", *options))
-        node = stack.enter_context(redis.Redis(port=port))
-        wait_for(lambda: answers(node))
-        training = {"SPECSHIELD_WORKER": "true", "REDIS_URL": url}
-        server = stack.enter_context(serving(tmp_path / "data", **training))
-        client = stack.enter_context(httpx.Client(base_url=server.url, verify=False, timeout=None))
-        policy = ask(client, options=LONG)
-        wait_for(lambda: read(client, policy)["eta_s"])
-        (run,) = children(learner_of(server))
-        store.terminate()
-        store.wait()
-        os.kill(run, signal.SIGALRM)  # as rq tells it that its time is over
-        time.sleep(1.0)  # it tries meanwhile
-        stack.enter_context(running(tmp_path / "store", *options))
-        wait_for(lambda: read(client, policy)["status"] == "failed" and not runs(run))
-        assert "SPECSHIELD_TRAINING_TIMEOUT" in read(client, policy)["error"]
+def test_a_run_that_fails_while_the_store_is_away_says_why_once_it_is_back(orphaned):
+    client, policy, run, start = orphaned
+    os.kill(run, signal.SIGALRM)  # as rq tells it that its time is over
+    time.sleep(1.0)  # it tries meanwhile
+    start()
+    wait_for(lambda: read(client, policy)["status"] == "failed" and not runs(run))
+    assert "SPECSHIELD_TRAINING_TIMEOUT" in read(client, policy)["error"]
 
 
 def test_a_worker_that_is_told_to_stop_hands_its_run_back_before_those_that_wait(server, client):
