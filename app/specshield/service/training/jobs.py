@@ -1,7 +1,7 @@
 """Training runs: queued with rq, followed in `specshield:training:{id}`. Blocking.
 
 A run writes there only while its `attempt`, the name of its job, is the latest, so cancelling or asking
-again is one write. One that stops giving signs of life, or gave none since it left the queue, has failed.
+again is one write. A run that stops giving signs of life, or left the queue and gave none, has failed.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class Jobs:
     # --- for the run itself
 
     def report(self, id: str, attempt: str, /, **fields: Any) -> str:
-        """Notes how the run stands. Its method, or "" and nothing noted once it was cancelled or replaced."""
+        """Notes how the run stands; its method. Notes nothing and gives "" once it was cancelled or replaced."""
         pairs = [part for pair in fields.items() for part in pair]
         method: bytes = reached(lambda: self.redis.eval(WRITE, 1, _key(id), attempt, *pairs))
         return method.decode()
