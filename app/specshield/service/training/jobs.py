@@ -147,7 +147,7 @@ class Jobs:
     # --- for the run itself
 
     def report(self, id: str, attempt: str, /, **fields: Any) -> str:
-        """Notes how the run stands and gives its method; does neither, but gives "", once it was cancelled."""
+        """Notes how the run stands and gives its method, or does nothing and gives "" once cancelled."""
         pairs = [part for pair in fields.items() for part in pair]
         method: bytes = reached(lambda: self.redis.eval(WRITE, 1, _key(id), attempt, *pairs))
         return method.decode()
