@@ -1,11 +1,13 @@
 """benchmarks/reliability: a harness that found nothing has to be one that would have found it."""
 
+import json
 import random
 import threading
 from dataclasses import replace
 
 import pytest
 
+from benchmarks.reliability import report
 from benchmarks.reliability.faults.check import COUNTS, check
 from benchmarks.reliability.fuzz import shards
 from benchmarks.reliability.robots import Episode, Robot, find_starts
@@ -59,3 +61,24 @@ def test_fuzzed_inputs_are_the_same_each_time_and_break_no_reader(name):
         except SpecshieldError:
             continue
     assert 0 < taken < 300
+
+
+def test_a_row_of_faults_that_is_measured_anew_takes_its_place_on_the_page_and_the_others_stay(tmp_path):
+    page, out = tmp_path / "page.md", tmp_path / "out"
+    page.write_text(report.PAGE.read_text())
+    report.run(out, page)
+    assert page.read_text() == report.PAGE.read_text()
+    what = "SIGKILL of the process that trains"
+    kept = [line for line in page.read_text().splitlines() if line.startswith("| ")]
+    (row,) = (line for line in kept if line.startswith(f"| {what}"))
+    out.mkdir()
+    times = {"median": 7.0, "max": 8.0}
+    figures = {"what": row.split(" | ")[0].removeprefix("| "), "kills": 3, "failed_without_reason": 1}
+    figures |= {"failed_after_s": times, "trains_again_after_s": times}
+    (out / "fault-run_killed.json").write_text(json.dumps(figures))
+    report.run(out, page)
+    anew = [line for line in page.read_text().splitlines() if line.startswith("| ")]
+    assert len(anew) == len(kept)
+    (new,) = set(anew) - set(kept)
+    assert new.startswith(f"| {what}")
+    assert new.endswith(" | 3 | 1 | 7.0 / 8.0 | 7.0 / 8.0 |")

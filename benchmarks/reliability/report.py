@@ -27,17 +27,14 @@ def run(out: Path, page: Path) -> int:
 
     rows, known = list(ROWS), page.read_text() if page.exists() else ""
     measured = [name for name in (*RUNS, *MODULES) if read(out, name) is not None]
-    if all(read(out, f"fault-{name}") is not None for name in rows):
-        measured += [f"fault-{name}" for name in rows]
-        faults = {"summary": _summary(out, rows), "faults": _faults(out, rows), "races": _races(out)}
-        faults["training"] = _training(out)
+    fresh = [name for name in rows if read(out, f"fault-{name}") is not None]
+    measured += [f"fault-{name}" for name in fresh]
+    faults = {"faults": _faults(out, rows), "races": _races(out), "training": _training(out)}
+    if len(fresh) == len(rows):
+        faults["summary"] = _summary(out, rows)
     else:
-        faults = {}
-        fresh = [name for name in rows if "away_all_s" in (read(out, f"fault-{name}") or {})]
-        if fresh and _part(known, "faults"):
-            faults["faults"] = _merged(_part(known, "faults"), _faults(out, fresh)[2:])
-            faults["summary"] = _summed(faults["faults"])
-            measured += [f"fault-{name}" for name in fresh]
+        faults = {name: _merged(_part(known, name), table) for name, table in faults.items()}
+        faults["summary"] = _summed(faults["faults"])
     makers = {"load": _load, "isolation": _isolation, "fuzz": _fuzz, "contract": _contract}
     parts = faults | {name: make(out) for name, make in makers.items() if name in measured}
     parts |= {name: _other(out, name) for name in MODULES if name in measured}
@@ -57,14 +54,16 @@ def run(out: Path, page: Path) -> int:
 
 def _merged(before: Sequence[str], fresh: Sequence[str]) -> list[str]:
     """The lines of a table, of which those that begin with the same cell as a fresh one give way to it."""
-    new = {line.split(" | ")[0]: line for line in fresh}
+    new = {line.split(" | ")[0]: line for line in fresh[2:]}
     return [new.get(line.split(" | ")[0], line) for line in before]
 
 
 def _summed(table: Sequence[str]) -> list[str]:
-    """The sums of this table of faults."""
+    """The sums of this table of faults; nothing where no row was run to its end."""
     rows = [line.strip("| ").split(" | ") for line in table[2:]]
     rows = [row for row in rows if len(row) > 4]
+    if not rows:
+        return []
     faults, steps = (sum(int(row[i].replace(",", "")) for row in rows) for i in (1, 2))
     bad = [sum(int(row[4].split(" / ")[i]) for row in rows) for i in range(len(COUNTS))]
     told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in zip(COUNTS, bad, strict=True))
