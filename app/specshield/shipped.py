@@ -13,8 +13,7 @@ PACKAGE = Path(__file__).resolve().parent
 
 
 def _folder(name: str) -> Path:
-    chosen = os.environ.get(f"SPECSHIELD_{name.upper()}_DIR")
-    if chosen:
+    if chosen := os.environ.get(f"SPECSHIELD_{name.upper()}_DIR"):
         return Path(chosen).resolve()
     installed = PACKAGE / name
     return installed if installed.is_dir() else PACKAGE.parents[1] / name

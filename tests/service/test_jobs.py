@@ -261,6 +261,24 @@ def test_a_run_goes_on_when_the_store_comes_back(orphaned):
     assert read(client, policy)["status"] == "training"
 
 
+def test_a_worker_whose_heartbeat_finds_the_store_away_goes_on(tmp_path):
+    """rq's comes every 30 s while a run lasts, and the run ends with its worker."""
+    with running(tmp_path, "--port", str(port := free_port())) as store, redis.Redis(port=port) as node:
+        wait_for(lambda: answers(node))
+        worker = _Worker(f"redis://127.0.0.1:{port}", Jobs(Settings(data_dir=tmp_path)), ["reachability"], ())
+        worker.register_birth()
+        queue = Queue("any", connection=worker.connection, serializer=JSONSerializer)
+        job = queue.enqueue("specshield.service.training.worker.train", "an-id", "an-attempt")
+        execution = worker.prepare_execution(job)
+        store.terminate()
+        store.wait()
+        worker.maintain_heartbeats(job, execution)
+    with running(tmp_path, "--port", str(port)), redis.Redis(port=port) as node:
+        wait_for(lambda: answers(node))
+        worker.maintain_heartbeats(job, execution)
+        assert node.ttl(worker.key) > 0
+
+
 def test_a_run_that_fails_while_the_store_is_away_says_why_once_it_is_back(orphaned):
     client, policy, run, start = orphaned
     os.kill(run, signal.SIGALRM)  # as rq tells it that its time is over

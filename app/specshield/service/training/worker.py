@@ -23,7 +23,7 @@ from specshield.errors import SpecshieldError, StoreError
 from specshield.policy.methods import METHODS, Run, available, missing
 from specshield.policy.options import read_options
 from specshield.service.settings import Settings
-from specshield.service.storage.connect import connect_to_jobs, reaching
+from specshield.service.storage.connect import FAILURES, connect_to_jobs, reaching
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.keeper import at_end_of_input, follow_parent
 from specshield.service.storage.marker import check_files
@@ -123,6 +123,10 @@ class _Worker(Worker):
             super().execute_job(job, queue)
         self._running = None
 
+    def maintain_heartbeats(self, job: Job, execution: Any) -> None:
+        with suppress(*FAILURES):  # the next may find it again; rq would end the worker, and its run with it
+            super().maintain_heartbeats(job, execution)
+
     def request_stop(self, signum: int, frame: Any) -> None:
         if self._running is not None:
             self.kill_horse()
@@ -137,9 +141,8 @@ class _Worker(Worker):
         how = f"by signal {os.WTERMSIG(status)}" if killed else f"with status {status}"
         if killed and os.WTERMSIG(status) == signal.SIGKILL:
             how += " (the kernel does this when memory runs out)"
-        reason = f"the process that made it ended {how}"
-        if (job.ended_at - job.started_at).total_seconds() > job.timeout:
-            reason = _too_long(job)  # rq kills a run that does not hear of its limit
+        late = (job.ended_at - job.started_at).total_seconds() > job.timeout  # then rq may have killed it
+        reason = _too_long(job) if late else f"the process that made it ended {how}"
         self._jobs.end(job.args[0], job.id, f"{reason}; {AGAIN}")
 
 
@@ -163,9 +166,8 @@ def train(id: str, attempt: str) -> None:
         except JobTimeoutException:
             reason = f"{_too_long(get_current_job())}; {AGAIN}"
         except Exception as error:
-            log.exception("training of %s", id)
-            name = type(error).__name__  # its text may tell of the inside: paths, lines of code
-            reason = f"an unexpected {name}; the worker's log says more"
+            log.exception("training of %s", id)  # its text may tell of the inside: paths, lines of code
+            reason = f"an unexpected {type(error).__name__}; the worker's log says more"
         for _ in range(PATIENCE):  # what it came to would be lost with a store that is away
             with suppress(StoreError):
                 jobs.end(id, attempt, reason)
