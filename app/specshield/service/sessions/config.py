@@ -28,8 +28,7 @@ def settings_of(config: Mapping[str, Any]) -> Config:
     seed of its own.
     """
     alike = {name: config[name] for name in (*ALIKE, ANY_SIGNAL) if name in config}
-    origin = config.get("origin", 0)
-    if origin:
+    if origin := config.get("origin", 0):
         alike |= {"seed": alike["seed"] + origin, "max_steps": alike["max_steps"] - origin}
     return Config(**alike, uncertainty=_uncertainty(config.get("uncertainty", "none")))
 

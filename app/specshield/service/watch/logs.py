@@ -45,11 +45,14 @@ def config(form: str, level: str) -> dict[str, Any]:
     own = {"handlers": ["default"], "level": level.upper(), "propagate": False}
     loggers = {**LOGGING_CONFIG["loggers"], "specshield": own}
     formatters = {"default": {"()": kind, "fmt": "%(levelprefix)s %(message)s"}}
-    news = [lambda record: record.getMessage() not in NO_NEWS]
-    handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": news}}
+    handlers = {"default": {**LOGGING_CONFIG["handlers"]["default"], "filters": [_is_news]}}
     # Access lines are the metrics' and the refusals' part: uvicorn's own cost a request some 60 us.
     del loggers["uvicorn.access"]
     return {**LOGGING_CONFIG, "formatters": formatters, "handlers": handlers, "loggers": loggers}
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    return record.getMessage() not in NO_NEWS
 
 
 class Text(DefaultFormatter):
