@@ -92,6 +92,8 @@ class _Worker(Worker):
     checkpoint, with which the next worker goes on.
     """
 
+    max_connection_wait_time = 1.0  # [s] between looks for a store that is away; rq would wait up to 60 s
+
     @reaching()
     def __init__(self, url: str, jobs: Jobs, methods: Sequence[str], others: Sequence[str]) -> None:
         self._training = [queue_of(method) for method in methods]

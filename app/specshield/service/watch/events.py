@@ -204,8 +204,7 @@ class Watchers:
         gone_on = [
             (feed, version) for feed, known, version in seen if version != known and feed.version == known
         ]  # one that was decided here meanwhile is looked at next time
-        here = [(feed, version) for feed, version in gone_on if version is not None]
-        if here:
+        if here := [(feed, version) for feed, version in gone_on if version is not None]:
             ends = [feed.end for feed, _ in here]
             news = await self._store.news([(feed.id, feed.end, feed.width, KEPT) for feed, _ in here])
             for (feed, version), end, new in zip(here, ends, news, strict=True):

@@ -93,8 +93,7 @@ def _about(record: logging.LogRecord) -> dict[str, Any]:
     if session is not None:
         about.setdefault("session_id", session)
     about["request_id"] = scope["state"].get("request_id")
-    traced = TRACEPARENT.fullmatch(dict(scope["headers"]).get(b"traceparent", b""))
-    if traced:
+    if traced := TRACEPARENT.fullmatch(dict(scope["headers"]).get(b"traceparent", b"")):
         about |= {"trace_id": traced[1].decode(), "span_id": traced[2].decode()}
     return about
 
