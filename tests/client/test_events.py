@@ -121,6 +121,28 @@ def test_a_session_that_is_gone_is_not_found(watch):
         watch(told(0), 404)
 
 
+def test_a_rule_that_a_session_knew_and_is_told_of_again_displaces_no_later_one():
+    """It knows of two switches, reads the first of them again, and then of a third in its turn."""
+    about = {"actions": ["m", "end"], "terminal_actions": [1]}
+    rules = [{**about, "from": t, "formula": f"F[0,3] p{t}", "spec_status": "pending"} for t in (0, 2, 4, 6)]
+    switches = [b"event: switch\ndata: %s\n\n" % json.dumps(rule).encode() for rule in rules]
+    over = json.dumps({**rules[1], "spec_status": "satisfied"}).encode()
+    pieces = [told(0, 1), b"event: switch\ndata: " + over + b"\n\n" + told(2), told(3)]
+    pieces += [switches[2] + told(4), switches[3] + told(6), END]
+
+    def serve(request):
+        return httpx.Response(200, content=iter(pieces), headers={"content-type": "text/event-stream"})
+
+    known = build(SessionInfo, {**SESSION, "rules": rules[:3]})
+    with ShieldClient("http://robot.test", transport=httpx.MockTransport(serve)) as client:
+        session = Session(client._run, known)
+        read = session.events(-1)
+        assert [next(read).t for _ in range(3)] == [0, 1, 2]
+        assert [session.rule_at(t)[-2:] for t in range(8)] == ["p0", "p0", "p2", "p2", *["p4"] * 4]
+        assert [decision.t for decision in read] == [3, 4, 6]
+        assert [session.rule_at(t)[-2:] for t in (1, 3, 5, 7)] == ["p0", "p2", "p4", "p6"]
+
+
 def test_a_watched_session_is_headed_with_the_rule_of_the_decisions_that_follow(monkeypatch, capsys):
     """It has had a second rule by the time it is read, and is given a third while it is watched."""
     rules = [

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+from bisect import insort
 from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -273,14 +275,17 @@ class SessionState:
                 yield from self._close(None, TRIES if error is None else 1)
 
     def _events(self, after: int | None) -> Events:
-        rules = self._heard = list(self.info.rules)
+        def switched(rule: Mapping[str, Any]) -> None:
+            same = itemgetter("from", "formula", "actions", "terminal_actions")
+            if same(rule) not in map(same, self._heard):  # else it is one of those that were known before
+                insort(self._heard, rule, key=itemgetter("from"))
 
         def decided(answer: Mapping[str, Any]) -> Decision:
             # Once the rule is settled, a session that is finished is one whose main task is over.
-            then = under(self.info, rules, answer.get("t", 0))
+            then = under(self.info, self._heard, answer.get("t", 0))
             return decision_of(answer, then, bool(answer.get("finished")), {})
 
-        return Events(self.id, self.t - 1 if after is None else after, decided, rules.append)
+        return Events(self.id, self.t - 1 if after is None else after, decided, switched)
 
     def _trajectory(self) -> Flow[tuple[TrajectoryItem, ...]]:
         """The states x_0..x_t that the server has, and its answers."""
