@@ -22,18 +22,15 @@ def begun(way: bytes | None) -> Carry | None:
     return None if way is None else Carry(NEVER, np.empty((0, 3)), (), way=way)
 
 
-def carried_over(
-    carry: Carry | None, same_map: bool, same_robot: bool, later: int, way: bytes | None = None
-) -> Carry | None:
+def carried_over(carry: Carry | None, same_map: bool, same_robot: bool, t: int, later: int) -> Carry:
     """What the last decision under the old rule hands to the first one under the new, whose windows count
-    from `later` steps later.
+    from `later` steps later. t: the step at which the new rule begins, by its own clock.
 
     What the map has learned stays where the map is the same, what is known of the robot where the robot is;
     where both are and the clock goes on, so does what the last motion should have led to. Continuations are
-    of the old rule; `way` is one of the new.
+    of the old rule.
     """
-    if carry is None:
-        return begun(way)
+    carry = Carry(NEVER, np.empty((0, 3)), ()) if carry is None else carry
     stays = same_map and same_robot and later == 0
     return carry._replace(
         t=carry.t if stays else NEVER,
@@ -44,8 +41,9 @@ def carried_over(
         threshold_left=None,
         learned=_learned(carry.learned, later) if same_map else None,
         action=carry.action if stays else None,
-        way=way,
+        way=None,
         stuck=carry.stuck if same_map and same_robot else (),
+        here=max(carry.here - later, 0) if same_map and same_robot else t,
     )
 
 

@@ -27,6 +27,8 @@ from specshield.errors import (
 )
 from specshield.local import LocalShield
 from specshield.local.shield import read_map_files
+from specshield.robot import robot_from_json
+from specshield.robot.dynamics import make_body, step
 from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
 from tests.service.world import grid_json, policy_files, send_policy
@@ -228,6 +230,69 @@ def test_what_a_rule_led_to_counts_for_it_after_a_switch(server: RunningServer, 
         assert [(each.t, each.rule, each.signals) for each in local.trajectory()] == [
             (each.t, each.rule, each.signals) for each in remote.trajectory()
         ]
+
+
+FORTH_AND_BACK = (0,) * 12 + (1,) * 6 + (0,) * 12 + (1,) * 6  # twelve moves, half a turn to the left
+
+
+@pytest.mark.parametrize("radii", [(0.2, 0.2), (0.1, 0.2)], ids=["another map", "a larger robot"])
+def test_where_a_robot_has_been_tells_nothing_of_another_map_nor_of_what_stops_a_larger_robot(
+    radii: tuple[float, float],
+) -> None:
+    """Something that is on no map stands where it drove before the switch. It runs into it once and goes
+    around, as it does where the switch begins a new history.
+    """
+    cells = np.pad(np.zeros((38, 78), np.bool_), 1, constant_values=True)
+    first, second = OccupancyGrid(cells, 0.05), OccupancyGrid(cells, 0.05)
+    if radii[0] == radii[1]:
+        cells = cells.copy()
+        cells[1, 1] = True
+        first = OccupancyGrid(cells, 0.05)
+    goal = {"Goal": {"type": "circle", "center": [3.4, 1.0], "radius": 0.3}}
+    turn = np.radians(30.0)
+    moves = ({"translate": 0.2}, {"rotate": turn}, {"rotate": -turn}, {"translate": -0.2}, {})
+    actions = [{"name": str(i), **move} for i, move in enumerate(moves)]
+    robots = [{"footprint": {"radius": r}, "on_contact": "stop", "actions": actions} for r in radii]
+    world = second.occupied.copy()
+    world[16:23, 38:42] = True  # 0.35 m wide, in the middle of the way
+    body = make_body(robot_from_json(robots[1]), OccupancyGrid(world, 0.05))
+    before = LocalShield.make(first, "F[0,90] Goal", goal, robot=robots[0], check=False)
+    wishes = [0.0, -30.0, -30.0, -30.0, -30.0]
+    ended = list[tuple[int, int]]()
+    for clock, begins in (("restart", 0), ("keep", len(FORTH_AND_BACK))):
+        rule = f"F[{begins},{begins + 50}] Goal"
+        after = LocalShield.make(second, rule, goal, robot=robots[1], check=False)
+        session, pose, bumps = before.session(initial_pose=(0.6, 1.0, 0.0)), (0.6, 1.0, 0.0), 0
+        for motion in FORTH_AND_BACK:
+            pose = session.step(pose, wishes).next_poses[motion]
+        there = (pose[0] - 0.05, pose[1], pose[2])
+        session.switch(after, clock=clock, pose=there)  # type: ignore[arg-type]
+        pose = there
+        while session.spec_status == "pending":
+            decision = session.step(pose, wishes)
+            foreseen, pose = decision.next_poses[decision.execute], step(body, *pose, decision.execute)
+            bumps += np.hypot(foreseen[0] - pose[0], foreseen[1] - pose[1]) > 1e-3
+        assert session.spec_status == "satisfied", clock
+        ended.append((session.t, bumps))
+    assert ended[0] == ended[1]
+    assert ended[0][1] == 1
+
+
+@pytest.mark.parametrize("learn_map", [True, False])
+@pytest.mark.parametrize("decided", [True, False], ids=["decided", "passed over"])
+def test_a_robot_that_was_taken_to_another_map_is_not_said_to_have_jumped(
+    small: LocalShield, learn_map: bool, decided: bool
+) -> None:
+    other = LocalShield.make(OccupancyGrid(np.eye(30) > 0, 0.25), "F[0,40] x > 4", robot=ROBOT, check=False)
+    session = small.session(initial_pose=(3.0, 3.0, 0.0), learn_map=learn_map)
+    if decided:
+        session.step((3.0, 3.0, 0.0), [0.0] * 4)
+    else:
+        session.record((3.0, 3.0, 0.0))
+    session.switch(other, pose=(2.0, 6.5, 0.0))
+    assert session.step((2.0, 6.5, 0.0), [0.0] * 4).warnings == ()
+    session.record((2.0, 6.5, 0.0))
+    assert "is 2.5 m from the one before" in " ".join(session.step((2.0, 4.0, 0.0), [0.0] * 4).warnings)
 
 
 @pytest.mark.parametrize("flag", ["main_task_done", "witnesses", "explain"])

@@ -175,10 +175,9 @@ class LocalSession:
         seen, signals = rule.since([*self._poses, x_t]), rule.signals(held)
         same_map = self.info.map_id == policy.task.grid.content_hash
         same_robot = old.policy.card["robot"] == policy.card["robot"]
-        later = rule.origin - old.origin
-        carry = handover.carried_over(self._carry, same_map, same_robot, later)
+        t, later = self.t - rule.origin, rule.origin - old.origin
+        carry = handover.carried_over(self._carry, same_map, same_robot, t, later)
         way = refusal.switch(rule.shield, seen, signals, carry, not (same_map and same_robot))
-        carry = handover.carried_over(self._carry, same_map, same_robot, later, way)
         known = self._poses if given is None else [*self._poses, x_t]
         have = told([*self._rules, rule], known, held)
         info = replace(
@@ -192,7 +191,7 @@ class LocalSession:
             any_signal=any_signal(rule.shield, seen, signals),
         )
         self._rules.append(rule)
-        self._carry, self._first = carry, first
+        self._carry, self._first = carry._replace(way=way), first
         self._given = {} if given is None else {self.t: given}
         self._signals = {name: values[: self.t] for name, values in held.items()}
         self.info, self.spec_status, self.finished = info, info.spec_status, False

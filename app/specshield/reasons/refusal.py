@@ -12,7 +12,7 @@ import numpy as np
 
 from specshield.arrays import Floats
 from specshield.errors import InfeasibleStart, InfeasibleSwitch, InputError
-from specshield.handover import begun, finite
+from specshield.handover import finite
 from specshield.reasons.bound import proof
 from specshield.reasons.lateness import later, when
 from specshield.reasons.relaxation import Conjunct, relaxations
@@ -81,7 +81,7 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
 
 
 def switch(
-    shield: Shield, history: Floats, signals: Signals | None, carry: Carry | None, elsewhere: bool
+    shield: Shield, history: Floats, signals: Signals | None, carry: Carry, elsewhere: bool
 ) -> bytes | None:
     """As in shield/switching.py; a way that a search found where no policy did is returned, as `begin` does.
     The InfeasibleSwitch that is raised says what is wrong with the rule.
@@ -95,7 +95,7 @@ def switch(
         sure = on_map(shield, forget(known, known.occupied & (known.by != SENT)))  # contacts are guesses
         told = refusal(on_map(shield, known), history, signals or {}, sure.body)
         if told.way is not None:
-            found = begun(told.way) if carry is None else carry._replace(way=told.way)
+            found = carry._replace(way=told.way)
             with suppress(InfeasibleSwitch):
                 switching.switch(shield, history, signals, found, elsewhere)
                 return told.way

@@ -154,8 +154,8 @@ class Carry(NamedTuple):
     memory: of the session's preference. residuals: what is known of the robot by now (uncertainty.py).
     threshold_left: what is left of a threshold over the episode. learned: what the session's map has that the
     policy's has not (world/learned.py). action: the one that was drawn, which the caller may have executed.
-    way: where a rule begins to hold, a continuation from there to its horizon that no policy found. stuck:
-    as `Taught` has it.
+    way: where a rule begins to hold, a continuation from there to its horizon that no policy found. stuck,
+    here: as `Taught` has them.
     """
 
     t: int
@@ -168,6 +168,7 @@ class Carry(NamedTuple):
     action: int | None = None
     way: bytes | None = None
     stuck: tuple[Stuck, ...] = ()
+    here: int = 0
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def decide(
     t, signals = len(poses) - 1, signals or {}
     log_prior = shaping.log_prior_of(task.robot, logits, main_task_done)
     taught, said = teach(shield, carry, poses, occupied, free)
-    said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)), *said)
+    said = (*oddities(task.grid, shield.body, np.asarray(history, np.float64)[taught.here :]), *said)
     told, shield = shield, on_map(shield, taught.map, barred=taught.barred)
     places = np.empty((len(robot.motions) + 1, 3))  # where each motion leads, and x_t, where what ends does
     nexts, places[-1] = places[:-1], poses[-1]
@@ -221,6 +221,7 @@ def decide(
             ),
             action=action,
             stuck=taught.stuck,
+            here=taught.here,
         ),
     )
 

@@ -22,11 +22,5 @@ def switch(
     found = decide(shield, history, None, True, signals, carry)
     if found.spec_status == "satisfied" or found.mode == "completion":
         return
-    if found.spec_status == "violated":
-        why = "what was driven before has broken it already"
-    else:
-        rho = [value for value in found.robustness if value is not None]
-        best = f"the best robustness found is {max(rho):.3f}" if rho else "; ".join(found.warnings)
-        why = f"no way from here was found that keeps it: {best}"
     expected = "a rule that can be kept from x_t" + ("; or clock 'restart'" if len(history) > 1 else "")
-    raise InfeasibleSwitch(f"the new rule was not taken: {why}", path="policy_id", expected=expected)
+    raise InfeasibleSwitch("no way keeps the new rule from x_t on", path="policy_id", expected=expected)

@@ -69,7 +69,8 @@ class Taught(NamedTuple):
 
     contact: whether the last motion ran into something, or on through it; it is not handed on. stuck: where
     the robot stood and which motion led nowhere from there, or elsewhere than f has it, whatever is marked;
-    handed on beside the bytes. near: how far apart two poses are that may be one.
+    handed on beside the bytes, as is `here`: the first step at which this robot was on this map. near: how
+    far apart two poses are that may be one.
     """
 
     map: LearnedMap = NONE
@@ -77,6 +78,7 @@ class Taught(NamedTuple):
     contact: bool = False
     stuck: tuple[Stuck, ...] = ()
     near: Near = NEAR
+    here: int = 0
 
     @property
     def barred(self) -> Floats:
@@ -104,18 +106,17 @@ def teach(
     SampleError for points that are none.
     """
     grid, config, t = shield.task.grid, shield.config, len(poses) - 1
-    learned = None if carry is None else carry.learned
+    learned, stuck, here = (None, (), 0) if carry is None else (carry.learned, carry.stuck, carry.here)
     if learned is None and occupied is None and free is None and not config.learn_map:
-        return Taught(), ()
+        return Taught(here=here), ()
     before = Taught.from_bytes(learned)
-    known, followed, motion, on = before.map, before.followed, -1, -1
-    stuck, near = () if carry is None else carry.stuck, NEAR
+    known, followed, motion, on, near = before.map, before.followed, -1, -1, NEAR
     if config.map_memory is not None:
         known = forget(known, known.occupied & (t - known.step > config.map_memory))
     if config.learn_map and carry is not None and carry.t == t - 1:
         told = known is NONE and occupied is None and free is None and not stuck and followed.drawn >= 0
         if told and _goes_as_told(shield.body, poses[-2], carry.next_poses[followed.drawn], poses[-1]):
-            return Taught(followed=moved_on(followed, as_drawn=True)), ()
+            return Taught(followed=moved_on(followed, as_drawn=True), here=here), ()
         body, near = body_on(shield, before.map), within_noise(shield, carry) or NEAR
         drawn, came_back = followed.drawn, t > 1 and not is_near(poses[-3:-2], poses[-2], near)
         halts = halts_at(stuck, poses[-1], drawn, near)
@@ -139,7 +140,7 @@ def teach(
             if deep:
                 known = learn(grid, known, t, cells_under(body, pose, UNDER), False, CONTACT)
         if motion >= 0:
-            driven = poses[np.hypot(*(poses[:, :2] - poses[-1, :2]).T) <= NEARBY]
+            driven = poses[here:][np.hypot(*(poses[here:, :2] - poses[-1, :2]).T) <= NEARBY]
             met = cells_met(body, poses[-1], motion, driven)
             if not any(len(cells) for _, cells in met):  # the footprint is told wrong, or someone came
                 met = cells_met(body, poses[-1], motion, poses[-1:])
@@ -160,7 +161,7 @@ def teach(
     if beyond:
         said.append(f"{beyond} points lie outside the map and were ignored")
     own = known if known is before.map else revised(before.map, known)
-    return Taught(own, followed, motion >= 0 or on >= 0, stuck, near), tuple(said)
+    return Taught(own, followed, motion >= 0 or on >= 0, stuck, near, here), tuple(said)
 
 
 @leaf

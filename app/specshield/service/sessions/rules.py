@@ -63,10 +63,11 @@ def widened(rows: Floats, names: Sequence[str], signals: Mapping[str, float]) ->
     return np.hstack([rows, np.tile(first, (len(rows), 1))]) if first else rows
 
 
-def carried_over(carry: Carry | None, old: Config, new: Config) -> Carry | None:
+def carried_over(carry: Carry | None, old: Config, new: Config) -> Carry:
     """What the last decision under the old rule hands to the first one under the new."""
     same_map, same_robot = old["map_id"] == new["map_id"], old["robot"] == new["robot"]
-    return handover.carried_over(carry, same_map, same_robot, origin(new) - origin(old), way(new))
+    t, later = begins(new) - origin(new), origin(new) - origin(old)
+    return handover.carried_over(carry, same_map, same_robot, t, later)._replace(way=way(new))
 
 
 def way(config: Config) -> bytes | None:

@@ -183,7 +183,6 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
     elsewhere = any(old[name] != config[name] for name in ("map_id", "robot"))
     way = refusal.switch(shield, seen[:, :3], rules.signals_in(seen, names), known, elsewhere)
     config["way"] = (way or b"").hex()
-    carry = rules.carried_over(carry, old, config)
     rows = made.since
     status = episode.close(shield, rows[:, :3], rules.signals_in(rows, names))[0] if len(rows) else "pending"
     state = msgspec.structs.replace(
@@ -193,7 +192,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         feasible=True,
         spec_status=status,
         head=record.digest(files.to_json(config)),
-        carry=own(carry),
+        carry=own(known._replace(way=way)),
         verdicts=(*session.state.verdicts, verdict),
         any_signal=any_signal(shield, seen[:, :3], rules.signals_in(seen, names)),
     )

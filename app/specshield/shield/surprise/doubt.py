@@ -64,7 +64,7 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     if not (seen | young).all():
         yield taught._replace(map=revised(known, forget(known, ~(seen | young))))
     if told.config.learn_map:
-        recent = prefix.poses[-1 - DOUBTED_AFTER :]  # older ones may be of a map before a switch
+        recent = prefix.poses[max(t - DOUBTED_AFTER, taught.here) :]
         under = [cells_under(body, pose, 0.0) for pose in recent if overlap(body, *pose) > 0.0]
         passed = np.setdiff1d(np.concatenate([known.cell, *under]), known.cell)  # not what came there later
         free = learn(told.task.grid, known, t, passed, False, CONTACT)
