@@ -127,6 +127,26 @@ def test_the_state_in_which_a_rule_ends_is_its_last(client, begin, step, switch)
         assert verdicts == ["pending", "satisfied", "pending"]
 
 
+@pytest.mark.parametrize("last", [3, 8])
+@pytest.mark.parametrize("fields", [{}, {"poses": [ahead(3)[3]]}], ids=["x_t comes later", "x_t is told"])
+def test_the_signals_of_the_state_in_which_a_rule_ends_count_for_it(
+    client, begin, step, switch, last, fields
+):
+    """They come with the step, under a rule that does not read them; until then the policy is needed."""
+    spec = {"formula": f"G[0,{last}] battery > 10", "regions": {}, "signals": {"battery": 90.0}}
+    old, poses = send_policy(client, spec=spec, seed=last)["id"], ahead(3)
+    session = begin(policy_id=old)
+    driven(step, session, poses[:3])
+    assert switch(session, 3, LATER, clock="restart", **fields).status_code == 200
+    problem(client.delete(f"/v1/policies/{old}"), 409, "in-use")
+    assert step(session, 3, poses[3:], signals={"battery": 5.0}).status_code == 200
+    assert [rule["spec_status"] for rule in state(client, session)["rules"]] == ["violated", "pending"]
+    assert client.delete(f"/v1/policies/{old}").status_code == 204
+    for _ in range(2):
+        closed = client.post(f"/v1/sessions/{session['id']}/close", json={}).json()
+        assert [rule["spec_status"] for rule in closed["rules"]] == ["violated", "pending"]
+
+
 def test_what_cannot_be_kept_changes_nothing(client, begin, step, switch):
     session, poses = begin(), ahead(8)
     driven(step, session, poses[:3])

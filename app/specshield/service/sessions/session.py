@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import msgspec
@@ -180,11 +181,10 @@ def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]
 
 
 def needed(rules: Sequence[Mapping[str, Any]], state: State) -> set[str]:
-    """The policies of the rule in force, and of each before it whose last pose is still to come: what it says
-    of that pose is worked out on its map.
+    """The policies of the rule in force, and of each before it whose last step is still to come: what it says
+    of that is worked out on its map.
     """
-    ended = zip(rules, rules[1:], state.verdicts, strict=False)
-    waiting = [a for a, b, verdict in ended if verdict == "pending" and ruled.begins(b) >= state.length]
+    waiting = [a for a, b in pairwise(rules) if ruled.begins(b) >= state.next_t]
     return {id for config in [*waiting, rules[-1]] for id in config["policy_ids"]}
 
 

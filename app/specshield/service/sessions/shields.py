@@ -104,15 +104,15 @@ class Shields:
         return Shield(task, (), Config(), body, view)
 
     def settled(self, session: Session) -> Session:
-        """The session, with the verdicts of the rules that its last switch ended once its x_t is known."""
-        begins, verdicts = rules.begins(session.config), list(session.state.verdicts)
-        if not verdicts or session.state.length > begins or len(session.rows) <= begins:
+        """The session with the verdicts of the rules that its last switch ended, on x_t and its signals."""
+        begins, state = rules.begins(session.config), session.state
+        if state.finished or state.next_t > begins or len(session.rows) <= begins:
             return session
-        for i, verdict in enumerate(verdicts):
-            if rules.begins(session.rules[i + 1]) == begins and verdict == "pending":
-                last = session.rows[: begins + 1]
+        last, verdicts = session.rows[: begins + 1], list(state.verdicts)
+        for i in range(len(verdicts)):
+            if rules.begins(session.rules[i + 1]) == begins:
                 verdicts[i], _ = self.verdict(session.rules[i], last, session.signal_names)
-        return session._replace(state=msgspec.structs.replace(session.state, verdicts=tuple(verdicts)))
+        return session._replace(state=msgspec.structs.replace(state, verdicts=tuple(verdicts)))
 
     def _prepare(
         self, name: str, policy_ids: Sequence[str], shield: Shield, pose: Sequence[float]
