@@ -179,7 +179,7 @@ def decide(
     remembered = None
     if seen is not None:
         follows = shield.config.learn_map and taught.followed.surely
-        done = np.eye(len(robot.actions))[action] if follows else answer.distribution
+        done = 1.0 * (np.arange(len(robot.actions)) == action) if follows else answer.distribution
         remembered = remember(shield, seen, done, moved, nexts, poses[-1])
     return Decision(
         t=t,

@@ -101,12 +101,12 @@ def judge(shield: Shield, now: Situation) -> Judged:
         best = best_of(tried, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
-    if lowered or (care.has_slack and best.robustness.max() > SATISFIED_ABOVE):
+    if lowered or (care.has_slack and max(values.tolist()) > SATISFIED_ABOVE):  # numpy's takes 3 us
         aimed = had or aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
         # A threshold for the episode weighs ways with any slack, also with more than the first futures have.
         by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
-        most = aimed.slack or int(aimed.early.max(initial=0))
+        most = aimed.slack or max(aimed.early.tolist(), default=0)
         if (by_chance or (most > 0 and care.on_way)) and not violated and True in left.tolist():
             known, wanted, before = len(tried.rho), left | by_chance, None if by_chance else aimed
             chancy = *range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)
