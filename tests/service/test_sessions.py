@@ -6,11 +6,14 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
+import msgspec
 import pytest
 import redis
 
 from specshield.cores import cores
 from specshield.service.routes.sessions import _each, _listed
+from specshield.service.sessions.state import State
+from specshield.shield.decision import Carry
 from tests.service import world
 from tests.service.world import LOGITS, SPEC, START, ahead, send_policy
 
@@ -368,6 +371,29 @@ def test_nothing_waits_for_those_who_begin_while_their_policy_may_be_deleted(
             finally:
                 store.delete(mark)
             assert all(each.result()["next_t"] == 0 for each in beginning)
+
+
+def test_a_session_whose_state_is_of_another_version_is_read_and_decides_no_step(client, begin, step, server):
+    """One of November 2026 stored 6 bytes where nothing was learned yet, not 18 as `Taught` does now."""
+    session = begin()
+    first = step(session, 0, [START])
+    assert first.status_code == 200
+    path, t1 = f"/v1/sessions/{session['id']}", first.json()["next_poses"][0]
+    driven = client.get(f"{path}/trajectory").content
+    with closing(redis.Redis(unix_socket_path=str(server.data_dir / "store" / "socket"))) as store:
+        key = f"specshield:v2:{{@{session['id']}}}:session"
+        held = msgspec.msgpack.decode(store.hget(key, "state"))
+        carry = held[State.__struct_fields__.index("carry")]
+        carry[Carry._fields.index("learned")] = bytes(6)
+        store.hset(key, mapping={"state": msgspec.msgpack.encode(held), "version": "another:1"})
+    told = problem(step(session, 1, [t1]), 503, "store-unavailable")
+    assert told["detail"].startswith("another version of specshield decided")
+    spec = {"policy_id": session["policy_ids"][0], "t": 1, "poses": [t1], "clock": "keep"}
+    problem(client.post(f"{path}/switch", json=spec), 503, "store-unavailable")
+    problem(client.get(f"{path}/learned"), 503, "store-unavailable")
+    assert step(session, 0, [START]).content == first.content
+    assert client.get(f"{path}/trajectory").content == driven
+    assert client.get(f"{path}/record").status_code == 200
 
 
 def test_the_draw_is_the_seeds(begin, step):

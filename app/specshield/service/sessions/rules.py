@@ -48,8 +48,7 @@ def at(rules: Sequence[Config], t: int) -> int:
 
 def added(names: Iterable[str], signals: Iterable[str]) -> list[str]:
     """The columns that a rule with these signals adds to the columns `names`."""
-    known = set(names)
-    return [name for name in sorted(signals) if name not in known]
+    return sorted(set(signals) - set(names))
 
 
 def signals_in(rows: Floats, names: Iterable[str]) -> dict[str, Floats]:
@@ -77,8 +76,7 @@ def way(config: Config) -> bytes | None:
 
 def told(rules: Sequence[Config], verdicts: Sequence[str]) -> list[dict[str, Any]]:
     """The rules as the contract shows them; verdicts: of each."""
-    each = zip(rules, verdicts, strict=True)
     return [
         handover.rule_told(rule, begins(rule), origin(rule), rule.get("clock", "restart"), verdict)
-        for rule, verdict in each
+        for rule, verdict in zip(rules, verdicts, strict=True)
     ]

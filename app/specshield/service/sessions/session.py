@@ -91,12 +91,10 @@ class Session(NamedTuple):
         known, width = self.rows.shape
         rows = np.empty((known + len(added), width))
         rows[:known], rows[known:, :3] = self.rows, added
-        if width > 3:
-            rows[known:, 3:] = self.rows[-1, 3:]
+        rows[known:, 3:] = self.rows[-1, 3:]
         for name, value in signals.items():
             rows[t, 3 + self.signal_names.index(name)] = value
-        same = self.rules, self.settings, self.state, self.version
-        return Session(*same, rows, self.signal_names, self.weight, self.held)
+        return self._replace(rows=rows)
 
     def added(self, stored: int) -> tuple[bytes, int]:
         """The rows that a change has to write, and the byte where they begin: only what is new, and row 0

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
 import msgspec
 import numpy as np
 
+from specshield.errors import StoreError
 from specshield.shield.decision import Carry
 from specshield.shield.taught import HEAD, Taught
 from specshield.world.learned import LearnedMap
@@ -47,8 +51,12 @@ class State(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def learned(self) -> LearnedMap:
-        """As the last decision left it."""
-        return Taught.from_bytes(None if self.carry is None else self.carry.learned).map
+        """As the last decision left it. Raises StoreError where another version stored it in another form."""
+        try:
+            return Taught.from_bytes(None if self.carry is None else self.carry.learned).map
+        except (struct.error, zlib.error, ValueError) as error:
+            told = "another version of specshield decided the session's last step: no further one is decided"
+            raise StoreError(told, expected="a server of that version, or a new session") from error
 
 
 def own(carry: Carry | None) -> Carry | None:

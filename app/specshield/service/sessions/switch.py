@@ -140,7 +140,7 @@ def _foreseen(session: Session, step: bytes) -> Sequence[float]:
 
 
 def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
-    """The session under its new rule. Raises PoseError, InfeasibleSwitch, InputError."""
+    """The session under its new rule. Raises PoseError, InfeasibleSwitch, InputError, StoreError."""
     session, t, old = shields.settled(wanted.session), wanted.t, wanted.session.config
     about = shields.policies.record(wanted.policy_ids[0]).about
     task = shields.get(wanted.policy_ids, Config()).task
@@ -176,7 +176,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         rows=rules.widened(session.rows, session.signal_names, signals),
         signal_names=names,
     )
-    carry = own(session.state.carry)
+    carry, _ = own(session.state.carry), session.state.learned  # raises StoreError for what cannot be read
     known = rules.carried_over(carry, old, config)
     seen = rules.widened(np.vstack([session.rows[:t], wanted.row]), session.signal_names, signals)[origin:]
     shield = shields.of(made)
