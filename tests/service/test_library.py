@@ -29,8 +29,8 @@ from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Rectangle
 from tests.service.test_bad_input import YAML, problem
 from tests.service.test_keys import caller, keyed
-from tests.service.world import RESOLUTION, START, cells, grid_json, policy_files, send_policy
-from tests.serving import wait_for
+from tests.service.world import LOGITS, RESOLUTION, START, cells, grid_json, policy_files, send_policy
+from tests.serving import serving, wait_for
 
 __all__ = ["keyed"]  # a fixture
 
@@ -382,6 +382,30 @@ def test_a_full_disk_refuses_what_is_new_and_says_so(tmp_path, claims):
     claims._settings = few
     with pytest.raises(Exception, match="disk is full"):
         Maps(few, claims).add(OccupancyGrid(np.zeros((5, 8), bool), 0.3), {}, OPEN)
+
+
+@pytest.mark.parametrize("gone", ["maps", "policies", "."])
+def test_files_that_are_away_are_told_as_a_store_that_is(tmp_path, gone):
+    """As where a network folder is not mounted any more. Sessions that run need none of them."""
+    folder, other = tmp_path / "data" / gone, {**grid_json(), "data": [0] * len(grid_json()["data"])}
+    with serving(tmp_path / "data") as server, httpx.Client(base_url=server.url, timeout=None) as client:
+        assert client.post("/v1/maps", json=grid_json()).status_code == 201
+        begun = {"policy_id": send_policy(client)["id"], "initial_pose": START}
+        session = client.post("/v1/sessions", json=begun).json()
+
+        def sent():
+            if gone == "policies":
+                return client.post("/v1/policies", files=policy_files(seed=1))
+            return client.post("/v1/maps", json=other)
+
+        folder.resolve().rename(tmp_path / "away")
+        detail = problem(sent(), 503, "store-unavailable")["detail"]
+        assert detail == "the server's files cannot be used: No such file or directory"
+        if gone != ".":  # else the embedded store is away too
+            step = {"t": 0, "poses": [START], "logits": LOGITS}
+            assert client.post(f"/v1/sessions/{session['id']}/steps", json=step).status_code == 200
+        (tmp_path / "away").rename(folder.resolve())
+        assert sent().status_code in (201, 202)
 
 
 def test_the_image_of_a_map_is_the_map(client):

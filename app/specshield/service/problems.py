@@ -17,7 +17,7 @@ from starlette.types import Receive, Scope, Send
 
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
-from specshield.service.library.files import is_full
+from specshield.service.library.files import unusable
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_GONE = 499  # what nginx logs for a request whose client went away; it is never sent
@@ -270,10 +270,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(OSError)
     async def disk(request: Request, error: OSError) -> Response:
-        if not is_full(error):
+        if error.strerror is None or isinstance(error, ConnectionError | TimeoutError):
             raise error
-        full = errors.InsufficientStorage("the server's disk is full", expected="a disk with room")
-        return ProblemResponse(full)
+        return tell(request.scope, unusable(error))
 
     @app.exception_handler(Exception)
     async def unknown(request: Request, error: Exception) -> Response:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import re
 import secrets
@@ -17,7 +18,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from specshield.errors import InputError, InsufficientStorage
+from specshield.errors import InputError, InsufficientStorage, SpecshieldError, StoreError
 from specshield.service.library.mirror import Mirror
 from specshield.service.settings import Settings
 from specshield.service.storage.objects import open_objects, sync, write_through
@@ -25,6 +26,7 @@ from specshield.service.storage.objects import open_objects, sync, write_through
 HASH = re.compile(r"[0-9a-f]{64}")
 PAGE_BYTES = 256 << 10  # chosen by hand: read and shown in a few ms
 V = TypeVar("V")
+log = logging.getLogger("specshield")
 _mirrors: dict[Path, Mirror] = {}  # of the folders whose things are behind a URL
 
 
@@ -64,8 +66,7 @@ def check_writable(folder: Path, name: str) -> None:
     """Makes the folder if need be. Raises InputError, with its setting's name, where it takes no files."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         told, expected = f"{name} cannot be used: {error.strerror}", "a folder to write to"
         raise InputError(told, path=name, got=str(folder), expected=expected) from error
@@ -138,26 +139,28 @@ def remove_folder(folder: Path) -> None:
 
 def check_free(folder: Path, wanted: int) -> None:
     """Raises InsufficientStorage where the disk of `folder` has fewer free bytes. One system call."""
-    free = shutil.disk_usage(folder).free
+    with guarded():
+        free = shutil.disk_usage(folder).free
     if free < wanted:
-        raise InsufficientStorage(
-            "the server's disk is full", got=free, expected=f"at least {wanted} bytes free: delete something"
-        )
+        expected = f"at least {wanted} bytes free: delete something"
+        raise InsufficientStorage("the server's disk is full", got=free, expected=expected)
 
 
 @contextmanager
-def full_disk() -> Iterator[None]:
-    """A disk that fills up while it is written to is InsufficientStorage."""
+def guarded() -> Iterator[None]:
+    """Files that cannot be used raise what `unusable` makes of it."""
     try:
         yield
     except OSError as error:
-        if not is_full(error):
-            raise
-        raise InsufficientStorage("the server's disk is full", expected="a disk with room") from None
+        raise unusable(error) from error
 
 
-def is_full(error: OSError) -> bool:
-    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+def unusable(error: OSError) -> SpecshieldError:
+    """What a caller is told of it; which file it is, the log alone. A full disk is InsufficientStorage."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return InsufficientStorage("the server's disk is full", expected="a disk with room")
+    log.warning("%s", error)
+    return StoreError(f"the server's files cannot be used: {error.strerror}")
 
 
 def page(

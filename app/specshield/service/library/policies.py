@@ -228,7 +228,7 @@ class Policies(Claimed):
         folder = self._folder / id
         if not files.there(folder):
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
-        with files.full_disk():
+        with files.guarded():
             files.write_file(folder / "policy.safetensors", weights)
             files.write_file(folder / "card.json", files.to_json({**card, "id": id}))
         if self.given is not None:
