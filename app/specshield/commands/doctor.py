@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import email.utils
 import os
+import re
 import shutil
 import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
+from importlib.metadata import PackageNotFoundError, distributions, requires, version
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
     from specshield.service.settings import Settings
 
-SERVER_PARTS = (
-    "fastapi", "fastapi_offline", "uvicorn", "numba", "pydantic", "pydantic_settings", "redis", "rq",
-)  # fmt: skip
 CLOCK = 2.0  # [s] by which this machine and a server may differ before it is said
 State = Literal["ok", "note", "wrong"]
 
@@ -81,11 +78,8 @@ def _shown(check: Callable[[], Iterator[Finding]]) -> int:
 
 def _parts() -> Iterator[Finding]:
     yield Finding("ok", f"Python {sys.version.split()[0]}, specshield {__version__}")
-    missing = [name for name in SERVER_PARTS if find_spec(name) is None]
-    if missing:
-        yield Finding(
-            "wrong", f"missing for a server: {', '.join(missing)}", "pip install 'specshield[server]'"
-        )
+    if missing := missing_parts():
+        yield Finding("wrong", f"a server lacks {', '.join(missing)}", "pip install 'specshield[server]'")
     else:
         yield Finding("ok", "the server's parts are installed")
     with contextlib.suppress(PackageNotFoundError):
@@ -96,6 +90,13 @@ def _parts() -> Iterator[Finding]:
         "torch is not installed: policies are computed, and none learns (method `dqn`)",
         "pip install 'specshield[train]' where that is wanted",
     )
+
+
+def missing_parts() -> list[str]:
+    """The packages that the extra `server` brings, which has those of `core`, and that are not installed."""
+    asked = [each for each in requires("specshield") or () if re.search("extra == .server", each)]
+    names = {re.split(r"[^\w.-]", each)[0] for each in asked}
+    return sorted(name for name in names if not [*distributions(name=name)])
 
 
 def _kernels() -> Iterator[Finding]:
