@@ -75,7 +75,7 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
         missing = (error.name or "").split(".")[0]
         if missing in EXTRAS:
             sys.exit(f"This command needs {missing}: pip install 'specshield[{EXTRAS[missing]}]'")
-        if missing_parts():
+        if missing_parts(missing.replace("_", "-")):
             sys.exit(NEEDS_SERVER)
         raise
 

@@ -92,11 +92,13 @@ def _parts() -> Iterator[Finding]:
     )
 
 
-def missing_parts() -> list[str]:
-    """The packages that the extra `server` brings, which has those of `core`, and that are not installed."""
+def missing_parts(module: str = "") -> list[str]:
+    """The packages that the extra `server` brings, which has those of `core`, and that are not installed.
+    module: one that could not be imported, so that the package of this name counts as missing too.
+    """
     asked = [each for each in requires("specshield") or () if re.search("extra == .server", each)]
     names = {re.split(r"[^\w.-]", each)[0] for each in asked}
-    return sorted(name for name in names if not [*distributions(name=name)])
+    return sorted(name for name in names if name == module or not [*distributions(name=name)])
 
 
 def _kernels() -> Iterator[Finding]:
