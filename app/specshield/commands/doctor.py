@@ -93,9 +93,7 @@ def _parts() -> Iterator[Finding]:
 
 
 def missing_parts(module: str = "") -> list[str]:
-    """The packages that the extra `server` brings, which has those of `core`, and that are not installed.
-    module: one that could not be imported, so that the package of this name counts as missing too.
-    """
+    """The packages of the extra `server` that are not installed, or whose `module` could not be imported."""
     asked = [each for each in requires("specshield") or () if re.search("extra == .server", each)]
     names = {re.split(r"[^\w.-]", each)[0] for each in asked}
     return sorted(name for name in names if name == module or not [*distributions(name=name)])
