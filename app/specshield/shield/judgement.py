@@ -101,7 +101,7 @@ def judge(shield: Shield, now: Situation) -> Judged:
         best = best_of(tried, kept, motions)
     feasible, lowered = _kept(best.robustness, asked)
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
-    if lowered or (care.has_slack and max(values.tolist()) > SATISFIED_ABOVE):  # numpy's takes 3 us
+    if lowered or (care.has_slack and max(values.tolist()) > SATISFIED_ABOVE):  # numpy is slow for so few
         aimed = had or aim(shield, care, part, tried, kept, leaves, follows)
         left = ~aimed.kept & (values > SATISFIED_ABOVE)
         # A threshold for the episode weighs ways with any slack, also with more than the first futures have.
