@@ -16,6 +16,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from specshield import __version__
 from specshield.errors import InputError, SpecshieldError, StoreError
 
 if TYPE_CHECKING:
@@ -35,11 +36,22 @@ EXTRAS = {"torch": "train", **dict.fromkeys(("foxglove", "pyarrow", "rerun", "ro
 
 def main() -> None:
     """The console script."""
-    run(_commands())
+    run(_commands(), callback=_about, invoke_without_command=True)
 
 
-def run(commands: Iterable[Callable[..., None]]) -> None:
-    """A command line with these commands. What can be expected to go wrong is told in one line."""
+def _about(
+    version: Annotated[bool, typer.Option("--version", help="Print the version, and nothing else.")] = False,
+) -> None:
+    if version:
+        print(f"specshield {__version__}")
+        raise typer.Exit
+
+
+def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
+    """A command line with these commands. What can be expected to go wrong is told in one line.
+
+    options: of the `typer.Typer`.
+    """
     if sys.version_info < (3, 11):
         sys.exit(f"This command needs Python 3.11 or later; this is {sys.version.split()[0]}")
     if typer is None:
@@ -52,6 +64,7 @@ def run(commands: Iterable[Callable[..., None]]) -> None:
         epilog="The commands evaluate and report come with evaluation/, from a checkout: make install.",
         no_args_is_help=True,
         pretty_exceptions_enable=False,
+        **options,
     )
     try:
         for command in commands:
@@ -166,9 +179,12 @@ def worker(
     Other packages may have jobs of their own: each entry point of the group specshield.queues is named like
     the queue that its jobs wait in.
     """
+    from specshield.service.storage.connect import naming
     from specshield.service.training.worker import serve as work
 
-    work(_settings(), until_eof, [queue.name for queue in entry_points(group="specshield.queues")], learner)
+    settings, others = _settings(), [queue.name for queue in entry_points(group="specshield.queues")]
+    with naming(settings):
+        work(settings, until_eof, others, learner)
 
 
 def verify(
@@ -186,7 +202,8 @@ def verify(
     """Check a session's record: its chain of hashes, then every decision, made again to the same bytes.
 
     The exit status is 0 where all is as it was, 1 where something differs, 2 where map or policy are not at
-    hand, so that only the chain was checked, 3 where the file cannot be read, so that nothing was.
+    hand, so that only the chain was checked, 3 where the file cannot be read, so that nothing was, 4 where a
+    step differs that another version decided.
     """
     from specshield.service import verify as verifying
     from specshield.service.settings import read_settings

@@ -18,7 +18,7 @@ import redis
 import yaml
 
 from examples.own_house import HOUSE, REGIONS, ROBOT, RULE, occupancy
-from specshield import cli
+from specshield import __version__, cli
 from specshield.client import ShieldClient
 from specshield.commands import doctor
 from specshield.service.storage.embedded import EmbeddedStore
@@ -289,6 +289,37 @@ def test_the_doctor_finds_what_a_server_does_not_start_with(tmp_path):
         assert there.stdout.splitlines()[-1] == "all is well", there.stdout
     finally:
         store.leave()
+
+
+def test_the_doctor_finds_a_folder_that_a_server_cannot_use(tmp_path):
+    """As after a first start by another user. Root may do all but make a folder where a file is."""
+    data = {"SPECSHIELD_DATA_DIR": str(tmp_path)}
+    assert run_specshield("keys", "create", "alice", **data).returncode == 0
+    (tmp_path / "maps").mkdir()
+    for folder in (tmp_path / "maps", tmp_path / "store" / "appendonlydir", tmp_path / "store"):
+        folder.rename(tmp_path / "away")
+        folder.touch()
+        told = run_specshield("doctor", **data)
+        assert told.returncode == 1
+        assert f"SPECSHIELD_DATA_DIR cannot be used: File exists; got '{folder}'" in told.stdout
+        folder.unlink()
+        (tmp_path / "away").rename(folder)
+    assert run_specshield("doctor", **data).returncode == 0
+
+
+def test_the_version_is_told():
+    told = run_specshield("--version")
+    assert (told.returncode, told.stdout) == (0, f"specshield {__version__}\n")
+
+
+@pytest.mark.parametrize("command", [("keys", "list"), ("keys", "create", "alice"), ("worker",)])
+def test_a_store_that_a_command_cannot_reach_is_named_by_its_setting(command, tmp_path):
+    told = run_specshield(
+        *command, REDIS_URL="redis://:secret@127.0.0.1:1/0", SPECSHIELD_DATA_DIR=str(tmp_path)
+    )
+    assert told.returncode == 1
+    assert told.stderr.splitlines()[-1].startswith("REDIS_URL: the store cannot be reached")
+    assert "secret" not in told.stderr
 
 
 def test_a_store_that_drops_what_was_answered_is_told_of(tmp_path):

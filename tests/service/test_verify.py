@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from specshield import __version__
 from specshield.client import ShieldClient
 from specshield.errors import InputError
 from specshield.service.sessions import chain, record
@@ -226,6 +227,8 @@ def test_a_switch_that_tells_of_another_rule_or_clock_is_found_out(server, capsy
         assert expected in said
     status, said = told(capsys, tmp_path, with_config(content, 0, clock="keep"))
     assert "NOT as it was: step 0" in said
+    upgraded = with_config(content, 1, version="0.0.9")
+    assert [told(capsys, tmp_path, forged(upgraded, t, kl=0.5))[0] for t in (2, 3)] == [1, 4]
 
 
 def test_a_forged_chain_is_whole_and_its_answer_is_found_out(case1, capsys, tmp_path):
@@ -243,6 +246,23 @@ def test_a_forged_chain_is_whole_and_its_answer_is_found_out(case1, capsys, tmp_
         assert "the chain is whole" in said
         assert f"step 7: {named} differ" in said
         assert seal not in said, "whoever kept the seal knows at once"
+
+
+def test_what_another_version_decided_has_a_status_of_its_own(case1, capsys, tmp_path):
+    content, _ = case1
+    old = with_config(content, 0, version="0.0.9")
+    status, said = told(capsys, tmp_path, old)
+    assert (status, "decided by specshield 0.0.9\n" in said) == (0, True)
+    status, said = told(capsys, tmp_path, forged(old, 7, kl=0.5))
+    assert status == 4
+    assert f"decided by specshield 0.0.9, and otherwise by this one, {__version__}: step 7: kl differ" in said
+    assert "NOT" not in said
+    assert told(capsys, tmp_path, forged(old, 7, logits=b""))[0] == 4  # cannot be decided again at all
+    config = json.loads(msgspec.msgpack.decode(content)["config"])
+    assert config.pop("version") == __version__
+    before = sealed_anew(content, json.dumps(config).encode(), msgspec.msgpack.decode(content)["steps"])
+    assert told(capsys, tmp_path, before)[0] == 0
+    assert told(capsys, tmp_path, forged(before, 7, kl=0.5))[0] == 1
 
 
 HOSTILE = [

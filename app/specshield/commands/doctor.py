@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import PackageNotFoundError, distributions, requires, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
@@ -123,9 +124,10 @@ def _kernels() -> Iterator[Finding]:
 def _disk(settings: Settings) -> Iterator[Finding]:
     from specshield.service.library.files import check_writable
 
-    there = settings.data_dir
-    if there.exists():
-        check_writable(there, "SPECSHIELD_DATA_DIR")
+    there, files = settings.data_dir, Path(settings.files_at)
+    for folder in (there, files / "maps", files / "policies"):  # of a URL, none is there
+        if folder.exists():
+            check_writable(folder, "SPECSHIELD_DATA_DIR")
     near = next(folder for folder in (there.absolute(), *there.absolute().parents) if folder.exists())
     if not os.access(near, os.W_OK):
         yield Finding("wrong", f"{near} cannot be written to", "set SPECSHIELD_DATA_DIR to another folder")
@@ -142,13 +144,17 @@ def _disk(settings: Settings) -> Iterator[Finding]:
 
 
 def _store(settings: Settings) -> Iterator[Finding]:
+    from specshield.service.library.files import check_writable
     from specshield.service.storage.connect import FAILURES, connect, drops
     from specshield.service.storage.embedded import EmbeddedStore
     from specshield.service.storage.marker import check_first
     from specshield.service.storage.objects import open_objects
 
     if settings.redis_url is None:
-        EmbeddedStore(settings.data_dir)
+        store_in = EmbeddedStore(settings.data_dir).folder
+        for folder in (store_in, store_in / "appendonlydir"):
+            if folder.exists():
+                check_writable(folder, "SPECSHIELD_DATA_DIR")
         yield Finding("ok", "the store is the server's own, in the data folder")
         open_objects(settings.files_at)
         return

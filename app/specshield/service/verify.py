@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from specshield import __version__
 from specshield.errors import InputError, SpecshieldError
 from specshield.handover import begun
 from specshield.lookahead.preferences import PROJECTION, prepare
@@ -32,7 +33,8 @@ from specshield.world.learned import LearnedMap
 
 def verify(file: Path, settings: Settings) -> int:
     """Prints what is found of a record. 0: every step is as it should be; 1: it is not; 2: only the chain
-    could be checked. Raises InputError where the file cannot be read.
+    could be checked; 4: a step differs, of a rule that another version decided. Raises InputError where the
+    file cannot be read.
     """
     try:
         with open(file, "rb") as opened:
@@ -51,6 +53,7 @@ def verify(file: Path, settings: Settings) -> int:
             print(f"from step {config.begins}, windows from step {config.origin}: {config.spec.formula}")
         print(f"map {config.map_id}")
         print(f"policies {', '.join(config.policy_ids)}")
+        print(f"decided by specshield {config.version or 'of a version that it does not tell'}")
     print("the chain is whole: no byte was changed since it was sealed")
     print(f"seal {found.seal}")
     try:
@@ -65,16 +68,25 @@ def verify(file: Path, settings: Settings) -> int:
 
 
 def _decide(found: Chain, shields: Sequence[Shield]) -> int:
+    """What another version decided shows in all that follows: a decision goes by those before it."""
+    others = [config for config in found.configs if config.version not in ("", __version__)]
+
+    def told(t: int) -> tuple[str, int]:
+        if not others or t < others[0].begins:
+            return "NOT as decided", 1
+        return f"decided by specshield {others[0].version}, and otherwise by this one, {__version__}", 4
+
     try:
         differing = list(differences(found, shields))
     except (SpecshieldError, ValueError, IndexError) as error:  # a record that no server made
-        print(f"NOT as decided: it cannot be decided again: {error}")
-        return 1
+        said, status = told(len(found.steps))
+        print(f"{said}: it cannot be decided again: {error}")
+        return status
     for t, fields in differing[:20]:
-        print(f"NOT as decided: step {t}: {', '.join(fields)} differ")
+        print(f"{told(t)[0]}: step {t}: {', '.join(fields)} differ")
     if differing:
         print(f"{len(differing)} steps differ")
-        return 1
+        return told(differing[0][0])[1]
     print("every step is decided again to the same bytes")
     return 0
 

@@ -56,7 +56,7 @@ def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = 
     """What the action answers, with the store open meanwhile. Raises StoreError."""
     from specshield.service.access.keys import Keys
     from specshield.service.settings import read_settings
-    from specshield.service.storage.connect import connect
+    from specshield.service.storage.connect import connect, naming
     from specshield.service.storage.embedded import EmbeddedStore
 
     settings = settings or read_settings()
@@ -70,4 +70,5 @@ def on_keys(action: Callable[[Keys], Awaitable[R]], settings: Settings | None = 
             embedded = EmbeddedStore(settings.data_dir)
             embedded.join()
             opened.callback(embedded.leave)
-        return asyncio.run(act())
+        with naming(settings):
+            return asyncio.run(act())

@@ -63,10 +63,13 @@ def there(folder: Path, *names: str) -> bool:
 
 
 def check_writable(folder: Path, name: str) -> None:
-    """Makes the folder if need be. Raises InputError, with its setting's name, where it takes no files."""
+    """Makes the folder if need be. Raises InputError, with its setting's name, where it takes no files or
+    cannot be listed.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
+        os.scandir(folder).close()
     except OSError as error:
         told, expected = f"{name} cannot be used: {error.strerror}", "a folder to write to"
         raise InputError(told, path=name, got=str(folder), expected=expected) from error

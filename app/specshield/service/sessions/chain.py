@@ -65,6 +65,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True):
     map_memory: int | None = None
     any_signal: bool = False
     created_at: str = ""
+    version: str = ""
     begins: int = msgspec.field(name="from", default=0)
     origin: int = 0
     clock: Literal["keep", "restart"] = "restart"

@@ -162,7 +162,7 @@ class Session(NamedTuple):
 
 
 # What others are not told of a config.
-INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before", "way")
+INSIDE = ("robot", "nonce", "owner", "from", "origin", "clock", "before", "way", "version")
 
 
 def describe(rules: Sequence[Mapping[str, Any]], state: State) -> dict[str, Any]:

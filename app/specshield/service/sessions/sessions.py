@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from specshield import handover
+from specshield import __version__
 from specshield.arrays import Floats
 from specshield.cores import cores
 from specshield.errors import InputError, LimitReached, NotFound, SpecshieldError
@@ -259,6 +260,7 @@ def begin(
         "created_at": files.now(),
         "owner": owner,
         "nonce": secrets.token_hex(8),
+        "version": __version__,
         "way": (way or b"").hex(),
     }
     carry = handover.begun(rules.way(config))

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from specshield import __version__
 from specshield.arrays import Floats
 from specshield.errors import InputError, LimitReached, SpecshieldError
 from specshield.lookahead.preferences import PROJECTION
@@ -167,6 +168,7 @@ def switched(shields: Shields, wanted: Wanted, most_steps: int) -> Session:
         "origin": origin,
         "clock": wanted.clock,
         "before": before.hex(),
+        "version": __version__,
         "way": "",
     }
     verdict, _ = shields.verdict(old, session.rows, session.signal_names)

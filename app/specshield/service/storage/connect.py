@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 import redis
@@ -28,6 +28,9 @@ import redis.sentinel
 from redis.backoff import ExponentialBackoff
 
 from specshield.errors import StoreError
+
+if TYPE_CHECKING:
+    from specshield.service.settings import Settings
 
 FORMS = (
     "redis://127.0.0.1:6379/0, rediss://..., unix:///path, redis+sentinel://h1,h2/service, redis+cluster://h1"
@@ -50,6 +53,15 @@ def reaching() -> Iterator[None]:
         if isinstance(error, RuntimeError) and "handler is closed" not in str(error):
             raise  # that one is uvloop's word for a connection that the other side has closed
         raise away(error) from error
+
+
+@contextmanager
+def naming(settings: Settings) -> Iterator[None]:
+    """A command's StoreError names the setting that says where the store is, where that is set."""
+    try:
+        yield
+    except StoreError as error:
+        raise error.at("REDIS_URL") if settings.redis_url is not None else error
 
 
 def away(error: Exception) -> StoreError:
