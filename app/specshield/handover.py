@@ -52,12 +52,8 @@ def check_main_task(over: bool, told: bool) -> None:
     back.
     """
     if over and not told:
-        raise StepConflict(
-            "an earlier step said that the main task is done, which cannot be taken back",
-            path="main_task_done",
-            got=False,
-            expected="true",
-        )
+        said, expected = "an earlier step said that the main task is done, which cannot be taken back", "true"
+        raise StepConflict(said, path="main_task_done", got=False, expected=expected)
 
 
 def finite(value: float) -> float | None:

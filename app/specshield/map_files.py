@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 from specshield.errors import MapError
 from specshield.task import parse_regions
-from specshield.world.map_server import load_map, read_yaml
+from specshield.world.map_server import parse, read_yaml, text_of
 from specshield.world.occupancy import OccupancyGrid
 from specshield.world.regions import Region
 
@@ -18,20 +19,19 @@ def read_map_files(path: Path) -> tuple[OccupancyGrid, dict[str, Region]]:
     The image is the PGM or PNG that the YAML names, else `<name>.pgm` or `<name>.png`, beside it. Raises
     MapError, and ValueError where the areas are no JSON.
     """
-    try:
-        text = path.read_text() if path.suffix.lower() in (".yaml", ".yml") else None
-    except (OSError, UnicodeDecodeError):
-        text = None
-    if text is None:
+    metadata = None
+    with suppress(OSError):
+        metadata = path.read_bytes() if path.suffix.lower() in (".yaml", ".yml") else None
+    if metadata is None:
         expected = "a .yaml with its image beside it, an OccupancyGrid, or an object as /v1/maps takes it"
         raise MapError("no map can be read there", path="world", got=str(path), expected=expected)
-    own = path.parent / Path(str(read_yaml(text).get("image", ""))).name
+    own = path.parent / Path(str(read_yaml(text_of(metadata)).get("image", ""))).name
     images = own, path.with_suffix(".pgm"), path.with_suffix(".png")
     found = [each for each in images if each.suffix.lower() in (".pgm", ".png") and each.is_file()]
     if not found:
         expected = "the PGM or PNG that the YAML names, or one called like the YAML"
         raise MapError("its image is not beside it", path="image", got=str(path), expected=expected)
-    grid = load_map(text, found[0].read_bytes())
+    grid, _ = parse(metadata, found[0].read_bytes())
     named = path.with_suffix(".regions.json")
     areas = json.loads(named.read_bytes()) if named.is_file() else {}
     return grid, parse_regions({**areas.get("rooms", {}), **areas.get("regions", {})})

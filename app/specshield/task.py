@@ -185,25 +185,16 @@ def parse_signals(signals: Mapping[str, float], taken: Mapping[str, Any]) -> dic
 def check_signals(names: Collection[str], signals: Mapping[str, float]) -> None:
     """Raises SampleError for a signal that is none of those a session's rules have read, or out of range."""
     for name, value in signals.items():
+        where = f"signals.{name}"
         if name not in names:
             declared = f"one of {sorted(names)}, which the session's rules read"
-            raise SampleError(
-                f"unknown signal {name!r}",
-                path=f"signals.{name}",
-                got=name,
-                expected=declared if names else "no signals: the rule reads none",
-            )
+            expected = declared if names else "no signals: the rule reads none"
+            raise SampleError(f"unknown signal {name!r}", path=where, got=name, expected=expected)
         if not -LARGEST <= value <= LARGEST:
-            raise SampleError(
-                "a signal is out of range", path=f"signals.{name}", got=str(value), expected=SIGNAL
-            )
+            raise SampleError("a signal is out of range", path=where, got=str(value), expected=SIGNAL)
 
 
 def _check_name(name: str, path: str, error: type[InputError]) -> None:
     if not is_name(name) or len(name) > MAX_NAME or name in POSE_NAMES:
-        raise error(
-            f"{name!r} cannot be a name",
-            path=path,
-            got=name,
-            expected=f"up to {MAX_NAME} letters a to z, digits and _; no keyword of formulas, no x, y, theta",
-        )
+        valid = f"up to {MAX_NAME} letters a to z, digits and _; no keyword of formulas, no x, y, theta"
+        raise error(f"{name!r} cannot be a name", path=path, got=name, expected=valid)

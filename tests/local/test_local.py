@@ -425,6 +425,10 @@ def test_a_map_has_the_image_that_its_yaml_names(tmp_path: Path) -> None:
         with pytest.raises(MapError, match="its image is not beside it"):
             read_map_files(tmp_path / "floor.yaml")
     (tmp_path / "house.json").write_text('{"rooms": []}')  # which is YAML too, and no map_server's
+    (tmp_path / "newer.pgm").write_bytes(image)
+    (tmp_path / "floor.yaml").write_text(metadata.replace("[0.0, 0.0, 0.0]", "[0, 0, 90]"))
+    with pytest.raises(MapError, match="radians"):  # as where a server is sent it
+        LocalShield.make(tmp_path / "floor.yaml", "F[0,9] x > 1", check=False)
     for nothing in (tmp_path, tmp_path / "none.yaml", tmp_path / "house.json"):
         with pytest.raises(MapError, match="no map can be read there"):
             LocalShield.make(nothing, "F[0,9] x > 1")

@@ -134,6 +134,7 @@ def test_round_trip(cells, resolution, origin):
         ({"image": "!!python/object/apply:os.getcwd []"}, "metadata"),
         ({"image": "!!timestamp today"}, "metadata"),
         ({"image": "x" * 20_000}, "metadata"),
+        ({"x": "1\nresolution: 9.0"}, "metadata"),  # ROS would take the first, PyYAML the last
     ],
 )
 def test_wrong_metadata_is_refused_by_name(changes, path):

@@ -152,12 +152,9 @@ def _prepare(task: Task, policy: ReachabilityPolicy | None) -> LookAhead:
     body, rules = make_body(task.robot, task.grid), make_rules(task)
     goals = make_goals(body, task.grid)
     if len(goals.distance) == 0:
-        raise Unsupported(
-            "the robot can turn freely nowhere on this map, so there is nowhere to think of it as going",
-            path="shaping",
-            got="lookahead",
-            expected="'projection'",
-        )
+        told = "the robot can turn freely nowhere on this map, so there is nowhere to think of it as going"
+        expected = "'projection'"
+        raise Unsupported(told, path="shaping", got="lookahead", expected=expected)
     planes = make_planes(body, rules, task.horizon, (policy or synthesise(task)).tables)
     entries = int((planes.slot >= 0).sum()) * planes.valid.size
     places, shares = _leads(goals, min(max(WORK // entries, FEWEST), MOST))

@@ -59,12 +59,9 @@ def prepare(name: str, task: Task, proposers: Sequence[Proposer], pose: Sequence
     try:
         preference = PREFERENCES.get(name).prepare(task, proposers)
     except FragmentError as error:
-        raise FragmentError(
-            f"{name!r} cannot be had for this formula: {error.message}",
-            path="shaping",
-            got=name,
-            expected="'projection', or a formula that 'reachability' takes",
-        ) from None
+        told = f"{name!r} cannot be had for this formula: {error.message}"
+        expected = "'projection', or a formula that 'reachability' takes"
+        raise FragmentError(told, path="shaping", got=name, expected=expected) from None
     actions = len(task.robot.actions)
     signals = {signal: np.array([value]) for signal, value in task.signals.items()}
     even = np.full(actions, -math.log(actions))

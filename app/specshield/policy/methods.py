@@ -105,12 +105,8 @@ def missing(method: Method) -> list[str]:
 def load_policy(weights: bytes | Path, card: Card, task: Task) -> Proposer:
     """A policy from its two files, for the task it was made for. Raises PolicyError where they do not fit."""
     if card.get("task_hash") != task.content_hash:
-        raise PolicyError(
-            "the policy was made for another task",
-            path="card.task_hash",
-            got=card.get("task_hash"),
-            expected=task.content_hash,
-        )
+        told, expected = "the policy was made for another task", task.content_hash
+        raise PolicyError(told, path="card.task_hash", got=card.get("task_hash"), expected=expected)
     try:
         method = METHODS.get(str(card.get("method")))
     except InputError as error:

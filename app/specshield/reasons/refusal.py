@@ -60,12 +60,9 @@ def begin(shield: Shield, pose: Sequence[float], allow_infeasible: bool) -> tupl
     """
     most, horizon = shield.config.max_steps, shield.task.horizon
     if most is not None and most < horizon:
-        raise InputError(
-            f"a session of {most} steps ends before its rule is decided",
-            path="max_steps",
-            got=most,
-            expected=f"at least {horizon}, the rule's last step",
-        )
+        said = f"a session of {most} steps ends before its rule is decided"
+        expected = f"at least {horizon}, the rule's last step"
+        raise InputError(said, path="max_steps", got=most, expected=expected)
     try:
         start(shield, pose)
     except InfeasibleStart as error:

@@ -72,12 +72,9 @@ def read_drive(bag: Path, step_seconds: float, topic: str | None = None) -> Floa
     # From the first on: a float of the seconds since 1970 is too coarse to find the pose of a step by.
     times = 1e-9 * np.array([at - found[0][0] for at, _ in found])
     if times[-1] > MOST_STEPS * step_seconds:
-        raise InputError(
-            "the poses are too far apart in time; was a clock set while they were recorded?",
-            path="BAG",
-            got=f"{times[-1]:g} s",
-            expected=f"at most {MOST_STEPS:,} steps of {step_seconds:g} s",
-        )
+        told = "the poses are too far apart in time; was a clock set while they were recorded?"
+        expected = f"at most {MOST_STEPS:,} steps of {step_seconds:g} s"
+        raise InputError(told, path="BAG", got=f"{times[-1]:g} s", expected=expected)
     wanted = np.arange(0.0, times[-1] + 1e-9, step_seconds)
     newest = np.searchsorted(times, wanted + 1e-9, side="right") - 1
     poses: Floats = np.array([pose for _, pose in found])[newest]

@@ -112,11 +112,8 @@ def robot_from_json(spec: Any) -> Robot:
     """
     if isinstance(spec, str):
         if spec not in PRESETS:
-            raise RobotError(
-                f"unknown robot {spec!r}",
-                got=spec,
-                expected=f"one of {', '.join(sorted(PRESETS))}; or an object",
-            )
+            known = f"one of {', '.join(sorted(PRESETS))}; or an object"
+            raise _wrong(f"unknown robot {spec!r}", None, spec, known)
         return PRESETS[spec]
     _keys(spec, "", {"footprint", "actions"}, {"on_contact"})
     footprint = spec["footprint"]
@@ -124,34 +121,21 @@ def robot_from_json(spec: Any) -> Robot:
     radius = _number(footprint["radius"], "footprint.radius", low=1e-3, high=5.0)
     offset = footprint.get("offset", [0.0, 0.0])
     if not isinstance(offset, (list, tuple)) or len(offset) != 2:
-        raise RobotError(
-            "an offset is two numbers", path="footprint.offset", got=offset, expected="[x, y] in metres"
-        )
+        raise _wrong("an offset is two numbers", "footprint.offset", offset, "[x, y] in metres")
     ox, oy = (_number(v, f"footprint.offset[{i}]", low=-5.0, high=5.0) for i, v in enumerate(offset))
     on_contact = spec.get("on_contact", "stay")
     if on_contact not in ("stay", "stop"):
-        raise RobotError(
-            "unknown contact rule", path="on_contact", got=on_contact, expected="'stay' or 'stop'"
-        )
+        raise _wrong("unknown contact rule", "on_contact", on_contact, "'stay' or 'stop'")
     items = spec["actions"]
     if not isinstance(items, list) or not 1 <= len(items) <= MAX_ACTIONS:
-        raise RobotError(
-            "a robot has a list of actions",
-            path="actions",
-            got=shown(items),
-            expected=f"1 to {MAX_ACTIONS} actions",
-        )
+        raise _wrong("a robot has a list of actions", "actions", shown(items), f"1 to {MAX_ACTIONS} actions")
     actions = tuple(_action(item, f"actions[{i}]") for i, item in enumerate(items))
     names = [action.name for action in actions]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise RobotError(
-                "two actions have one name", path=f"actions[{i}].name", got=name, expected="unique names"
-            )
+            raise _wrong("two actions have one name", f"actions[{i}].name", name, "unique names")
     if all(action.terminal for action in actions):
-        raise RobotError(
-            "every action is terminal", path="actions", got=names, expected="at least one that is not"
-        )
+        raise _wrong("every action is terminal", "actions", names, "at least one that is not")
     return Robot("custom", radius, (ox, oy), on_contact, actions)
 
 
@@ -173,21 +157,15 @@ def _action(item: Any, path: str) -> Action:
     _keys(item, path, {"name"}, {"translate", "rotate", "terminal"})
     name = item["name"]
     if not isinstance(name, str) or not 1 <= len(name) <= 64:
-        raise RobotError(
-            "an action needs a name", path=f"{path}.name", got=name, expected="1 to 64 characters"
-        )
+        raise _wrong("an action needs a name", f"{path}.name", name, "1 to 64 characters")
     terminal = item.get("terminal", False)
     if not isinstance(terminal, bool):
-        raise RobotError(
-            "terminal is true or false", path=f"{path}.terminal", got=terminal, expected="a boolean"
-        )
+        raise _wrong("terminal is true or false", f"{path}.terminal", terminal, "true or false")
     most, turn = MAX_TRANSLATE, 2 * math.pi
     translate = _number(item.get("translate", 0.0), f"{path}.translate", -most, most)
     rotate = _number(item.get("rotate", 0.0), f"{path}.rotate", -turn, turn, "radians")
     if terminal and (translate or rotate):
-        raise RobotError(
-            "a terminal action moves nothing", path=path, got=item, expected="no translate, no rotate"
-        )
+        raise _wrong("a terminal action moves nothing", path, item, "no translate, no rotate")
     return Action(name, translate, rotate, terminal)
 
 
@@ -195,17 +173,19 @@ def _keys(item: Any, path: str, required: set[str], optional: set[str]) -> None:
     which = path or "the robot"
     if not isinstance(item, dict):
         told, expected = f"{which} is not an object", f"an object with {sorted(required)}"
-        raise RobotError(told, path=path or None, got=shown(item), expected=expected)
+        raise _wrong(told, path or None, shown(item), expected)
     missing, unknown = required - item.keys(), item.keys() - required - optional
     if missing or unknown:
         said = f"lacks {sorted(missing)}" if missing else f"has unknown fields {sorted(map(str, unknown))}"
-        told = f"{which} {said}"
         expected = f"{sorted(required | optional)}"
-        raise RobotError(told, path=path or None, got=sorted(map(str, item)), expected=expected)
+        raise _wrong(f"{which} {said}", path or None, sorted(map(str, item)), expected)
 
 
 def _number(value: Any, path: str, low: float, high: float, unit: str = "metres") -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
-        expected = f"a number from {low:g} to {high:g} {unit}"
-        raise RobotError("not a number in range", path=path, got=value, expected=expected)
+        raise _wrong("not a number in range", path, value, f"a number from {low:g} to {high:g} {unit}")
     return float(value)
+
+
+def _wrong(told: str, path: str | None, got: Any, expected: str) -> RobotError:
+    return RobotError(told, path=path, got=got, expected=expected)

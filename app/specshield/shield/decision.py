@@ -53,39 +53,25 @@ class Config:
 
     def __post_init__(self) -> None:
         if self.evaluation not in ("feasibility", "robustness"):
-            raise InputError(
-                "unknown evaluation",
-                path="evaluation",
-                got=self.evaluation,
-                expected="'feasibility' or 'robustness'",
-            )
+            told, expected = "unknown evaluation", "'feasibility' or 'robustness'"
+            raise InputError(told, path="evaluation", got=self.evaluation, expected=expected)
         binary = self.evaluation == "feasibility"
         if not math.isfinite(self.threshold) or (binary and not 0.0 < self.threshold <= 1.0):
-            raise InputError(
-                "the threshold is out of range",
-                path="threshold",
-                got=self.threshold,
-                expected="above 0 and at most 1" if binary else "a finite number of metres",
-            )
+            told = "the threshold is out of range"
+            expected = "above 0 and at most 1" if binary else "a finite number of metres"
+            raise InputError(told, path="threshold", got=self.threshold, expected=expected)
         for name, value, unit in (("margin", self.margin, "metres"), ("slack", self.slack, "steps")):
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(
                     f"the {name} is out of range", path=name, got=value, expected=f"0 or more {unit}"
                 )
         if self.threshold_over == "episode" and not binary:
-            raise InputError(
-                "a threshold over the episode is a probability, and evaluation 'robustness' has metres",
-                path="threshold_over",
-                got="episode",
-                expected="'step', or evaluation 'feasibility'",
-            )
+            told = "a threshold over the episode is a probability, and evaluation 'robustness' has metres"
+            expected = "'step', or evaluation 'feasibility'"
+            raise InputError(told, path="threshold_over", got="episode", expected=expected)
         if self.map_memory is not None and self.map_memory < 1:
-            raise InputError(
-                "the map's memory is out of range",
-                path="map_memory",
-                got=self.map_memory,
-                expected="1 or more steps, or null for ever",
-            )
+            told, expected = "the map's memory is out of range", "1 or more steps, or null for ever"
+            raise InputError(told, path="map_memory", got=self.map_memory, expected=expected)
 
 
 @dataclass(frozen=True)
@@ -133,12 +119,9 @@ def make_shield(
     task = proposers[0].task
     for i, policy in enumerate(proposers):
         if policy.task.content_hash != task.content_hash:
-            raise PolicyError(
-                "the policies were made for different tasks",
-                path=f"policy_ids[{i}]",
-                got=policy.task.content_hash,
-                expected=f"task {task.content_hash}, as policy_ids[0]",
-            )
+            told = "the policies were made for different tasks"
+            expected = f"task {task.content_hash}, as policy_ids[0]"
+            raise PolicyError(told, path=f"policy_ids[{i}]", got=policy.task.content_hash, expected=expected)
     body, view = make_body(task.robot, task.grid), view_of(task, task.formula)
     return Shield(task, tuple(proposers), config or Config(), body, view, preference)
 

@@ -46,12 +46,8 @@ class Uncertainty:
         for name, highest in most.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and 0.0 <= value <= highest):
-                raise InputError(
-                    f"the {name} of the uncertainty is out of range",
-                    path=f"uncertainty.{name}",
-                    got=value,
-                    expected=f"from 0 to {highest:g}",
-                )
+                told, expected = f"the {name} of the uncertainty is out of range", f"from 0 to {highest:g}"
+                raise InputError(told, path=f"uncertainty.{name}", got=value, expected=expected)
 
 
 class Noise(NamedTuple):

@@ -33,7 +33,7 @@ from typing import Any, TypeVar
 from specshield.errors import FormulaError, HorizonError
 from specshield.stl import formula as nodes
 from specshield.stl.formula import BODY_WORDS, KEYWORDS, MAX_BOUND, Formula, Name, Node, Term
-from specshield.stl.tokens import Token, tokens
+from specshield.stl.tokens import Token, tokens, wrong
 
 MAX_DEPTH = 64  # nodes on the longest way down; a hand-written formula has about 6
 
@@ -50,6 +50,11 @@ _NO_CHAIN = {
     nodes.IMPLIES: ("implications", "parentheses around one of them"),
     nodes.UNTIL: ("untils", "parentheses around one of them"),
     nodes.COMPARISON: ("comparisons", "'and' between two of them"),
+}
+
+_ELSEWHERE = {  # what follows a word that is none here, and what to add
+    "[": "; with a window there are G, F and U: always, eventually, until",
+    "(": "; with parentheses there are abs, touches and inside",
 }
 
 _N = TypeVar("_N", bound=Node)
@@ -75,7 +80,7 @@ class _Parser:
     def formula(self) -> Formula:
         formula = self._as_formula(self._expression(nodes.IMPLIES))
         if self._token.kind != "end":
-            raise self._unexpected("an operator or the end")
+            raise self._unexpected("an operator or the end; between formulas there are and, or, -> and U")
         return formula
 
     @property
@@ -198,7 +203,7 @@ class _Parser:
             known = sorted(name for name in self._names if "(" not in name)
             more = f" and {len(known) - 20} more" if len(known) > 20 else ""
             expected = f"one of {', '.join(known[:20])}{more}" if known else "no names at all"
-            expected += _lower_case(token.text)
+            expected += _hint(token, self._token)
             raise self._error(f"nothing declares '{_clip(token.text)}'", token, expected)
         return Name(token.text)
 
@@ -220,7 +225,7 @@ class _Parser:
             raise self._unexpected("',' or ':' between the window's bounds")
         self._next()
         b = self._bound()
-        self._take("]", "']' after the window's bounds")
+        self._take("]", "']' after the window's bounds, which are steps without a unit")
         if a > b:
             raise self._error(f"the window [{a},{b}] is empty", opening, "a <= b", got=[a, b])
         return a, b
@@ -250,8 +255,10 @@ class _Parser:
 
     def _unexpected(self, expected: str) -> FormulaError:
         token = self._token
-        problem = "the text ends" if token.kind == "end" else f"unexpected '{_clip(token.text)}'"
-        return self._error(problem, token, expected + _lower_case(token.text))
+        if token.kind == "end":
+            return self._error("the text ends", token, expected)
+        hint = _hint(token, self._tokens[self._index + 1])
+        return self._error(f"unexpected '{_clip(token.text)}'", token, expected + hint)
 
     def _error(
         self,
@@ -261,18 +268,18 @@ class _Parser:
         error: type[FormulaError] = FormulaError,
         got: Any = None,
     ) -> FormulaError:
-        return error(
-            f"{problem} at position {token.position}; expected {expected}",
-            got=_clip(token.text) if got is None else got,
-            expected=expected,
-            position=token.position,
-        )
+        found = _clip(token.text) if got is None else got
+        return wrong(f"{problem} at position {token.position}", found, expected, token.position, error)
 
 
-def _lower_case(word: str) -> str:
-    """What to add for someone who wrote AND or Not."""
-    lower = word.lower()
-    return f"; '{lower}' is written in lower case" if lower != word and lower in KEYWORDS else ""
+def _hint(word: Token, following: Token) -> str:
+    """What to add for someone who wrote AND, or a word that other languages have."""
+    lower = word.text.lower()
+    if lower != word.text and lower in KEYWORDS:
+        return f"; '{lower}' is written in lower case"
+    if word.text in BODY_WORDS:
+        return f"; '{word.text}' takes a region in parentheses"
+    return _ELSEWHERE.get(following.kind, "") if word.kind == "name" else ""
 
 
 def _clip(text: str) -> str:

@@ -63,23 +63,17 @@ def read_map(name: Any, members: Mapping[str, Any], files: bool = False) -> tupl
     format = FORMATS.get(str(name))
     if format.files != files:
         ways = {True: "files (multipart/form-data)", False: "a JSON object"}
-        raise InputError(
-            f"a map of the format {name} is not sent this way",
-            path="format",
-            got=ways[files],
-            expected=f"{ways[format.files]} with {' and '.join(format.required)}",
-        )
+        told = f"a map of the format {name} is not sent this way"
+        expected = f"{ways[format.files]} with {' and '.join(format.required)}"
+        raise InputError(told, path="format", got=ways[files], expected=expected)
     for member in format.required:
         if member not in members:
-            raise MapError("this member is missing", path=member, expected=f"it belongs to the format {name}")
+            expected = f"a member {member!r}, which belongs to the format {name}"
+            raise MapError(f"{member} is missing", path=member, expected=expected)
     for member in members:
         if member not in format.members:
-            raise MapError(
-                f"the format {name} has no such member",
-                path=str(member)[:200],
-                got=members[member],
-                expected=_one_of(sorted(format.members)),
-            )
+            told, expected = f"the format {name} has no such member", _one_of(sorted(format.members))
+            raise MapError(told, path=str(member)[:200], got=members[member], expected=expected)
     defaults = {member: schema["default"] for member, schema in format.members.items() if "default" in schema}
     return format.parse(**{**defaults, **members})
 

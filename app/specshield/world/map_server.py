@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Hashable
 from contextlib import suppress
 from typing import Any
 
@@ -82,7 +83,17 @@ def from_values(values: NDArray[Any], resolution: float, origin: tuple[float, fl
 
 
 class _Loader(yaml.SafeLoader):
-    """Loads plain data alone, and refuses aliases, which can make a short text grow without bound."""
+    """Loads plain data alone, and refuses aliases, which can make a short text grow without bound, and a
+    member that is there twice, of which ROS takes the first and PyYAML the last.
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        names = [key.value for key, _ in node.value]
+        for i, (key, _) in enumerate(node.value):
+            if key.value in names[:i]:
+                problem = f"{key.value!r} is there twice"
+                raise yaml.constructor.ConstructorError(problem=problem, problem_mark=key.start_mark)
+        return super().construct_mapping(node, deep)
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -127,7 +138,7 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
         if picture.mode == "F":
             raise ValueError("PFM, which Pillow counts as PPM")
     except Image.DecompressionBombError as error:
-        got, most = f"{got}, {error}", f"at most {MAX_SIDE} x {MAX_SIDE} pixels"
+        most = f"at most {MAX_SIDE} x {MAX_SIDE} pixels"
         raise MapError("the image is too large", path="image", got=got, expected=most) from error
     except Exception as error:  # decoders raise whatever the bytes lead to
         problem = "the image has no header of a PGM or PNG"
@@ -149,12 +160,16 @@ def _read_image(image: bytes, alpha_counts: bool) -> tuple[Floats, Floats]:
         raise MapError(problem, path="image", got=got, expected="a whole PGM or PNG") from error
 
 
-def _parse(metadata: bytes, image: bytes) -> tuple[OccupancyGrid, Rooms]:
+def text_of(metadata: bytes) -> str:
     try:
-        text = metadata.decode()
+        return metadata.decode()
     except UnicodeDecodeError as error:
         raise checks.wrong("text", "metadata", str(error), "YAML in UTF-8") from None
-    grid = load_map(text, image)
+
+
+def parse(metadata: bytes, image: bytes) -> tuple[OccupancyGrid, Rooms]:
+    """As it is sent. A server's own files may have been kept before a yaw in degrees was refused."""
+    grid = load_map(text_of(metadata), image)
     if abs(grid.origin[2]) > FULL_TURN:
         raise checks.wrong("yaw", "origin[2]", grid.origin[2], "radians, from -2 pi to 2 pi")
     return grid, {}
@@ -166,6 +181,6 @@ FORMAT = MapFormat(
         "metadata": {"description": "The map_server YAML; its `image:` is ignored."},
         "image": {"description": "The image: PGM or PNG."},
     },
-    _parse,
+    parse,
     files=True,
 )

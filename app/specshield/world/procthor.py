@@ -148,12 +148,9 @@ def _furniture(house: Any, asset_sizes: Any) -> Iterator[tuple[Floats, Floats]]:
         pending += _items(thing, "children", path) if "children" in thing else []
         asset = checks.text(checks.member(thing, "assetId", path), f"{path}.assetId")
         if asset not in sizes:
-            raise MapError(
-                f"{path} has the asset {asset!r}, which asset_sizes does not have",
-                path=f"{path}.assetId",
-                got=checks.shown(asset),
-                expected="a key of asset_sizes",
-            )
+            told = f"{path} has the asset {asset!r}, which asset_sizes does not have"
+            expected = "a key of asset_sizes"
+            raise MapError(told, path=f"{path}.assetId", got=checks.shown(asset), expected=expected)
         half = np.array(_size(sizes[asset], f"asset_sizes.{asset}")) / 2
         x, y, z = _vector(checks.member(thing, "position", path), f"{path}.position")
         degrees = _vector(checks.member(thing, "rotation", path), f"{path}.rotation")

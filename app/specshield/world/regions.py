@@ -51,12 +51,9 @@ class Rectangle:
         object.__setattr__(self, "min", checks.numbers(self.min, 2, "min"))
         object.__setattr__(self, "max", checks.numbers(self.max, 2, "max"))
         if not (self.min[0] < self.max[0] and self.min[1] < self.max[1]):
-            raise MapError(
-                "a rectangle's min has to be below its max on both axes",
-                path="max",
-                got=list(self.max),
-                expected=f"x > {self.min[0]:g} and y > {self.min[1]:g}",
-            )
+            told = "a rectangle's min has to be below its max on both axes"
+            expected = f"x > {self.min[0]:g} and y > {self.min[1]:g}"
+            raise MapError(told, path="max", got=list(self.max), expected=expected)
 
 
 @dataclass(frozen=True)
@@ -71,12 +68,9 @@ class Polygon:
         object.__setattr__(self, "vertices", vertices)
         first, second = crossing_edges(np.array(vertices))
         if first >= 0:
-            raise MapError(
-                f"the polygon's edges {first} and {second} (counted by first vertex) touch or cross",
-                path="vertices",
-                got=[first, second],
-                expected="a simple polygon, no vertex repeated",
-            )
+            told = f"the polygon's edges {first} and {second} (counted by first vertex) touch or cross"
+            expected = "a simple polygon, no vertex repeated"
+            raise MapError(told, path="vertices", got=[first, second], expected=expected)
 
 
 @dataclass(frozen=True)
@@ -250,12 +244,8 @@ def region_from_json(spec: Any, path: str) -> Region:
         raise checks.wrong("kind of region", f"{path}.type", kind, "one of " + ", ".join(KINDS))
     names = [field.name for field in fields(KINDS[kind])]
     if extra := sorted(set(map(str, spec)) - {"type", *names}):
-        raise MapError(
-            f"a {kind} has no member {extra[0]!r}",
-            path=f"{path}.{extra[0]}",
-            got=extra[0],
-            expected="type, " + ", ".join(names),
-        )
+        told, expected = f"a {kind} has no member {extra[0]!r}", "type, " + ", ".join(names)
+        raise MapError(told, path=f"{path}.{extra[0]}", got=extra[0], expected=expected)
     values = [checks.member(spec, name, path) for name in names]
     if kind == "union":
         return _union_from_json(values[0], path)
@@ -270,12 +260,8 @@ def _union_from_json(members: Any, path: str) -> Union:
     for i, spec in enumerate(checks.items(members, f"{path}.members", 1, MAX_MEMBERS)):
         where = f"{path}.members[{i}]"
         if isinstance(spec, Mapping) and spec.get("type") == "union":
-            raise MapError(
-                "a union cannot be a member of a union",
-                path=where,
-                got="union",
-                expected="circle, rectangle or polygon",
-            )
+            told, expected = "a union cannot be a member of a union", "circle, rectangle or polygon"
+            raise MapError(told, path=where, got="union", expected=expected)
         part = region_from_json(spec, where)
         assert not isinstance(part, Union)
         parts.append(part)

@@ -41,12 +41,8 @@ class Layers(NamedTuple):
 def make_network(weights: Mapping[str, NDArray[np.generic]], inputs: int, outputs: int) -> Network:
     """Checks weights that come from outside. Raises PolicyError naming the tensor at fault."""
     if sorted(weights) != sorted(NAMES):
-        raise PolicyError(
-            "these are not the tensors of a Q-network",
-            path="weights",
-            got=sorted(weights),
-            expected=str(sorted(NAMES)),
-        )
+        told, expected = "these are not the tensors of a Q-network", str(sorted(NAMES))
+        raise PolicyError(told, path="weights", got=sorted(weights), expected=expected)
     before = inputs
     for layer in (1, 2, 3):
         after = outputs if layer == 3 else np.atleast_1d(weights[f"w{layer}"]).shape[-1]

@@ -82,9 +82,6 @@ def check(task: Task, settings: Settings) -> None:
     """Raises what `train` would for a task that it cannot serve, without making anything."""
     make_rules(task)
     if task.horizon < 1:
-        raise PolicyError(
-            "there is nothing to learn: the rule looks at the first state alone",
-            path="spec.formula",
-            got=str(task.formula),
-            expected="a horizon of at least 1; or method 'reachability'",
-        )
+        told = "there is nothing to learn: the rule looks at the first state alone"
+        expected = "a horizon of at least 1; or method 'reachability'"
+        raise PolicyError(told, path="spec.formula", got=str(task.formula), expected=expected)

@@ -140,12 +140,9 @@ class Policies(Claimed):
                 spec[kind] = {name: value for name, value in spec[kind].items() if name in used}
         size = len(files.to_json(spec))
         if size > self._max_spec:
-            raise InputError(
-                "the spec is too large",
-                path="spec",
-                got=f"{size} bytes as JSON",
-                expected=f"at most {self._max_spec}, regions that the formula does not name left out",
-            )
+            told = "the spec is too large"
+            expected = f"at most {self._max_spec}, regions that the formula does not name left out"
+            raise InputError(told, path="spec", got=f"{size} bytes as JSON", expected=expected)
         id = self._on_map(_id(about, task), about, task)
         return Record(id, replace(about, spec=spec), task.horizon)
 

@@ -15,8 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from specshield import handover
-from specshield import __version__
+from specshield import __version__, handover
 from specshield.arrays import Floats
 from specshield.cores import cores
 from specshield.errors import InputError, LimitReached, NotFound, SpecshieldError

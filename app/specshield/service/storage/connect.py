@@ -61,7 +61,9 @@ def naming(settings: Settings) -> Iterator[None]:
     try:
         yield
     except StoreError as error:
-        raise error.at("REDIS_URL") if settings.redis_url is not None else error
+        if settings.redis_url is not None:
+            error.at("REDIS_URL")
+        raise
 
 
 def away(error: Exception) -> StoreError:
