@@ -312,7 +312,7 @@ def test_the_version_is_told():
     assert (told.returncode, told.stdout) == (0, f"specshield {__version__}\n")
 
 
-@pytest.mark.parametrize("command", [("keys", "list"), ("keys", "create", "alice"), ("worker",)])
+@pytest.mark.parametrize("command", [("keys", "list"), ("keys", "create", "alice")])
 def test_a_store_that_a_command_cannot_reach_is_named_by_its_setting(command, tmp_path):
     told = run_specshield(
         *command, REDIS_URL="redis://:secret@127.0.0.1:1/0", SPECSHIELD_DATA_DIR=str(tmp_path)

@@ -147,7 +147,7 @@ def test_settings_that_cannot_be_are_said_in_one_line(tmp_path, command, environ
 def test_a_worker_whose_store_is_away_says_so_without_a_traceback(tmp_path):
     run = run_specshield("worker", cwd=tmp_path, REDIS_URL=f"redis://127.0.0.1:{free_port()}")
     assert run.returncode == 1
-    assert run.stderr.splitlines()[-1] == "the store cannot be reached: ConnectionError"
+    assert run.stderr.splitlines()[-1] == "REDIS_URL: the store cannot be reached: ConnectionError"
     assert "Traceback" not in run.stderr
 
 
