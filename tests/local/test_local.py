@@ -528,6 +528,14 @@ def test_a_setting_that_a_server_refuses_is_refused(
         assert any(str(each["path"]).startswith(path) for each in told.get("errors", [told])), told
 
 
+@pytest.mark.parametrize("seed", [-1, 1.5, "x", 2**63])
+def test_a_seed_that_a_server_refuses_makes_no_policy(seed: Any) -> None:
+    grid = OccupancyGrid(np.zeros((30, 30), bool), 0.25)
+    with pytest.raises(InputError, match="a whole number from 0 to 9223372036854775807") as told:
+        LocalShield.make(grid, "F[0,40] x > 4", robot=ROBOT, seed=seed, check=False)
+    assert told.value.path == "seed"
+
+
 def test_a_threshold_of_0_metres_is_taken_here_and_there(server: RunningServer) -> None:
     """A server refused it, as though it were a probability, of which 0 asks for nothing."""
     asked: dict[str, Any] = {"initial_pose": START, "evaluation": "robustness", "threshold": 0.0}

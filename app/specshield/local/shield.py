@@ -124,6 +124,7 @@ class LocalShield:
         regions, robot, signals, options = map(plain, (regions, robot, signals, options))
         made_robot = robot if isinstance(robot, Robot) else robot_from_json(robot)
         task = make_task(grid, made_robot, formula, regions, {**own, **(rooms or {})}, signals)
+        seed = read_settings({"seed": seed})["seed"]
         how = METHODS.get(method)
         settings = read_options(how.options, options or {})
         how.check(task, settings)

@@ -18,6 +18,7 @@ from starlette.types import Receive, Scope, Send
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
 from specshield.service.library.files import unusable
+from specshield.service.schemas.base import ID, ID_TOLD
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_GONE = 499  # what nginx logs for a request whose client went away; it is never sent
@@ -194,6 +195,8 @@ def _expected(item: Mapping[str, Any]) -> str:
     }
     if item["type"] == "finite_number" and "logits" in item["loc"]:
         return "a finite number, or null for minus infinity"
+    if context.get("pattern") == f"^{ID}$":
+        return ID_TOLD
     if item["type"] in told:
         return told[item["type"]].format(**context)
     return said.removeprefix("Value error, ").removeprefix("Input should be ")

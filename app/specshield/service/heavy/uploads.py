@@ -33,7 +33,7 @@ from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Description, Policies, Record, describe
 from specshield.service.problems import from_validation
-from specshield.service.schemas.base import ID
+from specshield.service.schemas.base import ID, ID_TOLD
 from specshield.service.schemas.policies import Card, PolicyRequest
 from specshield.service.schemas.specs import SpecRequest
 from specshield.service.settings import Settings
@@ -91,8 +91,7 @@ def add_map(settings: Settings, content_type: str, content: Content, key: Key) -
 def _named(name: Any) -> str | None:
     """The name that an upload asks for. Raises InputError for one that cannot be an id."""
     if name is not None and not (isinstance(name, str) and re.fullmatch(ID, name)):
-        expected = "1 to 64 letters a to z, digits, '_', '.' or '-', the first a letter or digit"
-        raise InputError("this is no name", path="name", got=name, expected=expected)
+        raise InputError("this is no name", path="name", got=name, expected=ID_TOLD)
     return name
 
 
