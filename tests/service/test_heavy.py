@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from specshield.errors import Busy, MapError, ServerError, TooExpensive
+from specshield.errors import Busy, MapError, ServerError, StoreError, TooExpensive
 from specshield.service.heavy.child import LENGTH
 from specshield.service.heavy.pool import Pool, Template
 from specshield.service.heavy.queue import Turns
@@ -45,6 +45,9 @@ def test_children_answer_fail_run_out_and_are_replaced() -> None:
         with pytest.raises(MapError) as wrong:  # our errors come back as they are
             await pool.run("specshield.world.checks:integer", 1.5, "data[0]", 0, 9, seconds=60.0)
         assert (wrong.value.path, wrong.value.got) == ("data[0]", 1.5)
+        with pytest.raises(StoreError, match="files cannot be used: No such file") as away:
+            await pool.run("os:listdir", "/no/such/folder", seconds=60.0)
+        assert "/no" not in str(away.value)
         with pytest.raises(ServerError, match="ZeroDivisionError"):  # and others without what they say
             await pool.run("operator:truediv", 1, 0, seconds=60.0)
         assert await pool.run("os:getpid", seconds=60.0) == first

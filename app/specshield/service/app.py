@@ -176,6 +176,6 @@ async def _adopt(library: Maps, known: Policies) -> None:
             break
         except StoreError:
             await asyncio.sleep(1.0)
-        except SpecshieldError as error:  # no room for them, say
+        except (SpecshieldError, OSError) as error:  # no room for them, say, or a folder that cannot be read
             log.error("maps and policies of a time before owners stay unseen: %s", error)
             break

@@ -24,6 +24,7 @@ import sys
 from typing import Any
 
 from specshield.errors import SpecshieldError
+from specshield.service.library.files import unusable
 from specshield.service.settings import Settings
 from specshield.service.watch import logs
 
@@ -87,6 +88,8 @@ def _call(call: bytes) -> tuple[Any, BaseException | None]:
         return None, error.with_traceback(None)
     except MemoryError:
         return None, MemoryError()
+    except OSError as error:
+        return None, unusable(error)
     except BaseException as error:
         logs.log.exception("a call failed in a process for heavy work")
         return None, RuntimeError(f"{type(error).__name__}; the server's log says more")
