@@ -78,12 +78,9 @@ class Registry(Generic[E]):
                 raise TypeError(f"{point.value} is a {type(entry).__name__}, not a {self._cls.__name__}")
         except Exception as error:  # importing a module can raise anything
             log.exception("%s cannot be loaded", what)
-            raise Unsupported(
-                f"{what} cannot be loaded: {type(error).__name__}; the log says more",
-                path=self._field,
-                got=point.name,
-                expected=f"a {self.word} whose package is whole",
-            ) from error
+            told = f"{what} cannot be loaded: {type(error).__name__}; the log says more"
+            expected = f"a {self.word} whose package is whole"
+            raise Unsupported(told, path=self._field, got=point.name, expected=expected) from error
         return entry
 
 

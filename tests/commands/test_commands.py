@@ -304,6 +304,10 @@ def test_the_doctor_finds_a_folder_that_a_server_cannot_use(tmp_path):
         assert f"SPECSHIELD_DATA_DIR cannot be used: File exists; got '{folder}'" in told.stdout
         folder.unlink()
         (tmp_path / "away").rename(folder)
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "policies").touch()
+    told = run_specshield("doctor", SPECSHIELD_DATA_URL=str(tmp_path / "elsewhere"), **data)
+    assert "SPECSHIELD_DATA_URL cannot be used: File exists" in told.stdout
     assert run_specshield("doctor", **data).returncode == 0
 
 

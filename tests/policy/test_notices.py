@@ -1,5 +1,7 @@
 """What is said of a policy that no start, or hardly one, can be kept by."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from specshield.policy.notices import notices
 from specshield.policy.reachability.policy import Settings
 from specshield.reasons.relaxation import way
 from specshield.robot import robot_from_json
+from specshield.robot.oddity import odd_turns
 from specshield.shield.decision import make_shield
 from specshield.shield.proposal import Proposal
 from specshield.task import make_task
@@ -17,6 +20,21 @@ REGIONS = {
     "Far": {"type": "circle", "center": [20.0, 20.0], "radius": 1.0},
 }
 ACTIONS = [{"name": "go", "translate": 0.2}, {"name": "turn", "rotate": 0.7853981633974483}, {"name": "wait"}]
+
+
+def test_a_turn_in_degrees_is_told_and_half_a_turn_is_not():
+    actions = [
+        {"name": "left", "rotate": 6},
+        {"name": "about", "rotate": -math.pi},
+        {"name": "go", "translate": 0.2},
+    ]
+    robot = robot_from_json({"footprint": {"radius": 0.2}, "actions": actions})
+    (told,) = odd_turns(robot)
+    assert "the action 'left' turns by 6 radians" in told
+    assert "6 degrees would be 0.1047 radians" in told  # pi / 30
+    policy = Policy("F[0,3] x > 0")
+    policy.task = make_task(policy.task.grid, robot, "F[0,3] x > 0")
+    assert notices(policy)[0] == told
 
 
 class Policy:

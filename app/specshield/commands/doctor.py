@@ -124,10 +124,12 @@ def _kernels() -> Iterator[Finding]:
 def _disk(settings: Settings) -> Iterator[Finding]:
     from specshield.service.library.files import check_writable
 
-    there, files = settings.data_dir, Path(settings.files_at)
-    for folder in (there, files / "maps", files / "policies"):  # of a URL, none is there
+    there, files = settings.data_dir, Path(settings.files_at)  # which is no folder for a URL
+    of = "SPECSHIELD_DATA_DIR" if settings.data_url is None else "SPECSHIELD_DATA_URL"
+    kept = [(of, files), (of, files / "maps"), (of, files / "policies")]
+    for name, folder in (("SPECSHIELD_DATA_DIR", there), *kept):
         if folder.exists():
-            check_writable(folder, "SPECSHIELD_DATA_DIR")
+            check_writable(folder, name)
     near = next(folder for folder in (there.absolute(), *there.absolute().parents) if folder.exists())
     if not os.access(near, os.W_OK):
         yield Finding("wrong", f"{near} cannot be written to", "set SPECSHIELD_DATA_DIR to another folder")

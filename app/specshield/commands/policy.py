@@ -93,11 +93,8 @@ def _map(map: str, assets: Path | None) -> Callable[[ShieldClient], Map]:
     if "image" in content:
         image = path.parent / Path(str(content["image"])).name
         if not image.is_file():
-            raise InputError(
-                f"{path} names the image {content['image']!r}, which is not beside it",
-                path="--map",
-                expected="the map's PGM or PNG beside its YAML",
-            )
+            told = f"{path} names the image {content['image']!r}, which is not beside it"
+            raise InputError(told, path="--map", expected="the map's PGM or PNG beside its YAML")
         return lambda client: client.maps.upload(path, image)
     if "rooms" in content:
         sizes = {} if assets is None else _read(assets, "--assets")

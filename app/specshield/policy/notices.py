@@ -1,4 +1,6 @@
-"""The warnings of a new policy: no start keeps its rule, it misses starts, or a part asks for nothing."""
+"""The warnings of a new policy: no start keeps its rule, it misses starts, or a part asks for nothing; and
+turns of its robot that look like degrees.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ from specshield.errors import InfeasibleStart, MapError, SampleError
 from specshield.policy.dqn.environment import free_poses
 from specshield.reasons.bound import contradiction, idle
 from specshield.reasons.relaxation import way
+from specshield.robot.oddity import odd_turns
 from specshield.rule.worst import worst_signals
 from specshield.shield.decision import Config, Shield, make_shield
 from specshield.shield.episode import start
@@ -24,6 +27,10 @@ MOST_SEARCHED = 4  # of those that it has no future from
 
 def notices(policy: Proposer) -> tuple[str, ...]:
     """One sentence each. The starts are drawn from free space, the same each time."""
+    return (*odd_turns(policy.task.robot), *_of_rule(policy))
+
+
+def _of_rule(policy: Proposer) -> tuple[str, ...]:
     task, shield = policy.task, make_shield([policy])
     why = contradiction(task, shield.body)
     if why is not None:

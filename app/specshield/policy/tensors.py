@@ -32,12 +32,9 @@ def read_tensors(weights: bytes | Path) -> dict[str, NDArray[Any]]:
         # No path of this machine is told: not as what was got, nor by an error of the system's.
         got = None if isinstance(weights, Path) else f"{len(weights)} bytes"
         reason = "the file cannot be opened" if isinstance(error, OSError) else str(error)
-        raise PolicyError(
-            f"the weights cannot be read: {reason}",
-            path="weights",
-            got=got,
-            expected=f"a safetensors file with arrays of {', '.join(KINDS)}",
-        ) from error
+        told = f"the weights cannot be read: {reason}"
+        expected = f"a safetensors file with arrays of {', '.join(KINDS)}"
+        raise PolicyError(told, path="weights", got=got, expected=expected) from error
 
 
 def named_arrays(

@@ -224,17 +224,12 @@ def _listed(names: str) -> list[str]:
 def read_settings() -> Settings:
     """Those of this process's environment. Raises InputError, which names the variable at fault."""
     if os.environ.get("SPECSHIELD_API_KEY") == "":  # empty counts as unset: nobody means an open server by it
-        raise InputError(
-            "SPECSHIELD_API_KEY is empty",
-            path="SPECSHIELD_API_KEY",
-            expected="a key, or the variable not set",
-        )
+        name, expected = "SPECSHIELD_API_KEY", "a key, or the variable not set"
+        raise InputError(f"{name} is empty", path=name, expected=expected)
     if os.environ.get("SPECSHIELD_DATA_URL", "").startswith("memory:"):
-        raise InputError(
-            "files in memory are seen by one process alone, and a server has several",
-            path="SPECSHIELD_DATA_URL",
-            expected="a folder, or a URL that every process reaches",
-        )
+        told = "files in memory are seen by one process alone, and a server has several"
+        expected = "a folder, or a URL that every process reaches"
+        raise InputError(told, path="SPECSHIELD_DATA_URL", expected=expected)
     known = [f"SPECSHIELD_{field.upper()}" for field in Settings.model_fields]
     for name in os.environ:  # a setting that is misspelt would be left out without a word
         meant = get_close_matches(name, known, 1, ALIKE)

@@ -82,12 +82,9 @@ def _ask(server: Server, caller: Key, asked: Record, called: str | None) -> dict
     if queued and name not in own and not server.jobs.worker_there(name):
         needs = METHODS.get(name).needs
         installed = f" where {' and '.join(needs)} is installed" if needs else ""
-        raise TrainingUnavailable(
-            f"no worker is running that makes policies by {name}",
-            path="method",
-            got=name,
-            expected=f"a worker: start one with `specshield worker`{installed}, then ask again",
-        )
+        told = f"no worker is running that makes policies by {name}"
+        expected = f"a worker: start one with `specshield worker`{installed}, then ask again"
+        raise TrainingUnavailable(told, path="method", got=name, expected=expected)
     record = server.policies.add(asked, caller)
     if queued:
         server.jobs.start(record.id, name)
