@@ -176,6 +176,24 @@ def test_refusals_name_the_place_and_what_was_expected(text: str, position: int,
     assert f"at position {position}" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "position", "expected"),
+    [
+        ("Globally[0,3] a", 8, "G, F and U: always, eventually, until"),
+        ("Always[0,3] a", 6, "'always' is written in lower case"),
+        ("F[0,3] x(t) > 1", 8, "abs, touches and inside"),
+        ("F[0,3] inside a", 14, "'inside' takes a region in parentheses"),
+    ],
+)
+def test_a_word_of_another_language_is_told_where_any_name_would_do(
+    text: str, position: int, expected: str
+) -> None:
+    with pytest.raises(FormulaError) as caught:
+        parse(text)
+    assert caught.value.details["position"] == position
+    assert expected in (caught.value.expected or "")
+
+
 def test_names_are_free_unless_given() -> None:
     assert parse("Anything > 0").names == ("Anything",)
     assert parse("a and Bedroom_2", names=["a", "Bedroom_2"]).names == ("Bedroom_2", "a")

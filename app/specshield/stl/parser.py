@@ -257,7 +257,8 @@ class _Parser:
         token = self._token
         if token.kind == "end":
             return self._error("the text ends", token, expected)
-        hint = _hint(token, self._tokens[self._index + 1])
+        before, after = self._tokens[max(self._index - 1, 0)], self._tokens[self._index + 1]
+        hint = _hint(token, after) or _hint(before, token)
         return self._error(f"unexpected '{_clip(token.text)}'", token, expected + hint)
 
     def _error(
