@@ -367,15 +367,19 @@ def test_maps_are_compressed_and_old_folders_are_read(claims, tmp_path):
     assert not folder.exists()
 
 
-def test_maps_of_a_time_before_owners_are_the_operators(claims, tmp_path):
-    settings = Settings(data_dir=tmp_path)
-    id = Maps(settings, claims).add(OccupancyGrid(np.zeros((5, 7), bool), 0.3), {}, OPEN).id
+def test_what_nobody_has_is_nobodys_until_it_is_sent_again(claims, tmp_path):
+    """As where the store was lost, and the files were not."""
+    settings, grid = Settings(data_dir=tmp_path), OccupancyGrid(np.zeros((5, 7), bool), 0.3)
+    id = Maps(settings, claims).add(grid, {}, OPEN).id
     claims._store().delete("specshield:{library}:maps:", f"specshield:{{library}}:owners:maps:{id}")
     maps = Maps(settings, claims)
     assert id not in [item["id"] for item in maps.page("", None, 1000)[0]]
-    maps.adopt()
+    with pytest.raises(NotFound):
+        maps.find(id, "")
+    assert maps.add(grid, {}, OPEN).id == id
     assert id in [item["id"] for item in maps.page("", None, 1000)[0]]
     maps.delete(id, "")
+    assert not (tmp_path / "maps" / id).exists()
 
 
 def test_a_folder_that_cannot_be_read_is_told_once_and_does_not_end_what_goes_on_beside(

@@ -14,7 +14,6 @@ from fastapi_offline import FastAPIOffline
 from starlette.types import Receive, Scope, Send
 
 from specshield import __version__
-from specshield.errors import SpecshieldError, StoreError
 from specshield.service import pages, problems
 from specshield.service.access.keys import Keys
 from specshield.service.bounds import body
@@ -148,7 +147,6 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         mover.run(),
         watchers.run(),
         keys.follow(),
-        _adopt(library, known),
     )
     tasks = [asyncio.create_task(each) for each in running]
     try:
@@ -165,17 +163,3 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
         await store.aclose()
         if embedded is not None:
             embedded.leave()
-
-
-async def _adopt(library: Maps, known: Policies) -> None:
-    """Once the store answers."""
-    while True:
-        try:
-            await asyncio.to_thread(library.adopt)
-            await asyncio.to_thread(known.adopt)
-            break
-        except StoreError:
-            await asyncio.sleep(1.0)
-        except (SpecshieldError, OSError) as error:  # no room for them, say, or a folder that cannot be read
-            log.error("maps and policies of a time before owners stay unseen: %s", error)
-            break

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from specshield.errors import Conflict, InputError, InsufficientStorage, LimitReached, NameTaken, NotFound
-from specshield.service.access.keys import OPEN, Key
+from specshield.service.access.keys import Key
 from specshield.service.library import files
 from specshield.service.settings import Settings
 from specshield.service.storage.connect import reaching
@@ -170,18 +170,6 @@ class Claimed:
     def __init__(self, kind: str, claims: Claims | None, settings: Settings) -> None:
         self._kind, self.given, self._folder = kind, claims, files.kept(settings, kind)
         self._named: Mapping[str, Any] = {}  # what came with the server
-
-    def adopt(self) -> None:
-        """Gives what nobody has, of a time before owners, to the owner without a name."""
-        for id in files.ids(self._folder):
-            if not self.claims.owners(self._kind, id):
-                size = files.weight_of(self._folder / id)
-                with self.claims.adding(self._kind, id, OPEN, size, self._map_of(id)):
-                    pass
-
-    def _map_of(self, id: str) -> str:
-        """Of a policy the map, as `Claims.adding` takes it."""
-        return ""
 
     def check_name(self, name: str, id: str, owner: str) -> None:
         """Raises NameTaken where something else than `id` has the name, and InputError for one that nothing

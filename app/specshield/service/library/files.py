@@ -40,12 +40,6 @@ def kept(settings: Settings, kind: str) -> Path:
     return folder
 
 
-def ids(folder: Path) -> list[str]:
-    mirror = _mirrors.get(folder)
-    names = mirror.ids() if mirror is not None else [entry.name for entry in folder.iterdir()]
-    return sorted(name for name in names if HASH.fullmatch(name))
-
-
 def there(folder: Path, *names: str) -> bool:
     """Whether a map or policy is there. A copy is brought up to date first: all of it, or these files."""
     mirror = _mirrors.get(folder.parent)

@@ -21,10 +21,6 @@ class Mirror:
     def __init__(self, local: Path, remote: Objects, kind: str) -> None:
         self._local, self._remote, self._kind, self._mark = local, remote, kind, MARK[kind]
 
-    def ids(self) -> list[str]:
-        found = (path.split("/") for path, _ in self._remote.sizes(self._kind))
-        return [parts[1] for parts in found if parts[2:] == [self._mark]]
-
     def missing(self, id: str, only: Sequence[str] = ()) -> dict[str, bytes] | None:
         """The files that the copy lacks, or those of `only`, the mark last; None where there is no such
         folder, or no more.

@@ -256,9 +256,6 @@ class Policies(Claimed):
             found = list(pool.map(self.made_here, keys))  # None: not written to the end, or deleted by now
         return [record for record in found if record is not None], following
 
-    def _map_of(self, id: str) -> str:
-        return self._own_map(self.record(id).about)
-
     def _shipped(self) -> Iterator[Record]:
         for path in sorted(self._models.glob("*/card.json")):
             try:
