@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from starlette.requests import Request
 
@@ -47,8 +47,8 @@ class Body:
     folder: Path
     content_type: str
     size: int = 0
-    path: Path | None = None
     _held: bytearray = field(default_factory=bytearray)
+    _file: Any = None
 
     async def add(self, chunk: bytes) -> None:
         """Raises Busy where the requests together hold too much."""
@@ -61,29 +61,28 @@ class Body:
 
     async def end(self) -> None:
         """No more will come."""
-        if self.path is not None:
+        if self._file is not None:
             await self._write()
+            self._file.flush()
 
     @property
     def content(self) -> bytes | Path:
         """The whole body, or the file that holds it."""
-        return bytes(self._held) if self.path is None else self.path
+        return bytes(self._held) if self._file is None else Path(self._file.name)
 
     async def _write(self) -> None:
-        if self.path is None:
+        if self._file is None:
             self.folder.mkdir(parents=True, exist_ok=True)
-            descriptor, name = tempfile.mkstemp(dir=self.folder)
-            os.close(descriptor)
-            self.path = Path(name)
+            self._file = tempfile.NamedTemporaryFile(dir=self.folder)  # noqa: SIM115  it stays open until `close`
         held, self._held = self._held, bytearray()
-        await asyncio.to_thread(_append, self.path, held)
+        await asyncio.to_thread(self._file.write, held)
 
     def close(self) -> None:
         self.budget.give(max(self.size - FREE, 0))
         self.size = 0
-        if self.path is not None:
+        if self._file is not None:
             with contextlib.suppress(OSError):
-                self.path.unlink()
+                self._file.close()  # which removes it
 
 
 def received(request: Request) -> Body:
@@ -98,9 +97,3 @@ def clear(folder: Path) -> None:
         with contextlib.suppress(OSError):
             if path.stat().st_mtime < time.time() - 3600:
                 path.unlink()
-
-
-def _append(path: Path, content: bytearray) -> None:
-    with open(path, "r+b") as file:  # not "ab", which would make a file again that `close` has removed
-        file.seek(0, os.SEEK_END)
-        file.write(content)
