@@ -102,9 +102,7 @@ class Watchers:
         self._check_room()
         feed = self._feeds.get(id) or await self._begin(id)
         t = feed.end if after is None else after + 1
-        if feed.over and t >= feed.end:
-            return None
-        return self._stream(feed, t)
+        return None if feed.over and t >= feed.end else self._stream({feed: t}, several=False)
 
     async def open_all(self, after: Mapping[str, int | None]) -> AsyncIterator[bytes]:
         """One stream of what follows in several sessions, each after its own step; those that are not there
@@ -116,7 +114,7 @@ class Watchers:
             with contextlib.suppress(NotFound):
                 feed = self._feeds.get(id) or await self._begin(id)
                 places[feed] = feed.end if t is None else t + 1
-        return self._together(places)
+        return self._stream(places, several=True)
 
     async def _idle(self) -> None:
         """Lets the steps go first that are being decided here."""
@@ -132,25 +130,31 @@ class Watchers:
                 expected="room for one more: close one, or ask another server",
             )
 
-    async def _together(self, after: dict[Feed, int]) -> AsyncIterator[bytes]:
+    async def _stream(self, after: Mapping[Feed, int], several: bool) -> AsyncIterator[bytes]:
+        """Of `several` sessions the events are gathered; that of one tells each at once."""
         places = {self._feeds.setdefault(feed.id, feed): t for feed, t in after.items()}
         feeds, told_at = list(places), time.monotonic()
         with self._watching(feeds):
             yield FIRST
             while places and not self._stopping():
-                told = []
-                for feed, t in [(feed, t) for feed, t in places.items() if t < feed.end or feed.over]:
+                told, changed = [], feeds[0].changed
+                behind = [(feed, t) for feed, t in places.items() if t < feed.end or feed.over]
+                for feed, t in behind:
                     found, t = await self._since(feed, t)
-                    told += [each.whole for each in found]
+                    told += [each.whole if several else each.event for each in found]
                     places[feed] = t
                     if feed.over and t >= feed.end:
-                        told.append(feed.last(session=shown(feed.id)))
+                        told.append(feed.last(several))
                         del places[feed]
                 if told or time.monotonic() - told_at > HEARTBEAT:
                     told_at = time.monotonic()
                     yield b"".join(told) or b": alive\n\n"
-                await asyncio.sleep(TOGETHER + EACH * len(places))
-                await self._idle()
+                if several:
+                    await asyncio.sleep(TOGETHER + EACH * len(places))
+                    await self._idle()
+                elif not behind:
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(changed.wait(), HEARTBEAT)
 
     @contextlib.contextmanager
     def _watching(self, feeds: Sequence[Feed]) -> Iterator[None]:
@@ -175,25 +179,6 @@ class Watchers:
         return Feed(
             id, *ruled(session), found.version, state.next_t, state.next_t, state.finished, state.spec_status
         )
-
-    async def _stream(self, feed: Feed, t: int) -> AsyncIterator[bytes]:
-        feed = self._feeds.setdefault(feed.id, feed)
-        with self._watching([feed]):
-            yield FIRST
-            while not self._stopping():
-                changed = feed.changed
-                found, t = await self._since(feed, t)
-                if found:
-                    yield b"".join(each.event for each in found)
-                if t < feed.end:
-                    continue
-                if feed.over:
-                    yield b"event: end\n" + feed.last()
-                    return
-                try:
-                    await asyncio.wait_for(changed.wait(), HEARTBEAT)
-                except TimeoutError:
-                    yield b": alive\n\n"
 
     async def _look(self, feeds: list[Feed]) -> None:
         if not feeds:

@@ -148,10 +148,12 @@ class Feed:
         """Whether the session has had a switch that this does not know of; its rows may be wider since."""
         return len(State.of(new.state).verdicts) >= len(self.rules)
 
-    def last(self, **of: str) -> bytes:
-        """The data of the last event. of: in a stream of several sessions, which one."""
-        told = {**of, "next_t": self.end, "spec_status": self.status, "finished": True}
-        return b"data: %s\n\n" % json.dumps(told).encode()
+    def last(self, several: bool) -> bytes:
+        """The last event; in a stream of several sessions it says which one has ended."""
+        told = {"next_t": self.end, "spec_status": self.status, "finished": True}
+        if several:
+            return b"data: %s\n\n" % json.dumps({"session": shown(self.id), **told}).encode()
+        return b"event: end\ndata: %s\n\n" % json.dumps(told).encode()
 
 
 def ruled(session: Session) -> tuple[Sequence[Mapping[str, Any]], list[dict[str, Any]], int]:
