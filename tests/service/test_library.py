@@ -16,7 +16,7 @@ import redis
 from PIL import Image
 from safetensors.numpy import load, save
 
-from specshield.errors import NotFound
+from specshield.errors import InsufficientStorage, NotFound
 from specshield.policy.card import policy_id
 from specshield.service.access.keys import OPEN, Key
 from specshield.service.app import _adopt
@@ -24,6 +24,7 @@ from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies, describe
 from specshield.service.settings import Settings
+from specshield.service.storage import objects
 from specshield.service.training.jobs import Jobs
 from specshield.world.map_server import dump_map
 from specshield.world.occupancy import OccupancyGrid
@@ -211,11 +212,17 @@ def test_nobody_begins_to_use_what_is_being_deleted(claims, monkeypatch):
     assert claims.ids("policies", "marks") == []
 
 
-def test_what_cannot_be_written_is_not_claimed(claims):
+def test_what_cannot_be_written_is_not_claimed(claims, tmp_path, monkeypatch):
+    def full(path, content):
+        raise OSError(28, "No space left on device", "/secret/path")
+
     before = claims._store().hgetall("specshield:{library}:sums")
+    maps = Maps(Settings(data_dir=tmp_path), claims)
+    monkeypatch.setattr(objects, "write_through", full)
     for _ in range(2):
-        with pytest.raises(Exception, match="disk is full"), claims.adding("maps", "1" * 64, OPEN, 10):
-            raise OSError(28, "No space left on device", "/secret/path")
+        with pytest.raises(InsufficientStorage, match="disk is full") as told:
+            maps.add(OccupancyGrid(np.zeros((5, 6), bool), 0.3), {}, OPEN)
+        assert "secret" not in f"{told.value} {told.value.details}"
     assert claims.ids("maps", "") == []
     after = claims._store().hgetall("specshield:{library}:sums")
     assert {k: v for k, v in after.items() if v != b"0"} == {k: v for k, v in before.items() if v != b"0"}
@@ -290,7 +297,7 @@ def test_a_server_lists_what_others_keep_behind_the_same_url_and_copies_weights_
     card = json.loads(made["card"])
     sent = policies.add_card(describe(card), card, made["weights"], ANN)
     assert sent in others.page("ann", None, 99)[0]
-    weights = others._folder / sent.id / "policy.safetensors"
+    weights = others._kept.root / sent.id / "policy.safetensors"
     assert not weights.exists()
     assert others.policy(others.find(sent.id, "ann")).id == sent.id
     assert weights.read_bytes() == made["weights"]
@@ -341,8 +348,8 @@ def test_what_goes_while_it_is_listed_is_left_out(library):
     policies, maps = library
     made = maps.add(OccupancyGrid(cells(), RESOLUTION), rooms(Den=3.0), ANN)
     record = policies.add(asked(policies, made.id), ANN)
-    (maps._folder / made.id / "map.json").unlink()  # as it is between two looks of the server
-    (policies._folder / record.id / "policy.json").unlink()
+    (maps._kept.root / made.id / "map.json").unlink()  # as it is between two looks of the server
+    (policies._kept.root / record.id / "policy.json").unlink()
     assert made.id not in [item["id"] for item in maps.page("ann", None, 99)[0]]
     assert record.id not in [found.id for found in policies.page("ann", None, 99)[0]]
     for look, key in ((maps.show, made.id), (maps.find, made.grid.content_hash), (policies.find, record.id)):

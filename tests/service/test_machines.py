@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from specshield.errors import InputError
-from specshield.service.library import files
+from specshield.service.library.files import Kept
 from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
@@ -83,49 +83,71 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
     embedded.leave()
 
 
-def test_what_one_server_keeps_behind_a_url_another_finds_and_loads_from_its_own_copy(tmp_path):
-    def settings(name: str) -> Settings:
-        nothing = tmp_path / "nothing"
-        nothing.mkdir(exist_ok=True)
-        return Settings(
-            data_dir=tmp_path / name,
-            data_url=f"memory://{tmp_path.name}",
-            maps_dir=nothing,
-            models_dir=nothing,
-        )
+def kept(tmp_path: Path, name: str) -> Kept:
+    """The policies of a server of this name, which are behind a URL."""
+    return Kept(Settings(data_dir=tmp_path / name, data_url=f"memory://{tmp_path.name}"), "policies")
 
-    one, other = settings("one"), settings("other")
-    here, there = (files.kept(each, "policies") / ("a" * 64) for each in (one, other))
-    assert not files.there(there)
-    files.write_folder(here, {"policy.json": b"{}"})
-    assert files.there(there)
-    assert not (there / "card.json").exists()
-    files.write_file(here / "policy.safetensors", b"weights")
-    files.write_file(here / "card.json", b"{}")
-    assert files.there(there)
-    assert (there / "policy.safetensors").read_bytes() == b"weights"
-    files.remove_folder(there)
-    assert not files.there(here)
+
+def test_what_one_server_keeps_behind_a_url_another_finds_and_loads_from_its_own_copy(tmp_path):
+    here, there, id = kept(tmp_path, "one"), kept(tmp_path, "other"), "a" * 64
+    assert there.find(id, "policy.json") is None
+    here.write(id, {"policy.json": b"{}"})
+    assert there.find(id, "policy.json") == {}
+    assert there.find(id, "card.json") is None
+    here.write(id, {"card.json": b"{}", "policy.safetensors": b"weights"})
+    assert there.find(id, "card.json") == {}
+    assert there.weight(id) == len(b"{}{}weights")
+    for each, name in ((here, "one"), (there, "other")):
+        copy = each.file(id, "policy.safetensors")
+        assert copy == tmp_path / name / "copies" / "policies" / id / "policy.safetensors"
+        assert copy.read_bytes() == b"weights"
+    there.remove(id)
+    assert not (there.root / id).exists()
+    assert here.find(id, "policy.json") is None
+    assert not (here.root / id).exists(), "what is made anew under this id has other weights"
+    assert not here.file(id, "policy.safetensors").exists()
 
 
 def test_a_copy_that_several_fetch_at_once_is_whole(tmp_path):
-    def folders(name: str) -> Path:
-        nothing = tmp_path / "nothing"
-        nothing.mkdir(exist_ok=True)
-        settings = {"data_url": f"memory://{tmp_path.name}", "maps_dir": nothing, "models_dir": nothing}
-        return files.kept(Settings(data_dir=tmp_path / name, **settings), "policies")
-
-    here, there = folders("one"), folders("other")
+    here, there = kept(tmp_path, "one"), kept(tmp_path, "other")
     weights, ids = bytes(1 << 20), [f"{number:064x}" for number in range(20)]
     for id in ids:
-        files.write_folder(here / id, {"policy.json": b"{}", "policy.safetensors": weights})
+        here.write(id, {"policy.json": b"{}", "policy.safetensors": weights})
 
-    def fetched(id: str, *names: str) -> bytes:
-        assert files.there(there / id, *names)
-        assert files.there(there / id)
-        return (there / id / "policy.safetensors").read_bytes()
+    def fetched(id: str) -> bytes:
+        assert there.find(id, "policy.json") == {}
+        return there.file(id, "policy.safetensors").read_bytes()
 
     with ThreadPoolExecutor(6) as several:
-        asked = [several.submit(fetched, id, *names) for id in ids for names in ((), ("policy.json",), ())]
+        asked = [several.submit(fetched, id) for id in ids for _ in range(3)]
         assert all(each.result() == weights for each in asked)
-    assert not list(there.glob("*/.draft-*"))
+    assert not list(there.root.glob("*/.draft-*"))
+
+
+@pytest.mark.parametrize("behind", [True, False], ids=["a URL", "a folder"])
+def test_what_is_not_written_or_removed_to_the_end_is_not_there(tmp_path, monkeypatch, behind):
+    each = kept(tmp_path, "one") if behind else Kept(Settings(data_dir=tmp_path), "policies")
+    files = {"card.json": b"{}", "policy.json": b"{}", "policy.safetensors": b"weights"}
+    write, id = each._objects.write, "a" * 64
+
+    def killed_after(most: int) -> None:
+        written = iter(range(most))
+        monkeypatch.setattr(each._objects, "write", lambda *file: (next(written), write(*file)))
+        with pytest.raises(StopIteration):
+            each.write(id, files)
+
+    for most in range(len(files)):
+        killed_after(most)
+        assert each.find(id, "policy.json") is None
+        assert (each.find(id, "card.json") is None) == (most < 2), "the weights come before the card"
+    monkeypatch.undo()
+    each.write(id, files)
+    assert each.find(id, "policy.json") == {}
+    remove = each._objects.remove
+    monkeypatch.setattr(each._objects, "remove", lambda path: (remove(path), 1 / 0))
+    with pytest.raises(ZeroDivisionError):
+        each.remove(id)
+    assert each.find(id, "policy.json") is None
+    monkeypatch.undo()
+    each.remove(id)
+    assert each.weight(id) == 0

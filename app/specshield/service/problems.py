@@ -17,8 +17,8 @@ from starlette.types import Receive, Scope, Send
 
 from specshield import errors
 from specshield.errors import InputError, SpecshieldError
-from specshield.service.library.files import unusable
 from specshield.service.schemas.base import ID, ID_TOLD
+from specshield.service.storage.objects import unusable
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_GONE = 499  # what nginx logs for a request whose client went away; it is never sent

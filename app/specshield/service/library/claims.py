@@ -105,8 +105,7 @@ class Claims:
         if said == "no map":
             raise NotFound("the map was deleted", path="map_id", got=map_id, expected="an id from /v1/maps")
         try:
-            with files.guarded():
-                yield
+            yield
         except BaseException:
             if said == "made":
                 token = secrets.token_hex(8)
@@ -168,7 +167,7 @@ class Claimed:
     """What maps and policies share. claims: whose they are; needed to find, add and delete."""
 
     def __init__(self, kind: str, claims: Claims | None, settings: Settings) -> None:
-        self._kind, self.given, self._folder = kind, claims, files.kept(settings, kind)
+        self._kind, self.given, self._kept = kind, claims, files.Kept(settings, kind)
         self._named: Mapping[str, Any] = {}  # what came with the server
 
     def check_name(self, name: str, id: str, owner: str) -> None:

@@ -1,59 +1,77 @@
-"""Folders that several processes share: each appears whole, by rename, under the hash of its content."""
+"""The files of maps and policies, which all servers of a store share: each under the hash of its content."""
 
 from __future__ import annotations
 
-import errno
 import json
-import logging
-import os
 import re
-import secrets
 import shutil
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from specshield.errors import InputError, InsufficientStorage, SpecshieldError, StoreError
-from specshield.service.library.mirror import Mirror
+from specshield.errors import InputError, InsufficientStorage
 from specshield.service.settings import Settings
-from specshield.service.storage.objects import open_objects, sync, write_through
+from specshield.service.storage.objects import Folder, open_objects, unusable
 
+MARK = {"maps": "map.json", "policies": "policy.json"}
 HASH = re.compile(r"[0-9a-f]{64}")
 PAGE_BYTES = 256 << 10  # chosen by hand: read and shown in a few ms
+BEHIND_A_URL = 4 << 10  # [bytes] as which a page counts what is there, whose size would take long to ask
 V = TypeVar("V")
-log = logging.getLogger("specshield")
-_mirrors: dict[Path, Mirror] = {}  # of the folders whose things are behind a URL
 
 
-def kept(settings: Settings, kind: str) -> Path:
-    """The folder of all `maps` or `policies`; where they are behind a URL, that of this server's copies."""
-    place = Path(settings.files_at) if "://" not in settings.files_at else settings.data_dir / "copies"
-    folder = place / kind
-    folder.mkdir(parents=True, exist_ok=True)
-    if "://" in settings.files_at:
-        _mirrors[folder] = Mirror(folder, open_objects(settings.files_at), kind)
-    return folder
+class Kept:
+    """All `maps`, or all `policies`: a folder each, of files that never change once they are there. The mark
+    is written last and removed first: it says that a folder is there at all.
 
+    Methods raise StoreError where the files cannot be reached, and InsufficientStorage for a full disk.
+    root: the folder on a disk of this machine; that of its copies where the files are behind a URL.
+    """
 
-def there(folder: Path, *names: str) -> bool:
-    """Whether a map or policy is there. A copy is brought up to date first: all of it, or these files."""
-    mirror = _mirrors.get(folder.parent)
-    if mirror is None:
-        return folder.is_dir()
-    missing = mirror.missing(folder.name, names)
-    if missing is None:
-        return False
-    if not folder.is_dir():
-        _write_folder(folder, missing)
-    for name, content in missing.items():
-        if not (folder / name).exists():  # another may have made the folder, with fewer files
-            _write_file(folder / name, content)
-    return True
+    def __init__(self, settings: Settings, kind: str) -> None:
+        objects, copies = open_objects(f"{settings.files_at}/{kind}"), settings.data_dir / "copies" / kind
+        self._here = objects if isinstance(objects, Folder) else Folder(copies)
+        self._objects, self._copies = objects, self._here is not objects
+        self._mark, self.root = MARK[kind], self._here.root
+
+    def find(self, id: str, name: str) -> Any:
+        """What a file of JSON holds; None where it is not there, or no more."""
+        content = self._objects.read(f"{id}/{name}")
+        if content is None and name == self._mark and self._copies:
+            shutil.rmtree(self.root / id, ignore_errors=True)  # another server has removed it
+        return None if content is None else json.loads(content)
+
+    def file(self, id: str, name: str) -> Path:
+        """A file on a disk of this machine: it itself, or a copy that is made now."""
+        path = self.root / id / name
+        if self._copies and not path.exists():
+            content = self._objects.read(f"{id}/{name}")
+            if content is not None:
+                self._here.write(f"{id}/{name}", content)
+        return path
+
+    def size(self, id: str, *names: str) -> int:
+        """About as many bytes as reading these files takes."""
+        return BEHIND_A_URL if self._copies else sum(size(self.root / id / name) for name in names)
+
+    def write(self, id: str, files: Mapping[str, bytes]) -> None:
+        # Weights before the card that makes them count.
+        for name in sorted(files, key=lambda name: (name == self._mark, name.endswith(".json"), name)):
+            self._objects.write(f"{id}/{name}", files[name])
+
+    def remove(self, id: str) -> None:
+        self._objects.remove(f"{id}/{self._mark}")
+        shutil.rmtree(self.root / id, ignore_errors=True)  # with what a training has left there
+        for name in self._objects.names(id):
+            self._objects.remove(f"{id}/{name}")
+
+    def weight(self, id: str) -> int:
+        """Bytes that the files take; 0 where there are none."""
+        return sum(size for path, size in self._objects.sizes(id) if path.count("/") == 1)
 
 
 def check_writable(folder: Path, name: str) -> None:
@@ -69,95 +87,19 @@ def check_writable(folder: Path, name: str) -> None:
         raise InputError(told, path=name, got=str(folder), expected=expected) from error
 
 
-def find_json(path: Path) -> Any:
-    """None where there is no such file, or no more: another process may delete what this one looks at."""
-    try:
-        return json.loads(path.read_bytes())
-    except FileNotFoundError:
-        return None
-
-
 def to_json(value: Any) -> bytes:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
 
 
-def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes all of the files, or none. A folder that is there already has the same content, and stays."""
-    _write_folder(folder, files)
-    if folder.parent in _mirrors:
-        _mirrors[folder.parent].send(folder.name, dict(files))
-
-
-def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    draft = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".draft-"))
-    try:
-        for name, content in files.items():
-            write_through(draft / name, content)
-        os.rename(draft, folder)
-        sync(folder.parent)
-    except OSError:
-        if not folder.is_dir():
-            raise
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def weight_of(folder: Path) -> int:
-    """Bytes that the files of a folder take; 0 where it is gone."""
-    try:
-        return sum(size(path) for path in folder.iterdir() if path.is_file())
-    except FileNotFoundError:
-        return 0
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Replaces the file as a whole: a reader sees the old one or the new one."""
-    _write_file(path, content)
-    if path.parent.parent in _mirrors:
-        _mirrors[path.parent.parent].send(path.parent.name, {path.name: content})
-
-
-def _write_file(path: Path, content: bytes) -> None:
-    draft = path.with_name(f".draft-{secrets.token_hex(8)}")
-    write_through(draft, content)
-    os.replace(draft, path)
-    sync(path.parent)
-
-
-def remove_folder(folder: Path) -> None:
-    """Takes the folder out of the others' sight at once, then erases it."""
-    if folder.parent in _mirrors:
-        _mirrors[folder.parent].remove(folder.name)
-    grave = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".deleted-"))
-    if folder.is_dir():
-        os.rename(folder, grave / folder.name)
-    shutil.rmtree(grave, ignore_errors=True)
-
-
 def check_free(folder: Path, wanted: int) -> None:
     """Raises InsufficientStorage where the disk of `folder` has fewer free bytes. One system call."""
-    with guarded():
+    try:
         free = shutil.disk_usage(folder).free
+    except OSError as error:
+        raise unusable(error) from error
     if free < wanted:
         expected = f"at least {wanted} bytes free: delete something"
         raise InsufficientStorage("the server's disk is full", got=free, expected=expected)
-
-
-@contextmanager
-def guarded() -> Iterator[None]:
-    """Files that cannot be used raise what `unusable` makes of it."""
-    try:
-        yield
-    except OSError as error:
-        raise unusable(error) from error
-
-
-def unusable(error: OSError) -> SpecshieldError:
-    """What a caller is told of it; which file it is, the log alone. A full disk is InsufficientStorage."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return InsufficientStorage("the server's disk is full", expected="a disk with room")
-    log.warning("%s", error)
-    return StoreError(f"the server's files cannot be used: {error.strerror}")
 
 
 def page(

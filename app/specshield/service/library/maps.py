@@ -73,9 +73,8 @@ class Maps(Claimed):
         found = self.shipped(key)
         if found is not None:
             return found
-        if files.HASH.fullmatch(key) and files.there(self._folder / key):
-            return self._recent.get(key, lambda: self._read(key))
-        raise missing("maps", key)
+        stored = self._stored(key)
+        return self._recent.get(key, lambda: self._read(key, stored))
 
     def shipped(self, key: str) -> Map | None:
         """One that came with the server, by its id, its name, or the hash of its grid."""
@@ -95,7 +94,7 @@ class Maps(Claimed):
         if files.HASH.fullmatch(key):
             if self.claims.holds("maps", key, owner):
                 return self.get(key)
-            for id in self._own(owner):
+            for id in self.claims.ids("maps", owner):
                 with suppress(NotFound):  # deleted at this moment
                     if self._stored(id)["grid"] == key:
                         return self.get(id)
@@ -126,12 +125,12 @@ class Maps(Claimed):
                 path="rooms",
                 expected=f"at most {self._max_rooms} bytes as JSON: simpler outlines",
             )
-        made, folder = Map(id, grid, rooms), self._folder / id
+        made = Map(id, grid, rooms)
         meta = files.to_json({"grid": grid.content_hash, "shown": made.to_json()})
         content = {"map.yaml": dump_map(grid)[0].encode(), "map.png": made.png(), "map.json": meta}
         with self.claims.adding("maps", id, key, sum(map(len, content.values()))):
-            if not files.there(folder):
-                files.write_folder(folder, content)
+            if self._kept.find(id, "map.json") is None:
+                self._kept.write(id, content)
         if name is not None:
             self.claims.name("maps", id, key.name, name)
         kept = self._recent.get(id, lambda: made)
@@ -155,25 +154,19 @@ class Maps(Claimed):
         try:
             if self.claims.free("maps", key, owner, token):
                 self._recent.drop(key)
-                files.remove_folder(self._folder / key)
+                self._kept.remove(key)
         finally:
             self.claims.unmark("maps", key, token)
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[dict[str, Any]], str | None]:
         """One page of an owner's maps and those of all, as JSON, had without reading the cells."""
-        keys = [*self._named, *self._own(owner)]
-        keys, following = files.page(
-            keys, after, limit, lambda key: files.size(self._folder / key / "map.json")
-        )
+        keys = [*self._named, *self.claims.ids("maps", owner)]
+        keys, following = files.page(keys, after, limit, lambda key: self._kept.size(key, "map.json"))
         names, shown = self.claims.names("maps", owner), []
         for key in keys:
-            with suppress(NotFound):  # deleted at this moment
+            with suppress(NotFound):  # deleted at this moment, or not written to the end
                 shown.append(self._shown(key) | ({"name": names[key]} if key in names else {}))
         return shown, following
-
-    def _own(self, owner: str) -> list[str]:
-        """Ids that the owner has; one whose files are not there was not written to the end."""
-        return [id for id in self.claims.ids("maps", owner) if files.there(self._folder / id)]
 
     def _shown(self, key: str) -> dict[str, Any]:
         if key in self._named:
@@ -182,19 +175,18 @@ class Maps(Claimed):
         return shown
 
     def _stored(self, id: str) -> dict[str, Any]:
-        """What a map's map.json holds. Raises NotFound where it is gone."""
-        folder = self._folder / id
-        found: dict[str, Any] | None = files.find_json(folder / "map.json") if files.there(folder) else None
+        """What a map's map.json holds. Raises NotFound where there is none, or no more."""
+        found: dict[str, Any] | None = self._kept.find(id, "map.json") if files.HASH.fullmatch(id) else None
         if found is None:
             raise missing("maps", id)
         return found
 
-    def _read(self, id: str) -> Map:
-        folder = self._folder / id
-        rooms = parse_regions(self._stored(id)["shown"]["rooms"], "rooms")
+    def _read(self, id: str, stored: Mapping[str, Any]) -> Map:
+        rooms = parse_regions(stored["shown"]["rooms"], "rooms")
         try:
-            image = next(path for kind in ("png", "pgm") if (path := folder / f"map.{kind}").is_file())
-            return Map(id, load_map((folder / "map.yaml").read_text(), image.read_bytes()), rooms)
+            images = (self._kept.file(id, f"map.{kind}") for kind in ("png", "pgm"))
+            image = next(path for path in images if path.is_file())
+            return Map(id, load_map(self._kept.file(id, "map.yaml").read_text(), image.read_bytes()), rooms)
         except (FileNotFoundError, StopIteration):
             raise missing("maps", id) from None
 

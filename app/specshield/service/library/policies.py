@@ -29,8 +29,8 @@ from specshield.task import Task, make_task
 
 KEPT_IN_MEMORY = 64
 AT_ONCE = 16  # policies that a list reads
-NOT_COPIED = 4 << 10  # [bytes] as which a list counts a policy that is behind a URL
 SMALL = "policy.json", "card.json"  # of the files of a policy, all that a list shows
+WEIGHTS = "policy.safetensors"
 log = logging.getLogger("specshield")
 
 
@@ -73,12 +73,10 @@ class Policies(Claimed):
         for found in self._named.values():
             if key in (found.name, found.id):
                 return found
-        folder = self._folder / key
-        there = files.HASH.fullmatch(key) and files.there(folder, *SMALL)
-        stored = files.find_json(folder / "policy.json") if there else None
+        stored = self._kept.find(key, "policy.json") if files.HASH.fullmatch(key) else None
         if stored is None:
             raise missing("policies", key)
-        card = files.find_json(folder / "card.json")
+        card = self._kept.find(key, "card.json")
         return Record(**{**stored, "about": Description(**stored["about"])}, card=card)
 
     def find(self, key: str, owner: str) -> Record:
@@ -121,10 +119,10 @@ class Policies(Claimed):
         if record.card is None:
             told, expected = f"policy {record.id} is not ready", "a policy whose status is `ready`"
             raise PolicyError(told, path="policy_id", got=record.id, expected=expected)
-        folder = self._models / record.name if record.name else self._folder / record.id
-        if record.name is None and not files.there(folder):
-            raise missing("policies", record.id)
-        return load_policy(folder / "policy.safetensors", record.card, self.task(record.about))
+        task = self.task(record.about)
+        if record.name is not None:
+            return load_policy(self._models / record.name / WEIGHTS, record.card, task)
+        return load_policy(self._kept.file(record.id, WEIGHTS), record.card, task)
 
     def resolve(self, about: Description, owner: str) -> Description:
         """The same with the map's id, whatever it was called. Raises NotFound."""
@@ -183,7 +181,7 @@ class Policies(Claimed):
         record = replace(record, id=id, card=card)
         if name is not None:
             self.check_name(name, record.id, key.name)
-        added = self.add(record, key, {"policy.safetensors": weights, "card.json": files.to_json(card)})
+        added = self.add(record, key, {WEIGHTS: weights, "card.json": files.to_json(card)})
         if name is not None:
             self.name(added, key.name, name)
         return added
@@ -197,12 +195,11 @@ class Policies(Claimed):
         record = replace(record, created_at=files.now())
         stored = asdict(replace(record, card=None))
         del stored["card"]
-        content, folder = {"policy.json": files.to_json(stored), **(trained or {})}, self._folder / record.id
-        files.there(folder)  # if it is trained already, all of it is counted
-        size = max(sum(map(len, content.values())), files.weight_of(folder))
+        content = {"policy.json": files.to_json(stored), **(trained or {})}
+        size = max(sum(map(len, content.values())), self._kept.weight(record.id))
         with self.claims.adding("policies", record.id, key, size, self._own_map(record.about)):
-            if not folder.is_dir():
-                files.write_folder(folder, content)
+            if self._kept.find(record.id, "policy.json") is None:
+                self._kept.write(record.id, content)
         return self.record(record.id)
 
     def _own_map(self, about: Description) -> str:
@@ -222,17 +219,14 @@ class Policies(Claimed):
 
     def finish(self, id: str, weights: bytes, card: Mapping[str, Any]) -> None:
         """Keeps what a run made. The card comes last: it makes the policy ready. Raises NotFound."""
-        folder = self._folder / id
-        if not files.there(folder):
+        if self._kept.find(id, "policy.json") is None:
             raise NotFound(f"policy {id} was deleted", path="policy_id", got=id)
-        with files.guarded():
-            files.write_file(folder / "policy.safetensors", weights)
-            files.write_file(folder / "card.json", files.to_json({**card, "id": id}))
+        self._kept.write(id, {WEIGHTS: weights, "card.json": files.to_json({**card, "id": id})})
         if self.given is not None:
-            self.claims.weigh("policies", id, files.weight_of(folder))
+            self.claims.weigh("policies", id, self._kept.weight(id))
 
     def checkpoints(self, id: str) -> Path:
-        return self._folder / id / "checkpoint"
+        return self._kept.root / id / "checkpoint"
 
     def delete(self, record: Record, owner: str, token: str) -> bool:
         """Takes the claim of an owner who has marked the deletion by this token. True where the policy went
@@ -241,18 +235,14 @@ class Policies(Claimed):
         last = self.claims.free("policies", record.id, owner, token, self._own_map(record.about))
         if last:
             self._recent.drop(record.id)
-            files.remove_folder(self._folder / record.id)
+            self._kept.remove(record.id)
         return last
 
     def page(self, owner: str, after: str | None, limit: int) -> tuple[list[Record], str | None]:
         """One page of an owner's policies and those of all."""
-
-        def size(key: str) -> int:
-            return sum(files.size(self._folder / key / name) for name in SMALL) or NOT_COPIED
-
         keys = [*self._named, *self.claims.ids("policies", owner)]
-        keys, following = files.page(keys, after, limit, size)
-        with ThreadPoolExecutor(AT_ONCE) as pool:  # those behind a URL that are not copied yet take long
+        keys, following = files.page(keys, after, limit, lambda key: self._kept.size(key, *SMALL))
+        with ThreadPoolExecutor(AT_ONCE) as pool:  # those behind a URL take long
             found = list(pool.map(self.made_here, keys))  # None: not written to the end, or deleted by now
         return [record for record in found if record is not None], following
 

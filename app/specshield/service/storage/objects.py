@@ -8,13 +8,13 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from errno import ELOOP
+from errno import EDQUOT, ELOOP, ENOSPC
 from functools import lru_cache, wraps
 from pathlib import Path
 from stat import S_ISDIR
 from typing import Any, ParamSpec, TypeVar, cast
 
-from specshield.errors import InputError, StoreError
+from specshield.errors import InputError, InsufficientStorage, SpecshieldError, StoreError
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -27,18 +27,18 @@ log = logging.getLogger("specshield")
 
 def open_objects(place: str) -> Objects:
     """The files of a folder, or of an fsspec URL. Raises InputError where nothing here reads such a URL."""
-    if "://" not in place:
-        return Folder(Path(place))
     try:
+        if "://" not in place:
+            return Folder(Path(place))
         from fsspec.core import url_to_fs
 
         files, root = url_to_fs(place, use_listings_cache=False, skip_instance_cache=True)
+        return Folder(Path(root)) if type(files).__name__ == "LocalFileSystem" else Remote(files, root)
     except (ImportError, ValueError, OSError) as error:  # OSError: it is tried to reach the server
         raise InputError(
             f"files at {place!r} cannot be used: {error}",
             expected="a folder, or a URL such as s3://bucket/prefix with the package that reads it (s3fs)",
         ) from None
-    return Folder(Path(root)) if type(files).__name__ == "LocalFileSystem" else Remote(files, root)
 
 
 def _reaching(absent: Callable[[], Any] | None = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -52,24 +52,28 @@ def _reaching(absent: Callable[[], Any] | None = None) -> Callable[[Callable[P, 
             except OSError as error:
                 if absent is not None and (isinstance(error, ABSENT) or error.errno == ELOOP):
                     return cast(R, absent())
-                raise _unreachable(args[1], error) from error
+                raise unusable(error) from error
 
         return reach
 
     return decorate
 
 
-def _unreachable(path: object, error: OSError) -> StoreError:
-    reason = error.strerror or type(error).__name__
-    return StoreError(f"the files of the archive or library cannot be reached at {path!r}: {reason}")
+def unusable(error: OSError) -> SpecshieldError:
+    """What a caller is told of it; which file it is, the log alone. A full disk is InsufficientStorage."""
+    if error.errno in (ENOSPC, EDQUOT):
+        return InsufficientStorage("the server's disk is full", expected="a disk with room")
+    log.warning("%s", error)
+    return StoreError(f"the server's files cannot be used: {error.strerror or type(error).__name__}")
 
 
 class Folder:
     """A folder of this machine, or one that several machines mount. Paths are relative, with `/`. Every
-    method raises StoreError where the files cannot be reached.
+    method raises StoreError where the files cannot be reached, and InsufficientStorage for a full disk.
     """
 
     def __init__(self, root: Path) -> None:
+        root.mkdir(parents=True, exist_ok=True)
         self.root = root
 
     @_reaching(absent=lambda: None)
@@ -87,6 +91,7 @@ class Folder:
         for left in reversed(range(TRIES)):
             made = [folder for folder in target.parents if not folder.exists()]
             try:
+                self.root.stat()  # a network folder that is away is not made anew
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_through(draft, content)
                 os.replace(draft, target)
@@ -133,7 +138,7 @@ class Folder:
             return  # it may go at any time
         except OSError as error:
             if not folder:
-                raise _unreachable(folder, error) from error
+                raise unusable(error) from error
             left_out(f"{here} is left out: {error.strerror}")
 
 
