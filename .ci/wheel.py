@@ -120,7 +120,7 @@ def demo(python: Path, empty: Path, environment: dict[str, str], *more: str) -> 
     """Seconds that the demo took."""
     began = time.monotonic()
     run([str(python.with_name("specshield")), "demo", *more], cwd=empty, env=environment)
-    assert sorted(path.name for path in (empty / "out").iterdir()) == ["case1.png", "case2.png"]
+    assert sorted(path.name for path in (empty / "out").iterdir()) == ["case1.svg", "case2.svg"]
     shutil.rmtree(empty / "out")
     return time.monotonic() - began
 

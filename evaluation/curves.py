@@ -9,12 +9,12 @@ from typing import Any
 
 from matplotlib import pyplot as plt
 
+from evaluation.colors import BLUE, INK, ORANGE, VISIT
 from evaluation.evaluation import evaluate
 from evaluation.experiment import Experiment
 from evaluation.figures import STYLE
 from evaluation.results import markdown, share
 from evaluation.statistics import summary
-from specshield.drawing.colors import BLUE, INK, ORANGE, VISIT
 
 COLORS = {"step": ORANGE, "episode": BLUE, "robustness": VISIT}
 COLUMNS = (("step", "episode"), ("robustness",))  # kinds whose thresholds share an axis

@@ -10,23 +10,23 @@ from typing import Any
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from evaluation.colors import AVOID, BLUE, FAINT, GREY, INK, ORANGE, TARGET, TINT, VISIT, WALL
 from evaluation.experiment import METHODS, split
 from evaluation.runs import Record
 from evaluation.statistics import MODES
-from specshield.drawing.colors import AVOID, BLUE, FAINT, GREY, INK, ORANGE, PAPER, TARGET, VISIT
-from specshield.sim.canvas import Canvas
+from specshield.drawing.avoided import is_avoided
+from specshield.drawing.outline import outlines
 from specshield.sim.cases import Case
 from specshield.stl import robustness
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 
 WAYS = 6  # runs drawn on a map
-SCALE, TITLE = 40, 18  # of a panel: pixels a metre, and pixels above the map
-COLUMNS = 4  # panels side by side
+WIDE, COLUMNS = 3.0, 4  # of a panel [inches], and panels side by side
 COLORS = ("#8a8d94", ORANGE, "#b0479a", "#5f9ea0", "#7a5cc8", BLUE, VISIT, AVOID)
 LOOKS = tuple(product(("-", "--", ":"), COLORS))  # of methods, in their order
 OF_MODE = {
@@ -49,10 +49,10 @@ def draw(case: Case, records: Sequence[Record], folder: Path) -> list[Path]:
     for record in sorted(records, key=lambda r: (METHODS.index(split(r.method)[0]), r.run)):
         by_method.setdefault(record.method, []).append(record)
     folder.mkdir(parents=True, exist_ok=True)
-    written = [folder / "ways.png"]
-    _ways(case, by_method).quantize(64).save(written[0])  # few colours, a third of the bytes
+    written = list[Path]()
+    pictures = (("ways", _ways), ("robustness", _robustness), ("mass", _mass), ("modes", _modes))
     with plt.rc_context(STYLE):
-        for name, make in (("robustness", _robustness), ("mass", _mass), ("modes", _modes)):
+        for name, make in pictures:
             figure = make(case, by_method)
             written.append(folder / f"{name}.png")
             figure.savefig(written[-1], bbox_inches="tight")
@@ -60,30 +60,42 @@ def draw(case: Case, records: Sequence[Record], folder: Path) -> list[Path]:
     return written
 
 
-def _ways(case: Case, by_method: ByMethod) -> Image.Image:
+def _ways(case: Case, by_method: ByMethod) -> Any:
     """The first WAYS runs over the map, one panel a method."""
-    panels = [_panel(case, name, records[:WAYS]) for name, records in by_method.items()]
-    wide, tall = panels[0].size
-    columns = min(len(panels), COLUMNS)
-    picture = Image.new("RGB", (wide * columns, tall * -(-len(panels) // columns)), PAPER)
-    for i, panel in enumerate(panels):
-        picture.paste(panel, (wide * (i % columns), tall * (i // columns)))
-    return picture
+    columns = min(len(by_method), COLUMNS)
+    rows = -(-len(by_method) // columns)
+    xmin, ymin, xmax, ymax = case.task.grid.bounds
+    high = WIDE * (ymax - ymin) / (xmax - xmin) + 0.3  # with the title
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(WIDE * columns, high * rows), squeeze=False, layout="tight"
+    )
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, (name, records) in zip(axes.flat, by_method.items(), strict=False):
+        _panel(axis, case, name, records[:WAYS])
+    return figure
 
 
-def _panel(case: Case, name: str, records: Sequence[Record]) -> Image.Image:
+def _panel(axis: Axes, case: Case, name: str, records: Sequence[Record]) -> None:
     """The runs of one method: blue where the rule is kept, orange where it is not, grey after its horizon."""
-    canvas = Canvas(case.task, SCALE, above=TITLE)
-    canvas.walls()
-    canvas.regions(10)
+    grid, asked = case.task.grid, case.task.horizon + 1  # states that the rule is about
+    x, y = np.moveaxis(grid.centres, -1, 0)
+    axis.pcolormesh(x, y, np.where(grid.occupied, 1.0, np.nan), cmap=ListedColormap([WALL]), rasterized=True)
+    for region, place in case.task.regions.items():
+        color = AVOID if is_avoided(case.task.formula, region) else VISIT
+        for line in outlines(place):
+            axis.fill(*line.T, facecolor=(color, TINT), edgecolor=color, lw=1.0)
+        middle, low = np.mean(outlines(place)[0][:, 0]), outlines(place)[0][:, 1].min()
+        axis.annotate(region, (middle, low), (0, -2), textcoords="offset points", color=color, size=7,
+                      ha="center", va="top")  # fmt: skip
     for record in records:
-        canvas.way(record.poses, BLUE if record.satisfied else ORANGE, 1.2)
-        canvas.dot(record.poses[0], 2.5, INK, INK)
-    canvas.dot(case.target, 4.0, TARGET, INK)
-    kept = sum(record.satisfied for record in records)
-    said = f"{name}: {kept} of {len(records)} kept"
-    canvas.text(canvas.top, said, 13, shift=(0, -TITLE / 2), anchor="lm")
-    return canvas.picture()
+        way = np.array(record.poses)[:, :2]
+        axis.plot(*way[asked - 1 :].T, color=GREY, lw=0.9)
+        axis.plot(*way[:asked].T, color=BLUE if record.satisfied else ORANGE, lw=0.9)
+        axis.plot(*way[0], "o", color=INK, ms=2.5)
+    axis.plot(*case.target, "o", color=TARGET, mec=INK, ms=5.0)
+    axis.set_aspect("equal")
+    axis.set_title(f"{name}: {sum(record.satisfied for record in records)} of {len(records)} kept")
 
 
 def _robustness(case: Case, by_method: ByMethod) -> Any:

@@ -47,7 +47,8 @@ def test_a_policy_from_files_and_an_episode_with_it(tmp_path):
     driven = run_specshield("run", "flat", "--seed", 3, "--out", tmp_path, **own)
     assert driven.returncode == 0, driven.stderr
     assert "shielded rule satisfied" in driven.stdout
-    assert (tmp_path / "flat-run.png").stat().st_size > 5000
+    drawn = (tmp_path / "flat-run.svg").read_text()
+    assert all(f'class="{kind}"' in drawn for kind in ("walls", "way", "beside", "target")), drawn
     refused = run_specshield("run", "flat", "--shaping", "nope", "--out", tmp_path, **own)
     assert refused.stderr.splitlines()[-1].startswith("unknown shaping; got 'nope'")
     refused = run_specshield("run", "flat", "--target=-1,-1", "--out", tmp_path, **own)

@@ -27,7 +27,7 @@ def test_demo_prints_the_table_and_draws_each_case(tmp_path):
     assert "1 episodes a case, seed 4" in done.stdout
     assert "rule satisfied" in done.stdout
     assert done.stdout.count("1 of 1") >= 4
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["case1.png", "case2.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["case1.svg", "case2.svg"]
     assert "starting the service" in done.stderr
     assert "page of both" not in done.stdout  # the service has ended
 

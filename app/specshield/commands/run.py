@@ -43,7 +43,7 @@ def run_policy(
         shielded = with_shield(session, case, model, start, seed)
         beside = without_shield(client, case, model, start, seed, found.id)
     status.clear()
-    path = out / f"{case.name}-run.png"
+    path = out / f"{case.name}-run.svg"
     picture.draw(case, shielded, beside, path)
     print(f"rule     {case.task.formula}")
     print(f"start    {_point(start)}, target {_point(case.target)}; {refused} starts could not keep the rule")

@@ -1,1 +1,1 @@
-"""Floor plans as pictures: the colours that all of them share, and SVG."""
+"""Floor plans as pictures, in SVG."""

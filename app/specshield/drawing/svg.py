@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image
 
 from specshield.arrays import Floats
-from specshield.drawing.colors import is_avoided
+from specshield.drawing.avoided import is_avoided
 from specshield.drawing.outline import outlines
 from specshield.task import Task
 from specshield.world.learned import NONE, LearnedMap
@@ -28,18 +28,21 @@ STYLE = """
 .paper{fill:#faf9f6}.ink{fill:#282b32}.faint{fill:#6d7078}
 .visit{fill:#2b8a5a;stroke:#2b8a5a}.avoid{fill:#c63c3c;stroke:#c63c3c}
 .region{fill-opacity:.16}
-.way{fill:none;stroke:#2563c8;stroke-linejoin:round;stroke-linecap:round}
-.next{fill:none;stroke:#2563c8;stroke-linejoin:round}.robot{fill:#2563c8;fill-opacity:.25;stroke:#2563c8}
+polyline{fill:none;stroke-linejoin:round;stroke-linecap:round}
+.way,.next{stroke:#2563c8}.beside{stroke:#e27d22}.after{stroke:#b4b4b4}
+.robot{fill:#2563c8;fill-opacity:.25;stroke:#2563c8}.body{fill-opacity:0}
+.mark{fill:#2563c8;stroke:#faf9f6}.target{fill:#f6be28;stroke:#282b32}
 text{font-family:system-ui,sans-serif}.formula{font-family:ui-monospace,monospace}
 @media (prefers-color-scheme:dark){.paper{fill:#16181d}.ink{fill:#e8e9ec}.faint{fill:#9a9da6}
 .walls{filter:brightness(1.75)}.visit{fill:#57c48f;stroke:#57c48f}.avoid{fill:#f07a72;stroke:#f07a72}
-.way,.next{stroke:#78a8ff}.robot{fill:#78a8ff;stroke:#78a8ff}}
+.way,.next{stroke:#78a8ff}.robot,.mark{fill:#78a8ff;stroke:#78a8ff}}
 .name{stroke:none;font-weight:600}
 """
 
 # Of a text below the map, in thousandths of the map's longer side: a letter's height and width, a line's.
 SIZE, LETTER, LINE = 24, 0.62 * 24, 36
 FOUND = 0x70, 0x40, 0xA8  # the colour of cells that were found occupied, and of those found free at a third
+WIDTHS = {"way": 6, "beside": 4, "after": 4, "next": 3}  # of ways, by kind
 FEWEST = 30  # letters a line: below a narrower map the picture is as wide as its text
 
 
@@ -91,23 +94,40 @@ class Plan:
             )
 
     def way(self, poses: Floats, kind: str = "way") -> None:
-        """kind: `way` for what was driven, `next` for what would follow."""
+        """kind: `way` for what was driven, `beside` for another way, `after` for what the rule is no longer
+        about, `next` for what would follow.
+        """
         points = self._points(np.asarray(poses)[:, :2].tolist(), ".3f")
         dashes = f' stroke-dasharray="{6 * self._unit:g} {6 * self._unit:g}"' if kind == "next" else ""
-        wide = (6 if kind == "way" else 3) * self._unit
+        wide = WIDTHS[kind] * self._unit
         self._parts.append(f'<polyline class="{kind}" points="{points}" stroke-width="{wide:g}"{dashes}/>')
 
-    def robot(self, pose: Sequence[float]) -> None:
-        """Its footprint, and a line from its origin to where it looks."""
+    def robot(self, pose: Sequence[float], kind: str = "robot") -> None:
+        """Its footprint, and a line from its origin to where it looks. kind: `robot body` for outlines alone,
+        of which there may be many.
+        """
         theta, robot = pose[2], self._task.robot
         cos, sin, (ahead, left) = math.cos(theta), math.sin(theta), robot.offset
         x, y = self._at(pose[0], pose[1])
         cx, cy = x + cos * ahead - sin * left, y - sin * ahead - cos * left
         self._parts.append(
-            f'<g class="robot" stroke-width="{3 * self._unit:g}">'
+            f'<g class="{kind}" stroke-width="{(3 if kind == "robot" else 1) * self._unit:g}">'
             f'<circle cx="{cx:.3f}" cy="{cy:.3f}" r="{robot.radius:g}"/><line x1="{x:.3f}" y1="{y:.3f}" '
             f'x2="{x + cos * robot.radius:.3f}" y2="{y - sin * robot.radius:.3f}"/></g>'
         )
+
+    def mark(self, point: Sequence[float], said: str, kind: str = "mark", above: bool = False) -> None:
+        """A dot, and words below or `above` it. kind: `mark`, or `target` for a larger dot."""
+        x, y = self._at(point[0], point[1])
+        dot, edge = (12 if kind == "target" else 8) * self._unit, 2 * self._unit
+        self._parts.append(
+            f'<circle class="{kind}" cx="{x:.3f}" cy="{y:.3f}" r="{dot:g}" stroke-width="{edge:g}"/>'
+            + self._text(x, y + (-16 if above else 30) * self._unit, said, 20, "ink", "middle")
+        )
+
+    def words(self, point: Sequence[float], said: str) -> None:
+        """At a point of the map."""
+        self._parts.append(self._text(*self._at(point[0], point[1]), said, 20, "faint", "middle"))
 
     def line(self, said: str, kind: str = "ink") -> None:
         """A line of text below the map; a long one goes on in the next."""

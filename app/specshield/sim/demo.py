@@ -33,7 +33,7 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
                 campaigns.append(_campaign(several, name, runs, seed, status))
                 first = campaigns[-1].shielded[0], campaigns[-1].unshielded[0]
                 # In one of the processes, while the others go on with the next case.
-                pictures.append(several.submit(picture.draw, load_case(name), *first, out / f"{name}.png"))
+                pictures.append(several.submit(picture.draw, load_case(name), *first, out / f"{name}.svg"))
             for drawn in pictures:
                 drawn.result()
         status.clear()
@@ -61,7 +61,7 @@ def _tell(campaigns: Sequence[Campaign], runs: int, seed: int, out: Path) -> Non
     for case in (campaign.case for campaign in campaigns):
         print(f'{case.name}  {case.task.formula}\n       model: "{case.instruction}"')
     print(f"\n{report.table(campaigns)}\n")
-    print("\n".join(f"picture: {out / campaign.case.name}.png" for campaign in campaigns))
+    print("\n".join(f"picture: {out / campaign.case.name}.svg" for campaign in campaigns))
 
 
 def _campaign(several: Executor, case: str, runs: int, seed: int, status: StatusLine) -> Campaign:

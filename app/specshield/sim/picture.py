@@ -7,43 +7,41 @@ from pathlib import Path
 
 import numpy as np
 
-from specshield.drawing import colors
+from specshield.drawing.avoided import avoided
+from specshield.drawing.svg import Plan
 from specshield.policy.progress.obligations import obligations
-from specshield.sim import canvas
 from specshield.sim.cases import Case
 from specshield.sim.episodes import Episode
 from specshield.sim.robot import Pose
 from specshield.stl import SATISFIED_ABOVE, region_named, robustness
 from specshield.world.regions import signed_distance
 
-SCALE = 110  # pixels a metre
-LEGEND = 86  # pixels
-SHIELDED, UNSHIELDED = colors.BLUE, colors.ORANGE
-
 
 def draw(case: Case, shielded: Episode, unshielded: Episode, path: Path) -> None:
-    """Writes a PNG, and the folder that it is in."""
-    plan = canvas.Canvas(case.task, SCALE, below=LEGEND)
+    """Writes an SVG, and the folder that it is in."""
+    asked = case.task.horizon + 1  # states that the rule is about
+    plan = Plan(case.task, f"{case.name} with and without the shield")
     plan.walls()
     _rooms(plan, case)
-    plan.regions(13)
+    plan.regions()
     if any(region_named(name)[0] for name in case.task.formula.names):  # the rule is about the body
-        plan.footprints(shielded.poses[: case.task.horizon + 1], SHIELDED)
-    plan.way(unshielded.poses, UNSHIELDED, 2.2)
-    plan.way(shielded.poses, SHIELDED, 3.0)
+        for pose in shielded.poses[:asked]:
+            plan.robot(pose, "robot body")
+    for episode, kind in ((unshielded, "beside"), (shielded, "way")):
+        poses = np.array(episode.poses)
+        plan.way(poses[asked - 1 :], "after")
+        plan.way(poses[:asked], kind)
     for n, (t, pose) in enumerate(_visits(case, shielded.poses)):
-        plan.dot(pose, 5.0, SHIELDED, colors.PAPER)
-        plan.text(pose, f"t={t}", 12, SHIELDED, shift=(9, 18 if n % 2 else -9), anchor="ls")  # two may meet
-    plan.start(shielded.start)
-    plan.dot(case.target, 8.0, colors.TARGET, colors.INK)
+        plan.mark(pose, f"t={t}", above=n % 2 == 0)  # two may meet
+    plan.robot(shielded.start)
     sought = case.instruction.split()[-1]
-    plan.text(case.target, sought if sought.isalpha() else "target", 14, shift=(0, 12), anchor="mt")
+    plan.mark(case.target, sought if sought.isalpha() else "target", "target")
     _legend(plan, case, shielded, unshielded)
     path.parent.mkdir(parents=True, exist_ok=True)
-    plan.picture().save(path)
+    path.write_bytes(plan.svg())
 
 
-def _rooms(plan: canvas.Canvas, case: Case) -> None:
+def _rooms(plan: Plan, case: Case) -> None:
     """The names of rooms that are no regions of the rule, where no region and no target takes the space."""
     grid = case.task.grid
     taken = [signed_distance(region, grid.centres) > -0.4 for region in case.task.regions.values()]
@@ -52,7 +50,7 @@ def _rooms(plan: canvas.Canvas, case: Case) -> None:
         roomy = np.minimum(signed_distance(room, grid.centres), grid.clearance)
         free = np.where(np.any(taken, axis=0), -1.0, roomy)
         if name not in case.task.regions and free.max() > 0.0:
-            plan.text(grid.centres[np.unravel_index(np.argmax(free), free.shape)], name, 13, colors.FAINT)
+            plan.words(grid.centres[np.unravel_index(np.argmax(free), free.shape)].tolist(), name)
 
 
 def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
@@ -68,21 +66,15 @@ def _visits(case: Case, poses: Sequence[Pose]) -> Iterator[tuple[int, Pose]]:
                 break
 
 
-def _legend(plan: canvas.Canvas, case: Case, shielded: Episode, unshielded: Episode) -> None:
-    """Below the map; what is said of a way or of regions has their colour."""
-
-    def write(right: float, down: float, said: str, size: float = 14, color: str = colors.INK) -> None:
-        plan.text(plan.bottom, said, size, color, (right, canvas.BORDER + down), anchor="lt")
+def _legend(plan: Plan, case: Case, shielded: Episode, unshielded: Episode) -> None:
+    """Below the map: what each colour is."""
 
     def outcome(episode: Episode) -> str:
         found = f"ended at t={episode.ended_at}" if episode.main_done else "target not found"
         return f"rule {episode.spec_status}, {found}"
 
-    write(0, 0, str(case.task.formula), 15)
-    write(0, 26, f"with the shield: {outcome(shielded)}", color=SHIELDED)
-    write(0, 50, f"without: {outcome(unshielded)}", color=UNSHIELDED)
-    write(560, 26, "to visit", color=colors.VISIT)
-    if colors.avoided(case.task.formula):
-        write(640, 26, "to avoid", color=colors.AVOID)
-    write(730, 26, f"after t={case.task.horizon}, the rule's last", color=colors.GREY)
-    write(560, 50, f'"{case.instruction}"')
+    plan.line(str(case.task.formula), "ink formula")
+    plan.line(f"Blue: with the shield: {outcome(shielded)}.")
+    plan.line(f"Orange: without: {outcome(unshielded)}.")
+    areas = "Green: to visit; red: to avoid" if avoided(case.task.formula) else "Green: to visit"
+    plan.line(f'{areas}; grey: after t={case.task.horizon}, the rule\'s last. "{case.instruction}"', "faint")

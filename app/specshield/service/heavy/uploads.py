@@ -22,7 +22,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import create_form_parser
 
 from specshield import stl
-from specshield.drawing.colors import avoided
+from specshield.drawing.avoided import avoided
 from specshield.drawing.windows import windows
 from specshield.errors import BodyTooLarge, FormulaError, FragmentError, InputError, PolicyError
 from specshield.policy.methods import METHODS

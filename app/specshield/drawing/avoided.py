@@ -1,14 +1,8 @@
-"""The colours of every picture of a floor, and what a rule says of its regions: to visit, or to avoid."""
+"""What a rule says of its regions: to visit, or to avoid."""
 
 from __future__ import annotations
 
 from specshield.stl import BODY_WORDS, Formula, Implies, Not, body_name
-
-PAPER, WALL, INK, FAINT = "#faf9f6", "#343840", "#282b32", "#9ea0a5"
-VISIT, AVOID = "#2b8a5a", "#c63c3c"  # regions
-TARGET = "#f6be28"  # what the model looks for
-BLUE, ORANGE, GREY = "#2563c8", "#e27d22", "#b4b4b4"  # ways; grey: after the rule's horizon
-TINT = 0.16  # opacity of a region
 
 
 def is_avoided(formula: Formula, region: str) -> bool:
