@@ -9,7 +9,6 @@ look-ahead session needs is compiled when the first of them is made.
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import signal
@@ -19,9 +18,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from llvmlite.binding import ffi
 from numba.core.caching import IndexDataCacheFile
-from numba.core.compiler import Flags
 
 from specshield.policy.dqn.network import Network
 from specshield.policy.dqn.observation import observation_size
@@ -54,7 +51,7 @@ START, AWAY = (1.0, 1.0, 0.0), (0.2, 0.2, 0.8)  # in A and out of it
 
 def warm_up(part: str) -> None:
     """Runs this part's kernels once: compiles them, or takes them from the disk."""
-    _hasten()
+    gc.set_threshold(100_000, 50, 50)  # compiling makes millions of small objects
     {**PARTS, **LATER}[part](_task())
 
 
@@ -141,17 +138,6 @@ def _network(task: Task) -> Network:
     inputs, outputs = observation_size(make_rules(task), body), motion_count(body)
     shapes = ((inputs, 4), 4, (4, 4), 4, (4, outputs), outputs)
     return Network(*(np.zeros(shape, np.float32) for shape in shapes))
-
-
-def _hasten() -> None:
-    """Takes a tenth off the time that compiling and loading kernels take in this process."""
-    gc.set_threshold(100_000, 50, 50)  # compiling makes millions of small objects
-    flags: Any = Flags
-    with contextlib.suppress(AttributeError):  # a numba that does it otherwise
-        ffi.lib._lock._cblist.clear()  # each call of LLVM is told to clocks that nobody here reads
-        defaults = {name: option.default for name, option in flags.options.items()}
-        if flags()._values == {}:  # otherwise a hundred thousand comparisons ask for each option by itself
-            flags.values = lambda flags: {**defaults, **flags._values}
 
 
 def _keep_all() -> None:
