@@ -24,8 +24,8 @@ import sys
 from typing import Any
 
 from specshield.errors import SpecshieldError
-from specshield.service.library.files import unusable
 from specshield.service.settings import Settings
+from specshield.service.storage.objects import unusable
 from specshield.service.watch import logs
 
 LIMITS = struct.Struct("<QB")  # most memory [bytes], niceness
