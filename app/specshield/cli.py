@@ -56,6 +56,7 @@ def run(commands: Iterable[Callable[..., None]], **options: Any) -> None:
         sys.exit(f"This command needs Python 3.11 or later; this is {sys.version.split()[0]}")
     if typer is None:
         sys.exit(NEEDS_SERVER)
+    gc.set_threshold(50_000)  # objects: what is imported stays, and to look at it took a tenth of a start
     kernels = Path(sys.prefix) / "numba-cache"  # where `make` keeps them: what it compiled serves here too
     if kernels.is_dir():
         os.environ.setdefault("NUMBA_CACHE_DIR", str(kernels))
@@ -101,12 +102,10 @@ def _commands() -> Iterator[Callable[..., None]]:
     from specshield.commands.policy import policy
     from specshield.commands.run import run_policy
     from specshield.commands.watch import watch
-
-    yield from (serve, demo, policy, run_policy, watch, doctor, train, worker, verify, openapi)
-    yield from (export, check_drive)
     from specshield.service.access.commands import app as keys
 
-    yield keys
+    yield from (serve, demo, policy, run_policy, watch, doctor, train, worker, verify, openapi)
+    yield from (export, check_drive, keys)
     for registered in entry_points(group="specshield.commands"):
         yield registered.load()
 

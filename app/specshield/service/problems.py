@@ -7,11 +7,11 @@ import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fastapi import FastAPI, Request, Response
-from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
 from starlette.routing import Match
 from starlette.types import Receive, Scope, Send
 
@@ -19,6 +19,9 @@ from specshield import errors
 from specshield.errors import InputError, SpecshieldError
 from specshield.service.schemas.base import ID, ID_TOLD
 from specshield.service.storage.objects import unusable
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
 
 MEDIA_TYPE = "application/problem+json"
 CLIENT_GONE = 499  # what nginx logs for a request whose client went away; it is never sent
@@ -241,6 +244,7 @@ def _allowed(request: Request) -> str:
 
 def install(app: FastAPI) -> None:
     """Every way an answer can go wrong ends in a `ProblemResponse`."""
+    from fastapi.exceptions import RequestValidationError  # the processes for heavy work need no FastAPI
 
     @app.exception_handler(SpecshieldError)
     async def known(request: Request, error: SpecshieldError) -> Response:

@@ -35,7 +35,8 @@ def own_server(
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
         log = Path(folder) / "server.log"
-        url = f"http://127.0.0.1:{_free_port()}"
+        with socket.create_server(("127.0.0.1", 0)) as probe:  # a port that is free
+            url = f"http://127.0.0.1:{probe.getsockname()[1]}"
         with open(log, "wb") as output:
             server = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "serve", "--port", url.rpartition(":")[2]],
@@ -92,9 +93,3 @@ def _wait_until_ready(
         say(answer.json()["detail"])
         time.sleep(0.1)
     raise ServerError(f"the server did not come up:\n{log.read_text(errors='replace')[-4000:].strip()}")
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
 
 from specshield.errors import FragmentError
 from specshield.policy.dqn import train as training
@@ -127,3 +128,11 @@ def test_measured_rates_have_exact_intervals():
         measured = measure(task, weights_of(Training(task, TINY, 0).q_network), 20, 0)
         for name in ("satisfied", "feasible_start"):
             assert (measured[name], measured[f"{name}_interval"]) == (rate, interval)
+
+
+def test_a_measured_rate_between_has_the_interval_that_scipy_has():
+    task = flat("F[0,1] x > 1")
+    measured = measure(task, weights_of(Training(task, TINY, 0).q_network), 20, 0)
+    assert 0.0 < measured["satisfied"] < 1.0
+    expected = binomtest(round(20 * measured["satisfied"]), 20).proportion_ci(0.95)
+    assert measured["satisfied_interval"] == pytest.approx([expected.low, expected.high], abs=5e-5)

@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import save_file
-from scipy.stats import binomtest
+from scipy.special import betaincinv  # scipy.stats has the interval, and takes 0.5 s more to import
 from torch import nn
 
 from specshield.arrays import Bools, Ints, Singles
@@ -85,9 +85,9 @@ def measure(task: Task, weights: dict[str, Singles], starts: int, seed: int) -> 
     result: dict[str, Any] = {"starts": starts}
     for name, first in (("satisfied", False), ("feasible_start", True)):
         count = int(satisfies(scene, net, poses, first).sum())
-        interval = binomtest(count, starts).proportion_ci(0.95)
-        result[name] = count / starts
-        result[f"{name}_interval"] = [round(float(interval.low), 4), round(float(interval.high), 4)]
+        low = betaincinv(count, starts - count + 1, 0.025) if count > 0 else 0.0
+        high = betaincinv(count + 1, starts - count, 0.975) if count < starts else 1.0
+        result |= {name: count / starts, f"{name}_interval": [round(float(low), 4), round(float(high), 4)]}
     return result
 
 

@@ -35,8 +35,8 @@ LENGTH = struct.Struct("<Q")
 def template(control: socket.socket) -> None:
     settings = Settings()
     logging.config.dictConfig(logs.config(settings.log_format, settings.log_level))
+    gc.set_threshold(50_000)  # objects: what is imported stays, and to look at it took a quarter of the time
     importlib.import_module("specshield.service.heavy.uploads")
-    gc.collect()
     gc.freeze()  # the forks leave these pages as they are, and share them
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the forks
