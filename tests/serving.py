@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +24,10 @@ from pathlib import Path
 import httpx
 import psutil
 
+# The commands of `evaluation`, whose modules the template imports for the first of them.
+EVALUATION = {"evaluate", "worlds", "results", "rewards", "curves", "habits", "rivals", "report"}
+_ONE = threading.Lock()  # held while the template is begun
+
 
 class Forked:
     """`specshield` with these arguments, forked from the template. It has of a Popen what tests use."""
@@ -31,7 +36,9 @@ class Forked:
         """files: `stdout` and `stderr`, and the folder `cwd` to work in."""
         self._told, theirs = socket.socketpair()
         with theirs:
-            socket.send_fds(_template(), [b"."], [theirs.fileno()])
+            with _ONE:
+                template = _template()
+            socket.send_fds(template, [b"e" if arguments[0] in EVALUATION else b"."], [theirs.fileno()])
         named = {name: str(path.absolute()) for name, path in files.items()}
         command = {"arguments": arguments, "environment": environment, **named}
         self._told.sendall(json.dumps(command).encode() + b"\n")
@@ -118,14 +125,9 @@ def free_port() -> int:
     raise OSError("no port from 20000 to 31999 is free")
 
 
-# A server with one of these has an interpreter of its own, since the template read them when it began.
-READ_AT_IMPORT = {
-    "NUMBA_CACHE_DIR",
-    "PYTHONPATH",
-    "REDIS_URL",
-    "SPECSHIELD_MAPS_DIR",
-    "SPECSHIELD_MODELS_DIR",
-}
+# A server with one of these has an interpreter of its own, since the template read them when it began. So has
+# one on a cluster: `specshield.service.training` looks for that, and for no other store, at its import.
+READ_AT_IMPORT = {"NUMBA_CACHE_DIR", "PYTHONPATH", "SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR"}
 
 
 @contextmanager
@@ -144,7 +146,7 @@ def serving(
         "TMPDIR": str(data_dir),  # what a killed server leaves goes with the test
         **environment,
     }
-    if READ_AT_IMPORT & environment.keys():
+    if READ_AT_IMPORT & environment.keys() or "+cluster:" in environment.get("REDIS_URL", ""):
         program = [sys.executable, "-m", "specshield.cli", *arguments]
         with open(log, "ab") as output:
             process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""A process that has imported what a server needs, and has its kernels: tests fork `specshield` from it.
+"""A process that has imported what a command needs, and has its kernels: tests fork `specshield` from it.
 
     python -m tests.template     # standard input is a socket from `tests.serving`
 
@@ -22,18 +22,19 @@ import tempfile
 from specshield import cli
 from specshield.service.startup import Startup, prepare
 
-IMPORTED = (
+SERVER = (
     "uvicorn.protocols.http.httptools_impl",
     "specshield.service.app",
     "specshield.service.bounds.protocol",
 )
+EVALUATION = ("evaluation.plan", "scipy.stats")  # before the first command that needs them: a second
 
 
 def main(control: socket.socket) -> None:
     """Forks for each socket that is sent, until the test's process has ended."""
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    for name in IMPORTED:
-        importlib.import_module(name)
+    gc.disable()  # `prepare` collects again
+    _import(SERVER)
     asyncio.run(prepare(Startup()))
     gc.freeze()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the keepers
@@ -42,12 +43,22 @@ def main(control: socket.socket) -> None:
         sent, descriptors, _, _ = socket.recv_fds(control, 1, 1)
         if not sent:
             break
+        if sent == b"e":
+            _import(EVALUATION)
         if os.fork() == 0:
             control.close()
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             _keep(socket.socket(fileno=descriptors[0]))
             break
         os.close(descriptors[0])
+
+
+def _import(names: tuple[str, ...]) -> None:
+    """What is not installed is told by the command."""
+    for name in names:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    gc.freeze()
 
 
 def _keep(told: socket.socket) -> None:

@@ -7,8 +7,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -25,7 +23,7 @@ from specshield.service.storage.connect import connect
 from specshield.service.storage.store import Change, Record, Store
 from tests.service.test_events import END, read
 from tests.service.world import ROBOT, SPEC, grid_json, send_policy
-from tests.serving import HUNG, RunningServer, serving, wait_for
+from tests.serving import HUNG, RunningServer, run_specshield, serving, wait_for
 from tests.stores import Cluster, behind_tls, cluster, watched
 
 pytestmark = pytest.mark.skipif(
@@ -55,14 +53,16 @@ def on_store(folder: Any, url: str, **settings: str) -> Iterator[RunningServer]:
 
 def key_of(name: str, folder: Any, url: str) -> str:
     """`specshield keys create`."""
-    environment = {**os.environ, "REDIS_URL": url, "SPECSHIELD_DATA_DIR": str(folder / "data")}
-    command = [sys.executable, "-m", "specshield.cli", "keys", "create", name]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    own = {"REDIS_URL": url, "SPECSHIELD_DATA_DIR": str(folder / "data")}
+    done = run_specshield("keys", "create", name, **own)
+    assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
 
 def caller(server: RunningServer, key: str) -> httpx.Client:
-    return httpx.Client(base_url=server.url, timeout=None, headers={"Authorization": f"Bearer {key}"})
+    return httpx.Client(
+        base_url=server.url, timeout=None, verify=False, headers={"Authorization": f"Bearer {key}"}
+    )
 
 
 class Episode:
