@@ -108,7 +108,12 @@ def test_one_client_watches_many_sessions_and_still_steps(server):
         assert session.step(first.next_poses[first.execute], model(session, 9)).t == 1
         for events in watching:
             events.close()
-        wait_for(lambda: "specshield_watchers 0.0" in httpx.get(f"{server.url}/metrics", timeout=None).text)
+        wait_for(
+            lambda: (
+                "specshield_watchers 0.0"
+                in httpx.get(f"{server.url}/metrics", timeout=None, verify=False).text
+            )
+        )
         client.sessions.delete(session.id)
 
 

@@ -54,7 +54,7 @@ def _read(
 ) -> None:
     headers = {**(headers or {}), **({} if last is None else {"Last-Event-ID": str(last)})}
     params = {} if after is None else {"after": after}
-    with httpx.stream("GET", path, params=params, headers=headers, timeout=None) as response:
+    with httpx.stream("GET", path, params=params, headers=headers, timeout=None, verify=False) as response:
         if response.status_code == 204:
             found.append(204)
             return
@@ -275,7 +275,7 @@ def test_an_erased_session_ends_its_streams_and_an_unknown_one_has_none(server, 
 def test_a_stream_that_needs_a_store_which_is_away_ends_and_the_log_tells_of_no_failure(tmp_path):
     with (
         serving(tmp_path, SPECSHIELD_STORE_TIMEOUT="0.5") as server,
-        httpx.Client(base_url=server.url, timeout=None) as client,
+        httpx.Client(base_url=server.url, timeout=None, verify=False) as client,
         contextlib.closing(redis.Redis(unix_socket_path=str(tmp_path / "store" / "socket"))) as store,
     ):
         body = {"policy_id": "case1", "initial_pose": [4.5, 5.0, 0.0]}

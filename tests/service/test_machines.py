@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,7 +18,7 @@ from specshield.service.settings import Settings
 from specshield.service.storage.embedded import EmbeddedStore
 from specshield.service.storage.marker import check_files
 from tests.service.world import LOGITS, START, ahead, grid_json, send_policy
-from tests.serving import HUNG, RunningServer, children, command_line, serving, wait_for
+from tests.serving import HUNG, RunningServer, children, command_line, run_specshield, serving, wait_for
 
 
 @pytest.mark.parametrize("options", [(), ("--workers", "2")], ids=["one process", "two processes"])
@@ -69,14 +68,16 @@ def test_servers_of_one_store_that_keep_their_files_apart_do_not_start(tmp_path)
     with ThreadPoolExecutor(8) as servers:  # that all start for the first time
         list(servers.map(lambda _: check_files(embedded.url, shared, 10.0), range(8)))
     check_files(embedded.url, shared, 10.0)
-    with pytest.raises(InputError, match="SPECSHIELD_DATA_URL"):
-        check_files(embedded.url, other, 10.0)
-    for command in ("serve", "worker"):
-        done = subprocess.run(
-            [sys.executable, "-m", "specshield.cli", command],
-            env={**os.environ, "REDIS_URL": embedded.url, "SPECSHIELD_DATA_DIR": other},
-            capture_output=True, text=True,
-        )  # fmt: skip
+
+    def told(command: str) -> subprocess.CompletedProcess[str]:
+        return run_specshield(command, REDIS_URL=embedded.url, SPECSHIELD_DATA_DIR=other)
+
+    with ThreadPoolExecutor(2) as several:  # each waits for 5 s, in case that the file is only just written
+        started = [several.submit(told, command) for command in ("serve", "worker")]
+        with pytest.raises(InputError, match="SPECSHIELD_DATA_URL"):
+            check_files(embedded.url, other, 10.0)
+    for each in started:
+        done = each.result()
         assert done.returncode == 1
         assert len(done.stderr.strip().splitlines()) == 1
         assert "elsewhere than in" in done.stderr

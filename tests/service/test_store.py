@@ -167,11 +167,13 @@ def test_worker_processes_share_a_port_and_their_metrics_and_follow_their_superv
         with httpx.Client(base_url=server.url, verify=False, timeout=None) as client:
             session = begin(client)
         answers = [
-            httpx.post(f"{server.url}/v1/sessions/{session['id']}/steps", json=body, timeout=None).content
+            httpx.post(
+                f"{server.url}/v1/sessions/{session['id']}/steps", json=body, timeout=None, verify=False
+            ).content
             for body in [STEP] * 8
         ]
         assert len(set(answers)) == 1
-        told = httpx.get(f"{server.url}/metrics", timeout=None).text
+        told = httpx.get(f"{server.url}/metrics", timeout=None, verify=False).text
         assert 'specshield_decisions_total{mode="shaped"} 1.0' in told
         route = 'method="POST",route="/v1/sessions/{session_id}/steps",status="200"'
         assert f"specshield_requests_total{{{route}}} 8.0" in told

@@ -23,21 +23,21 @@ DASHBOARD = Path(__file__).parents[2] / "docker" / "grafana" / "specshield.json"
 
 def samples(server: RunningServer, **headers: str) -> dict[tuple[str, ...], float]:
     """Every sample of /metrics by its name and its labels' values."""
-    text = httpx.get(f"{server.url}/metrics", headers=headers, timeout=None).text
+    text = httpx.get(f"{server.url}/metrics", headers=headers, timeout=None, verify=False).text
     families = text_string_to_metric_families(text)
     return {(s.name, *s.labels.values()): s.value for family in families for s in family.samples}
 
 
 def begin(server: RunningServer, **headers: str) -> str:
     body = {"policy_id": "case1", "initial_pose": START}
-    response = httpx.post(f"{server.url}/v1/sessions", json=body, headers=headers, timeout=None)
+    response = httpx.post(f"{server.url}/v1/sessions", json=body, headers=headers, timeout=None, verify=False)
     assert response.status_code == 201, response.text
     return str(response.json()["id"])
 
 
 def decide(server: RunningServer, session: str, t: int = 0, **fields: object) -> httpx.Response:
     body = {"t": t, "poses": [START] * (t + 1), "logits": LOGITS, **fields}
-    return httpx.post(f"{server.url}/v1/sessions/{session}/steps", json=body, timeout=None)
+    return httpx.post(f"{server.url}/v1/sessions/{session}/steps", json=body, timeout=None, verify=False)
 
 
 def ready(server: RunningServer, processes: int) -> None:
@@ -132,7 +132,12 @@ def test_lines_for_people_say_the_same_and_stay_one_line_each(tmp_path):
     with serving(tmp_path) as server:
         session = begin(server, **{"X-Request-Id": "r-1"})
         assert decide(server, session).status_code == 200
-        assert httpx.get(f"{server.url}/v1/sessions/a%0aINFO:     forged", timeout=None).status_code == 422
+        assert (
+            httpx.get(
+                f"{server.url}/v1/sessions/a%0aINFO:     forged", timeout=None, verify=False
+            ).status_code
+            == 422
+        )
         text = server.log.read_text()
         assert re.search(rf"^INFO:     session begun  session_id={session} .*request_id=r-1$", text, re.M)
         assert "\nINFO:     forged" not in text
@@ -143,7 +148,9 @@ def test_lines_of_the_processes_for_heavy_work_are_of_the_same_form(tmp_path):
     settings = {"SPECSHIELD_LOG_FORMAT": "json", "SPECSHIELD_MAX_HORIZON": "100"}  # case2 asks for more
     with serving(tmp_path, **settings) as server:
         body = {"map_id": "case1", "spec": {"formula": "F[0,60] Kitchen"}}
-        assert httpx.post(f"{server.url}/v1/policies", json=body, timeout=None).status_code == 503
+        assert (
+            httpx.post(f"{server.url}/v1/policies", json=body, timeout=None, verify=False).status_code == 503
+        )
         lines = [json.loads(line) for line in server.log.read_text().splitlines()]
     left_out = [line["message"] for line in lines if "case2 is left out" in line["message"]]
     assert len(left_out) == 2  # by the server, and by the process that read the request
@@ -160,7 +167,7 @@ def dashboard() -> dict[str, object]:
 
 def test_dashboard_and_page_name_the_metrics_that_are_told(server, dashboard):
     begin(server)
-    httpx.get(f"{server.url}/v1/sessions/none", timeout=None)
+    httpx.get(f"{server.url}/v1/sessions/none", timeout=None, verify=False)
     told = {name for name, *_ in samples(server)}
     panels = [panel for panel in dashboard["panels"] if panel["type"] != "row"]
     expressions = [target["expr"] for panel in panels for target in panel["targets"]]
