@@ -150,7 +150,7 @@ def decide(
         believed = tried_again(told, taught, judged, now)
         if believed is not None:
             taught, (shield, now, judged, withstands) = believed
-            said = (*said, "no other way was left, so the map is doubted where the robot touched something")
+            said = (*said, "no other way was left, so what was touched, or last seen long ago, is doubted")
             touches = _look_around(shield.body, poses[-1], nexts)
         prefix = now.prefix
         doubts, risky = doubtful(told, taught, judged.part, nexts, judged.left_out)

@@ -214,8 +214,8 @@ def doubtful(
             successors(body_on(told, believed), pose, end)
         doubts |= np.any(ends[0] != ends[1], axis=1)
     stopped = np.zeros(motions, np.bool_)
-    learns = config.learn_map and (config.uncertainty is not None or len(known))
-    if learns and _stop_short(*displacements(told.body), pose, nexts, stopped):
+    if config.learn_map and (config.uncertainty is not None or len(known)):
+        _stop_short(*displacements(told.body), pose, nexts, stopped)
         for motion in np.flatnonzero(stopped).tolist():
             places = _farther(told.body, pose, motion, nexts[motion])
             risky[motion] = any(not prefix.allows(place) for place in places)
@@ -226,17 +226,14 @@ def doubtful(
 
 
 @leaf
-def _stop_short(far: Floats, turn: Floats, pose: Floats, nexts: Floats, stopped: Bools) -> bool:
+def _stop_short(far: Floats, turn: Floats, pose: Floats, nexts: Floats, stopped: Bools) -> None:
     """Marks the motions [M] that end at `nexts` [M, 3], short of their displacements [M] from a pose (3,), in
-    `stopped`; whether some do.
+    `stopped`.
     """
-    some = False
     for m in range(nexts.shape[0]):
         gone = math.hypot(nexts[m, 0] - pose[0], nexts[m, 1] - pose[1])
         short = abs(gone - abs(far[m])) > SAME_PLACE
         stopped[m] = short or (turn[m] != 0.0 and nexts[m, 2] == pose[2])
-        some = some or bool(stopped[m])
-    return some
 
 
 def _farther(body: Body, pose: Floats, motion: int, end: Floats) -> Iterator[Floats]:

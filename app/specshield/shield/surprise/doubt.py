@@ -1,7 +1,4 @@
-"""What is believed where what was seen or touched leaves no way, and what is done where there is none left.
-
-Of contacts less is believed than is marked, one guess after the other.
-"""
+"""What is believed where what was seen or touched leaves no way, and what is done where none is left."""
 
 from __future__ import annotations
 
@@ -22,6 +19,7 @@ from specshield.world.learned import CONTACT, LEFT, RIGHT, SENT, forget, learn, 
 
 GUESSES = ((CONTACT, LEFT, RIGHT), (CONTACT,), (LEFT,), (RIGHT,))  # what of a contact is believed, in turn
 DOUBTED_AFTER = 4  # [steps] then what was met is tried again where nothing else is left; chosen by hand
+UNSEEN_AFTER = 20  # [steps] then the same is done with what was sent as occupied, and not again; by hand
 MOST_PARTS = 4  # of those that no way keeps together: for which ways are asked that keep one; chosen by hand
 
 
@@ -51,18 +49,17 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
     lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
     before was wrong, and the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
-    forgotten, since no contact shows that a thing is gone. Last, all that the robot has just passed is free.
+    forgotten, since no contact shows that a thing is gone; then also what no sensor has seen for UNSEEN_AFTER
+    steps, since it may look elsewhere. Last, all that the robot has just passed is free.
     """
-    known, t, body = taught.map, prefix.t, body_on(told, taught.map)
-    young = t - known.step < DOUBTED_AFTER
-    seen = ~known.occupied | (known.by == SENT)
-    first = max(taught.followed.met - 1, 0) % len(GUESSES)
-    for held in GUESSES[first:] + GUESSES[:first]:
-        stays = seen | np.isin(known.by, held)
-        if not stays.all() and (~seen & stays).any():
-            yield taught._replace(map=revised(known, forget(known, ~stays)))
-    if not (seen | young).all():
-        yield taught._replace(map=revised(known, forget(known, ~(seen | young))))
+    known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
+    marked, first = known.occupied & ~sent, max(taught.followed.met - 1, 0) % len(GUESSES)
+    held = [marked & np.isin(known.by, some) for some in GUESSES[first:] + GUESSES[:first]]
+    old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
+    unseen = told.config.learn_map and (old & sent).any()
+    for gone in [*(marked & ~some for some in held if some.any()), old & marked, *([old] if unseen else [])]:
+        if gone.any():
+            yield taught._replace(map=revised(known, forget(known, gone)))
     if told.config.learn_map:
         recent = prefix.poses[max(t - DOUBTED_AFTER, taught.here) :]
         under = [cells_under(body, pose, 0.0) for pose in recent if overlap(body, *pose) > 0.0]
