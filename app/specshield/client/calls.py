@@ -240,8 +240,8 @@ def create_session(
     `uncertainty`: "learned" has margin and slack follow from how the robot moves; {"translation": m,
     "rotation": rad, "slip": probability} says what is known of it before the first step; "none" takes the
     world for exact. `learn_map`: a motion that stops short marks what it ran into. `map_memory`: the steps
-    after which a point sent as `occupied` is forgotten, None: never. `threshold_over`: whether `threshold`
-    holds at each "step" or over the whole "episode".
+    after which a point sent as `occupied` is forgotten, None: not for its age.
+    `threshold_over`: whether `threshold` holds at each "step" or over the whole "episode".
 
     `on_failure` says what a step is when the service cannot answer it in time. "raise": its error. "witness":
     a `LocalDecision` that follows the certified continuation received last; it says to stop where there is

@@ -67,10 +67,11 @@ NEVER_DRAWN = Followed()
 class Taught(NamedTuple):
     """What a session has learned: its map, and how its caller follows what is drawn.
 
-    contact: whether the last motion ran into something, or on through it; it is not handed on. stuck: where
-    the robot stood and which motion led nowhere from there, or elsewhere than f has it, whatever is marked;
-    handed on beside the bytes, as is `here`: the first step at which this robot was on this map. near: how
-    far apart two poses are that may be one.
+    contact: whether the last motion ran into something, or on through it. looks: whether a sensor says what
+    it sees at this step, be it nothing. Neither is handed on. stuck: where the robot stood and which motion
+    led nowhere from there, or elsewhere than f has it, whatever is marked. here: the first step at which this
+    robot was on this map. Both are handed on beside the bytes. near: how far apart two poses are that may be
+    one.
     """
 
     map: LearnedMap = NONE
@@ -79,6 +80,7 @@ class Taught(NamedTuple):
     stuck: tuple[Stuck, ...] = ()
     near: Near = NEAR
     here: int = 0
+    looks: bool = False
 
     @property
     def barred(self) -> Floats:
@@ -161,7 +163,7 @@ def teach(
     if beyond:
         said.append(f"{beyond} points lie outside the map and were ignored")
     own = known if known is before.map else revised(before.map, known)
-    return Taught(own, followed, motion >= 0 or on >= 0, stuck, near, here), tuple(said)
+    return Taught(own, followed, motion >= 0 or on >= 0, stuck, near, here, occupied is not None), tuple(said)
 
 
 @leaf

@@ -108,7 +108,7 @@ class SessionRequest(_Policies):
         None,
         ge=1,
         le=1_000_000,
-        description="An `occupied` point is forgotten after so many steps; null: never.",
+        description="An `occupied` point is forgotten after so many steps; null: not for its age.",
     )
     threshold_over: Literal["step", "episode"] = Field(
         "step", description="Whether `threshold` holds at each step, or for the episode as a whole."
@@ -169,7 +169,7 @@ class SessionResponse(BaseModel):
     )
     learn_map: bool = Field(False, description="Whether motions that stop short mark what they ran into.")
     map_memory: int | None = Field(
-        None, description="Steps after which an `occupied` point is forgotten; null: never."
+        None, description="Steps after which an `occupied` point is forgotten; null: not for its age."
     )
     threshold_over: str = Field("step", description="`step` or `episode`.")
     max_steps: int = Field(description="The last step there can be.")

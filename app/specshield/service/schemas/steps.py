@@ -41,7 +41,8 @@ class StepRequest(Strict):
     witnesses: bool = Field(False, description="Answer a certified continuation for every action.")
     occupied: Points | None = Field(
         None,
-        description="Points at which the robot's sensors see an obstacle now, map frame. They count at once.",
+        description="Points at which the robot's sensors see an obstacle now, map frame. They count at once. "
+        "`[]`: they see none.",
     )
     free: Points | None = Field(
         None, description="Points at which the robot's sensors see free floor now, map frame."

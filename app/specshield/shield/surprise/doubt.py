@@ -49,14 +49,14 @@ def doubted(told: Shield, taught: Taught, prefix: Prefix) -> Iterator[Taught]:
     less is believed than is marked: nothing behind what was touched; only what lies straight ahead; only what
     lies to the left; only what lies to the right. Each new contact at the same pose shows that the guess
     before was wrong, and the next one is tried first. Then contacts of DOUBTED_AFTER steps ago or earlier are
-    forgotten, since no contact shows that a thing is gone; then also what no sensor has seen for UNSEEN_AFTER
-    steps, since it may look elsewhere. Last, all that the robot has just passed is free.
+    forgotten, since no contact shows that a thing is gone; then also what a sensor has not seen again for
+    UNSEEN_AFTER steps, since it may look elsewhere. Last, all that the robot has just passed is free.
     """
     known, t, body, sent = taught.map, prefix.t, body_on(told, taught.map), taught.map.by == SENT
     marked, first = known.occupied & ~sent, max(taught.followed.met - 1, 0) % len(GUESSES)
     held = [marked & np.isin(known.by, some) for some in GUESSES[first:] + GUESSES[:first]]
     old = known.occupied & (t - known.step >= np.where(sent, UNSEEN_AFTER, DOUBTED_AFTER))
-    unseen = told.config.learn_map and (old & sent).any()
+    unseen = told.config.learn_map and taught.looks and (old & sent).any()
     for gone in [*(marked & ~some for some in held if some.any()), old & marked, *([old] if unseen else [])]:
         if gone.any():
             yield taught._replace(map=revised(known, forget(known, gone)))
