@@ -105,13 +105,14 @@ class _Motion:
         part, early, t, asked = self.judged.part, self.judged.aimed.early, self.prefix.t, rho.copy()
         if len(early):  # else J is made of the conjuncts as a whole
             view, joint = conjunction_of(part.task, part.formula)
-            seen, still = part.of(part.formula, view), np.empty(len(early), np.bool_)
+            seen, settled = part.of(part.formula, view), np.empty(len(early))
+            still = np.empty(len(early), np.bool_)
             _, leaves = rho_of(seen, np.ascontiguousarray(poses[:, t + 1 :]))
-            find_open(joint, seen.known, t, still)
+            find_open(joint, seen.known, t, self.judged.aimed.visits, still, settled)
             for k, each in enumerate(conjuncts(part.formula)[: len(early)]):
                 if still[k] and each in parts:
                     only = np.arange(len(still)) == k
-                    rate_open(joint, only, t, early, leaves, asked[parts.index(each)])
+                    rate_open(joint, only, t, settled, early, leaves, asked[parts.index(each)])
         return asked
 
     def shows(

@@ -1,9 +1,10 @@
 """What a prefix leaves open of a formula, with each F and U met some steps early.
 
-What the prefix has settled is left out. An F or U is asked for so many steps before its window ends, or where
-it is met already. What a G that has yet to begin asks for is asked for so many steps before it, and so is
-what a short window far away asks for; another G at the top counts from the first step on at which its child
-is open. Below a `not`, a G is an F in other words, and an F a G.
+What the prefix has settled is left out; a visit may have to be robust to count. An F or U is asked for so
+many steps before its window ends, or where it is met already. What a G that has yet to begin asks for is
+asked for so many steps before it, and so is what a short window far away asks for; another G at the top
+counts from the first step on at which its child is open. Below a `not`, a G is an F in other words, and an F
+a G.
 """
 
 from __future__ import annotations
@@ -19,7 +20,18 @@ from specshield.rule.values import places
 from specshield.rule.view import View, view_of
 from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, conjuncts
 from specshield.stl.conjunction import flat, is_predicate
-from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, apply, bounds_at, compile_tree, slide, until
+from specshield.stl.tree import (
+    ALWAYS,
+    EVENTUALLY,
+    UNTIL,
+    Tree,
+    apply,
+    bounds_at,
+    compile_tree,
+    slide,
+    sought_leaves,
+    until,
+)
 from specshield.task import Task, kept_with_task
 
 OTHER = -1  # beside a tree's operators
@@ -33,7 +45,8 @@ class Conjuncts(NamedTuple):
     window [steps]. horizon [K]: of what is below [steps]. lead [K]: half of the time until its window if that
     `is_far`, else 0 [steps]. half [K]: half of the longest window of an F or U in it, or of the time until a
     window in `below` that is far [steps]. plain [K]: whether what is below is a predicate, or under F a G of
-    one. owner [n]: each node's conjunct; -1 where nothing can be asked for early.
+    one. owner [n]: each node's conjunct; -1 where nothing can be asked for early. seeker [l]: the conjunct of
+    each leaf that an F or U seeks to be true, -1 of any other.
     """
 
     below: Tree
@@ -46,6 +59,7 @@ class Conjuncts(NamedTuple):
     half: Ints
     plain: Bools
     owner: Ints
+    seeker: Ints
 
 
 @kept_with_task
@@ -56,6 +70,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts
     whole, slots = joined(above), places(task)
     tree = compile_tree(whole, slots, True)
     rows, kept, owner, size = list[tuple[int, ...]](), list[bool](), list[int](), 0
+    seeker = [k if sought else -1 for k, part in enumerate(above) for sought in sought_leaves(part)]
     for k, part in enumerate(above):
         each, row = compile_tree(part, slots, True), (OTHER, size, 0, 0, part.horizon, 0)
         seeks = np.where(each.op == ALWAYS, each.turned, (each.op > ALWAYS) & ~each.turned)
@@ -72,7 +87,8 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts
         size += each.size
     below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:8]})  # of its nodes
     columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
-    parts = Conjuncts._make((below, *columns, plain, np.array(owner, np.int64)))
+    last = np.array(owner, np.int64), np.array(seeker, np.int64)
+    parts = Conjuncts._make((below, *columns, plain, *last))
     same = whole == formula and tree.size == view_of(task, formula).tree.size  # no window is far
     return None if same else view_of(task, whole, True), parts
 
@@ -83,31 +99,63 @@ def _is_plain(part: Formula) -> bool:
 
 
 @kernel
-def find_open(parts: Conjuncts, known: Floats, t: int, still: Bools) -> Floats:
+def find_open(
+    parts: Conjuncts, known: Floats, t: int, margin: float, still: Bools, settled: Floats
+) -> Floats:
     """Writes which conjuncts x_{0:t} has not settled into still (K,). known (size,): the leaves to step t.
     Returns the least that each node may have, by x_{0:t}.
+
+    margin: what was sought counts where it is more robust than this, as long as that can be had yet. settled
+    (K,): written, what that is for each conjunct.
     """
-    low = known.copy()
-    bounds_at(parts.below, t, low, known.copy())
+    low, high = known.copy(), known.copy()
+    bounds_at(parts.below, t, low, high)
+    for k in range(settled.shape[0]):
+        had = _value(parts, k, parts.a[k], parts.b[k], high) > margin
+        settled[k] = margin if had else SATISFIED_ABOVE
+    copy_row(known, low)
+    if not _settle(parts, t, settled, low):  # then nothing is settled by less
+        settled[:] = SATISFIED_ABOVE
+    bounds_at(parts.below, t, low, low.copy())
     for k in range(still.shape[0]):
-        still[k] = not _value(parts, k, parts.a[k], parts.b[k], low) > SATISFIED_ABOVE
+        still[k] = not _value(parts, k, parts.a[k], parts.b[k], low) > settled[k]
     return low
 
 
+@leaf
+def _settle(parts: Conjuncts, t: int, settled: Floats, buffer: Floats) -> bool:
+    """Of the leaves to step t, in `buffer` (size,), what is settled asks for no margin any more, in place.
+    settled (K,): as `find_open` has it. Whether something sought is settled by less than that.
+    """
+    less = False
+    for n in range(parts.below.leaf_at.shape[0]):
+        first = parts.below.leaf_at[n] - parts.below.leaf_start[n]
+        enough = settled[parts.seeker[n]] if parts.seeker[n] >= 0 else SATISFIED_ABOVE
+        for i in range(parts.below.leaf_at[n], first + min(parts.below.leaf_stop[n], t + 1)):
+            if buffer[i] > enough:
+                buffer[i] = np.inf
+            elif buffer[i] > SATISFIED_ABOVE:
+                less = True
+            else:
+                buffer[i] = -np.inf
+    return less
+
+
 @kernel
-def rate_open(parts: Conjuncts, still: Bools, t: int, early: Ints, leaves: Floats, rho: Floats) -> None:
+def rate_open(
+    parts: Conjuncts, still: Bools, t: int, settled: Floats, early: Ints, leaves: Floats, rho: Floats
+) -> None:
     """rho (N,) of the conjuncts that are `still` (K,) open, each F and U met early (K,) steps before its end,
     though a window keeps at least half its length, and what a window that is far asks for kept before it.
 
-    leaves (N, size): the leaves along N trajectories. Where nothing is open, rho is that of the whole.
+    settled (K,): as `find_open` has it. leaves (N, size): the leaves along N trajectories. Where nothing is
+    open, rho is that of the whole.
     """
     buffer, scratch, some = np.empty(leaves.shape[1]), np.empty(leaves.shape[1]), still.any()
     for f in range(leaves.shape[0]):
         copy_row(leaves[f], buffer)
-        for n in range(parts.below.leaf_at.shape[0] if some else 0):  # what is settled asks for no margin
-            first = parts.below.leaf_at[n] - parts.below.leaf_start[n]
-            for i in range(parts.below.leaf_at[n], first + min(parts.below.leaf_stop[n], t + 1)):
-                buffer[i] = np.inf if buffer[i] > SATISFIED_ABOVE else -np.inf
+        if some:
+            _settle(parts, t, settled, buffer)
         for n in range(parts.owner.shape[0]):
             sooner = early[parts.owner[n]] if some and parts.owner[n] >= 0 else 0
             _apply_early(parts.below, n, t, sooner, buffer, scratch)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,7 +26,9 @@ from specshield.shield.uncertainty import Care
 from specshield.stl import SATISFIED_ABOVE, Always, Formula, Verdict
 from specshield.stl.conjunction import flat
 
-LESS = 4  # [steps] V has ways asked for with so much less slack, and in such strides with more. By hand.
+# [steps] Ways are asked for with so much less slack for V, in such strides with more, and with so much more
+# after a surprise. Chosen by hand.
+LESS = 4
 
 
 class Situation(NamedTuple):
@@ -103,14 +105,12 @@ def judge(shield: Shield, now: Situation) -> Judged:
     values, aimed = best.robustness, Aimed(best, feasible, asked, 0, lowered)
     if lowered or (care.has_slack and max(values.tolist()) > SATISFIED_ABOVE):  # numpy is slow for so few
         aimed = had or aim(shield, care, part, tried, kept, leaves, follows)
-        left = ~aimed.kept & (values > SATISFIED_ABOVE)
-        # A threshold for the episode weighs ways with any slack, also with more than the first futures have.
-        by_chance = shield.config.threshold_over == "episode" and shield.config.uncertainty is not None
         most = aimed.slack or max(aimed.early.tolist(), default=0)
-        if (by_chance or (most > 0 and care.on_way)) and not violated and True in left.tolist():
-            known, wanted, before = len(tried.rho), left | by_chance, None if by_chance else aimed
-            chancy = *range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)
-            for steps in chancy if by_chance else (most,):
+        left = ~aimed.kept & (values > SATISFIED_ABOVE)
+        sooner, anew = _sooner(shield, care, prefix.t, most, True in left.tolist())
+        if sooner and not violated:
+            known, wanted, before = len(tried.rho), left | anew, None if anew else aimed
+            for steps in sooner:
                 tried = _in_time(shield, prefix, tried, asked, steps, wanted)
             if len(tried.rho) > known:
                 kept = tried.rho
@@ -144,6 +144,20 @@ def _with_room(shield: Shield, prefix: Prefix, tried: Futures, kept: Floats) -> 
     """`kept` [N], and -inf for the futures that come too near to something for a larger robot."""
     room = has_room(widened(shield.body), prefix.poses[-1], tried.motions, tried.poses)
     return np.where(room, kept, -np.inf)
+
+
+def _sooner(shield: Shield, care: Care, t: int, most: int, some: bool) -> tuple[Sequence[int], bool]:
+    """By how many steps earlier ways are asked for, beside the first futures, which have `most` steps of
+    slack. And whether of every motion, or of those alone that keep the rule and not what is asked of it;
+    some: whether there are any.
+    """
+    unsure = shield.config.uncertainty is not None
+    if unsure and shield.config.threshold_over == "episode":  # it weighs ways with any slack
+        chancy = [*range(care.least, most, -LESS), *range(most, max(most - LESS, 0), -1)]
+        return chancy if some else [], True
+    if unsure and t > 0 and not care.on_way and most < care.least:  # a surprise may have cost slack
+        return [min(most + LESS, care.least), most + 1], True
+    return [most] if some and most > 0 and care.on_way else [], False
 
 
 def _in_time(

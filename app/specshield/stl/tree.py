@@ -61,10 +61,17 @@ def compile_tree(formula: Formula, slots: Mapping[str, int], ahead: bool = False
     builder = _Builder(ahead)
     builder.add(formula, 0, 1, False)
     *nodes, turned = np.array(builder.nodes, np.int64).reshape(-1, 8).T.copy()
-    leaves = np.array(builder.leaves, np.int64).T.copy()
+    *leaves, _ = np.array(builder.leaves, np.int64).T.copy()
     bounds = np.array([unseen_bounds(each) for each in builder.predicates]).T.copy()
     programs = compile_predicates(builder.predicates, slots)
     return Tree._make((*nodes, turned.astype(np.bool_), *leaves, *bounds, programs, builder.size))
+
+
+def sought_leaves(formula: Formula) -> list[int]:
+    """1 for each leaf that an F or U seeks to be true, below no odd number of `not`, and 0 for any other."""
+    builder = _Builder(False)
+    builder.add(formula, 0, 1, False)
+    return [sought for *_, sought in builder.leaves]
 
 
 def is_far(formula: Always | Eventually, turned: bool) -> bool:
@@ -82,12 +89,14 @@ class _Builder:
     def __init__(self, ahead: bool) -> None:
         self.ahead = ahead
         self.nodes: list[tuple[int, ...]] = []
-        self.leaves: list[tuple[int, int, int]] = []
+        self.leaves: list[tuple[int, int, int, int]] = []
         self.predicates: list[Formula] = []
         self.size = 0
 
-    def add(self, formula: Formula, start: int, stop: int, turned: bool) -> int:
-        """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin."""
+    def add(self, formula: Formula, start: int, stop: int, turned: bool, sought: bool = False) -> int:
+        """Adds the nodes for rho at steps start to stop - 1; returns where in the buffer these begin. turned:
+        as in `Tree`; sought: whether what stands above seeks it.
+        """
 
         def node(op: int, at: int, right: int = -1, a: int = 0, b: int = 0) -> int:
             self.nodes.append((op, at, stop - start, a, b, right, start, turned))
@@ -96,30 +105,30 @@ class _Builder:
         match formula:
             case _ if is_predicate(formula):
                 at, self.size = self.size, self.size + stop - start
-                self.leaves.append((at, start, stop))
+                self.leaves.append((at, start, stop, sought and not turned))
                 self.predicates.append(formula)
                 return at
             case Not(child):
-                return node(NOT, self.add(child, start, stop, not turned))
+                return node(NOT, self.add(child, start, stop, not turned, sought))
             case And(children) | Or(children):
                 op = AND if isinstance(formula, And) else OR
-                at = self.add(children[0], start, stop, turned)
+                at = self.add(children[0], start, stop, turned, sought)
                 for child in children[1:]:
-                    node(op, at, self.add(child, start, stop, turned))
+                    node(op, at, self.add(child, start, stop, turned, sought))
                 return at
             case Implies(left, right):
-                at = node(NOT, self.add(left, start, stop, not turned))
-                return node(OR, at, self.add(right, start, stop, turned))
+                at = node(NOT, self.add(left, start, stop, not turned, sought))
+                return node(OR, at, self.add(right, start, stop, turned, sought))
             case Always(a, b, child) | Eventually(a, b, child):
                 op = ALWAYS if isinstance(formula, Always) else EVENTUALLY
                 before = a if self.ahead and is_far(formula, turned) else 0
-                at = self.add(child, start + a - before, stop + b, turned)
+                at = self.add(child, start + a - before, stop + b, turned, (op == EVENTUALLY) is not turned)
                 return node(op, at, at + before, a, b)
             case Until(_, 0, _, right):
-                return self.add(right, start, stop, turned)
+                return self.add(right, start, stop, turned, not turned)
             case Until(a, b, left, right):
                 at = self.add(left, start, stop - 1 + b, turned)
-                return node(UNTIL, at, self.add(right, start + a, stop + b, turned), a, b)
+                return node(UNTIL, at, self.add(right, start + a, stop + b, turned, not turned), a, b)
         raise TypeError(f"not a formula: {formula!r}")
 
 

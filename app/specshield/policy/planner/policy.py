@@ -159,13 +159,24 @@ class PlannerPolicy(Carded):
         return joined(*(proposal for proposal, _ in plans)), found
 
     def _asked(self, formula: Formula, history: Floats, rows: Floats, margin: float) -> tuple[Formula, ...]:
-        """What J asks the margin of: the whole trajectory where that can be had, else what is still open."""
-        bounds = [bounds_after(self.task, part, history, rows) for part in conjuncts(formula)]
-        lost = any(SATISFIED_ABOVE < high <= margin for _, high in bounds)
-        if not lost and not any(SATISFIED_ABOVE < low <= margin for low, _ in bounds):
+        """What J asks the margin of: each part as a whole where it can have it there, else what is still
+        open; where a visit that is behind has less, also what is still open of all parts.
+        """
+        parts = conjuncts(formula)
+        bounds = [bounds_after(self.task, part, history, rows) for part in parts]
+        lost = [SATISFIED_ABOVE < high <= margin for _, high in bounds]
+        again = any(SATISFIED_ABOVE < low <= margin < high for low, high in bounds)
+        if not again and not any(lost):
             return (formula,)
         left = still_open(self.task, formula, history, rows)
-        return (left,) if lost else (formula, left)
+        if not again:
+            return (left,)
+        kept = [
+            still_open(self.task, part, history, rows) if gone else part
+            for part, gone, (low, _) in zip(parts, lost, bounds, strict=True)
+            if not (gone and low > SATISFIED_ABOVE)
+        ]
+        return (formula if not any(lost) else all_of(kept), left)
 
     def _plan_in(
         self, world: World, history: Floats, rows: Floats, margin: float, most: int

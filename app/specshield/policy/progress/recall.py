@@ -35,6 +35,7 @@ class Present(NamedTuple):
 def recall(rules: Rules, past: Past) -> Present:
     """As `replay`, but the states x_0..x_t have to keep their own margin instead of the rules'.
 
+    By the rules' margin, what can have it no more counts by what it has: J asks for it elsewhere.
     J asks the rules' margin of every step of a dwell. So of a dwell that has begun only the steps that keep
     that margin count. Where it is too late to begin the dwell anew, all steps that keep their own do.
     """
@@ -45,6 +46,11 @@ def recall(rules: Rules, past: Past) -> Present:
         for k in range(status.shape[0]):
             if status[k] == PENDING and asked[k] == PENDING:
                 run[k] = whole[k]
+    elif margin > 0.0:
+        had, whole = replay(rules, 0.0, poses, signals)
+        for k in range(status.shape[0]):
+            if status[k] == BROKEN:
+                status[k], run[k] = had[k], whole[k]
     return Present(poses.shape[0] - 1, poses[-1], status, run)
 
 
@@ -59,29 +65,22 @@ def resume(rules: Rules, past: Past) -> Present:
 def pasts(rules: Rules, poses: Floats, signals: Floats) -> list[Past]:
     """The states x_0..x_t with each margin by which proposals have to `recall` them, given what J asks for.
 
-    Where it can be had, J asks the rules' margin of the whole trajectory; then what was settled by less than
-    that margin has to be settled anew. Elsewhere J asks it only of what is still open; then what was settled
-    at all counts as settled. Where both may apply, a proposal is made for each.
+    J asks that a visit behind has the rules' margin, where it can be made again; elsewhere any visit counts.
+    Where both may apply, a proposal is made for each.
     """
-    lost = less = False
-    if rules.margin > 0.0:
-        lost, less = _fall_short(rules, poses, signals)
-    margins = [0.0] if lost else [rules.margin, 0.0] if less else [rules.margin]
-    return [Past(margin, poses, signals) for margin in margins]
+    less = rules.margin > 0.0 and _fall_short(rules, poses, signals)
+    return [Past(margin, poses, signals) for margin in ([rules.margin, 0.0] if less else [rules.margin])]
 
 
 @kernel
-def _fall_short(rules: Rules, poses: Floats, signals: Floats) -> tuple[bool, bool]:
-    """Two answers: whether the rules' margin cannot be had any more on the whole trajectory though the rule
-    can, and whether x_0..x_t settled something by less than that margin.
-    """
+def _fall_short(rules: Rules, poses: Floats, signals: Floats) -> bool:
+    """Whether x_0..x_t settled something by less than the rules' margin, which it could still have."""
     asked, _ = replay(rules, rules.margin, poses, signals)
     status, _ = replay(rules, 0.0, poses, signals)
-    lost = less = False
+    less = False
     for k in range(status.shape[0]):
-        lost = lost or (asked[k] == BROKEN and status[k] != BROKEN)
-        less = less or asked[k] != status[k]
-    return lost, less
+        less = less or (asked[k] != BROKEN and asked[k] != status[k])
+    return less
 
 
 @leaf

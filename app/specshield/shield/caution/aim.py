@@ -29,7 +29,7 @@ class Aimed(NamedTuple):
 
     margin [m], slack [steps]: how much that is, the slack at the next deadline. lowered: whether it is less
     than the session's settings ask for; what is asked for beside them is had where it can be. early (K,)
-    [steps]: of each conjunct.
+    [steps]: of each conjunct. visits: the robustness above which a visit that is behind counts.
     """
 
     best: Best
@@ -38,6 +38,7 @@ class Aimed(NamedTuple):
     slack: int
     lowered: bool
     early: Ints = np.zeros(0, np.int64)
+    visits: float = SATISFIED_ABOVE
 
 
 def aim(
@@ -57,17 +58,31 @@ def aim(
     future is what is left of the way that the robot is on. before: what could be had of fewer futures, of
     which no more is asked.
     """
-    task, margin = shield.task, SATISFIED_ABOVE + care.margin
-    view, parts = conjunction_of(task, prefix.formula)
+    view, parts = conjunction_of(shield.task, prefix.formula)
     if view is not None:
         prefix = prefix.of(prefix.formula, view)
         _, leaves = rho_of(prefix, tried.poses)
-    count, motions = len(parts.kind), len(task.robot.motions)
-    early, due = np.zeros((2, count), np.int64)
-    still, best = np.empty(count, np.bool_), Best(np.empty(motions), np.empty(motions, np.int64))
-    now = Open(parts, still, early, due, prefix.t, leaves, whole, tried.motions, follows)
+    count = len(parts.kind)
+    still, settled, (asked, due) = np.empty(count, np.bool_), np.empty(count), np.empty((2, count), np.int64)
+    now = Open(parts, still, settled, asked, due, prefix.t, leaves, whole, tried.motions, follows)
+    if before is not None:
+        return _aim(shield, care, prefix, now, before.visits, before)
+    robust = _aim(shield, care, prefix, now, SATISFIED_ABOVE + care.margin)
+    if max(settled.tolist()) <= SATISFIED_ABOVE:  # no visit was made by less
+        return robust
+    any_visit = _aim(shield, care, prefix, now, SATISFIED_ABOVE)
+    enough = min(any_visit.slack, care.least // 2)  # to make a visit again may cost half of the slack
+    return robust if robust.margin >= any_visit.margin and robust.slack >= enough else any_visit
+
+
+def _aim(
+    shield: Shield, care: Care, prefix: Prefix, now: Open, visits: float, before: Aimed | None = None
+) -> Aimed:
+    """`aim`, where a visit that is behind counts if it was more robust than `visits`."""
+    motions, margin = len(shield.task.robot.motions), SATISFIED_ABOVE + care.margin
+    best = Best(np.empty(motions), np.empty(motions, np.int64))
     asking = care.noise, care.stride, care.least, care.chance
-    had = _best_asked(now, prefix.known, asking, margin, best) > margin
+    had = _best_asked(now, prefix.known, asking, visits, margin, best) > margin
 
     def at(early: Ints) -> tuple[Best, bool]:
         best = Best(np.empty(motions), np.empty(motions, np.int64))
@@ -77,12 +92,13 @@ def aim(
         margin = min(margin, SATISFIED_ABOVE + before.margin)
         best, _ = at(before.early)
         return before._replace(best=best, kept=best.robustness > margin)
+    early = now.asked.copy()
     if not had:
-        early = np.zeros(count, np.int64)
+        early = np.zeros_like(early)
         best, had = at(early)
         if not had:  # nor the margin: ask for all that can be had of it, and for slack beside that
             margin = max(float(np.nextafter(best.robustness.max(), -np.inf)), SATISFIED_ABOVE)
-        for of in (early == 0, *(np.arange(count) == k for k in np.argsort(now.due, kind="stable"))):
+        for of in (early == 0, *(np.arange(len(early)) == k for k in np.argsort(now.due, kind="stable"))):
             low, high = int(early[of].max()), int(now.asked[of].max()) + 1
             while high - low > 1:
                 middle = (low + high) // 2
@@ -91,18 +107,20 @@ def aim(
                 best, early = (tighter, more) if had else (best, early)
                 low, high = (middle, high) if had else (low, middle)
     margin_had, slack = margin - SATISFIED_ABOVE, int(early[now.due.argmin()])
-    less = early is not now.asked and (early < np.minimum(now.asked, shield.config.slack)).any()
+    less = (early < np.minimum(now.asked, shield.config.slack)).any()
     lowered = bool(less or margin_had < shield.config.margin)
-    return Aimed(best, best.robustness > margin, margin_had, slack, lowered, early)
+    return Aimed(best, best.robustness > margin, margin_had, slack, lowered, early, visits)
 
 
 class Open(NamedTuple):
-    """The conjuncts at step t: which are still open (K,), how early each is asked for (K,), and in how many
-    steps it is due (K,), NEVER where it is not. The rest is as in `aim`.
+    """The conjuncts at step t: which are still open (K,), above which robustness they are `settled` (K,), how
+    early each is asked for (K,), and in how many steps it is due (K,), NEVER where it is not. The rest is as
+    in `aim`.
     """
 
     parts: Conjuncts
     still: Bools
+    settled: Floats
     asked: Ints
     due: Ints
     t: int
@@ -114,16 +132,16 @@ class Open(NamedTuple):
 
 @kernel
 def _best_asked(
-    now: Open, known: Floats, care: tuple[Noise, float, int, float], margin: float, best: Best
+    now: Open, known: Floats, care: tuple[Noise, float, int, float], visits: float, margin: float, best: Best
 ) -> float:
-    """Fills in `still`, `asked` and `due` of `now`, whose `asked` is 0, and then writes as `_best_open` does
-    for what is asked. care: its noise, stride, least and chance. A window keeps half its length.
+    """Fills in `still`, `settled`, `asked` and `due` of `now`, and then writes as `_best_open` does for what
+    is asked. care: its noise, stride, least and chance. A window keeps half its length.
     """
-    parts, still, asked, due, t = now[:5]
+    parts, still, settled, asked, due, t = now[:6]
     noise, stride, least, chance = care
-    low = find_open(parts, known, t, still)
+    low = find_open(parts, known, t, visits, still, settled)
     for k in range(still.shape[0]):
-        half, due[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER
+        half, due[k], asked[k] = max(parts.half[k], parts.lead[k] if parts.a[k] > t else 0), NEVER, 0
         if still[k] and half > 0:
             left = parts.b[k] + parts.horizon[k] - t
             if parts.kind[k] != EVENTUALLY:  # the first that its child is asked for
@@ -132,7 +150,7 @@ def _best_asked(
             due[k] = left
             # What an earlier step asks for, and is still open, is due first.
             for i in range(parts.a[k], min(t, parts.b[k]) + 1 if parts.kind[k] == ALWAYS else 0):
-                if not low[parts.at[k] - parts.a[k] + i] > SATISFIED_ABOVE:
+                if not low[parts.at[k] - parts.a[k] + i] > settled[k]:
                     due[k] = min(due[k], i + parts.horizon[k] - t)
     return _best_open(now, asked, margin, best)
 
@@ -145,7 +163,7 @@ def _best_open(now: Open, early: Ints, margin: float, best: Best) -> float:
     be more robust: a robot that changes to a better one at each step may go to and fro and never arrive.
     """
     rho = np.empty(now.whole.shape[0])
-    rate_open(now.parts, now.still, now.t, early, now.leaves, rho)
+    rate_open(now.parts, now.still, now.t, now.settled, early, now.leaves, rho)
     rho[~(now.whole > SATISFIED_ABOVE)] = -np.inf
     best_rows(now.motions, rho, best)
     if now.follows and rho[0] > margin:
