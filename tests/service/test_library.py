@@ -19,7 +19,6 @@ from safetensors.numpy import load, save
 from specshield.errors import InsufficientStorage, NotFound
 from specshield.policy.card import policy_id
 from specshield.service.access.keys import OPEN, Key
-from specshield.service.app import _adopt
 from specshield.service.library.claims import Claims
 from specshield.service.library.maps import Maps
 from specshield.service.library.policies import Policies, describe
@@ -387,18 +386,6 @@ def test_what_nobody_has_is_nobodys_until_it_is_sent_again(claims, tmp_path):
     assert id in [item["id"] for item in maps.page("", None, 1000)[0]]
     maps.delete(id, "")
     assert not (tmp_path / "maps" / id).exists()
-
-
-def test_a_folder_that_cannot_be_read_is_told_once_and_does_not_end_what_goes_on_beside(
-    claims, tmp_path, caplog
-):
-    """An error that nobody caught came up when the server stopped: its worker and its store stayed behind."""
-    settings = Settings(data_dir=tmp_path)
-    maps = Maps(settings, claims)
-    (tmp_path / "maps").rmdir()
-    asyncio.run(_adopt(maps, Policies(settings, maps)))
-    (told,) = [each for each in caplog.records if each.levelname == "ERROR"]
-    assert f"stay unseen: [Errno 2] No such file or directory: '{tmp_path}/maps'" in told.getMessage()
 
 
 def test_a_full_disk_refuses_what_is_new_and_says_so(tmp_path, claims):
