@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import httpx
@@ -18,7 +19,7 @@ from specshield import compiled
 from specshield.client import ShieldClient
 from specshield.cores import cores
 from specshield.errors import Starting, TransportError
-from specshield.service.startup import COMPLETE, KERNELS, READY, Startup
+from specshield.service.startup import CHECK_EVERY, COMPLETE, KERNELS, READY, Startup
 from tests.serving import serving, wait_for
 
 
@@ -137,6 +138,13 @@ def test_what_few_need_is_compiled_once_the_server_is_ready(tmp_path, incomplete
     with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(incomplete)):
         wait_for(lambda: list(incomplete.glob(f"{COMPLETE}-*[!k]")))
     assert list(incomplete.rglob("due_dates.make_bounds-*.nbi"))
+
+
+def test_a_server_that_is_not_to_does_not_compile_what_few_need(tmp_path, incomplete):
+    with serving(tmp_path / "data", NUMBA_CACHE_DIR=str(incomplete), SPECSHIELD_COMPLETE="False") as server:
+        time.sleep(4 * CHECK_EVERY)
+        assert not compiling(incomplete)
+    assert "in the background" not in server.log.read_text()
 
 
 def test_a_server_told_to_stop_while_it_compiles_what_few_need_leaves_nothing_running(tmp_path, incomplete):

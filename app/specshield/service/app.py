@@ -142,7 +142,7 @@ async def _life(app: FastAPI, settings: Settings, embedded: EmbeddedStore | None
     drain_at_sigterm(startup, settings.drain)
     running = (
         prepare(startup, check),
-        complete(startup),
+        *([complete(startup)] if settings.complete else []),
         tend(embedded, worker, startup),
         mover.run(),
         watchers.run(),

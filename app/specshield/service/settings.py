@@ -143,6 +143,9 @@ class Settings(BaseSettings):
     worker: bool | None = Field(
         None, description="Start a training worker too. Unset: where the store is embedded."
     )
+    complete: bool = Field(
+        True, description="Once ready, compile the kernels that only some rules and robots need, too."
+    )
     training_timeout: int = Field(
         6 * 3600, ge=1, description="Longest training run of a method that learns [s]."
     )

@@ -26,7 +26,7 @@ def run_demo(runs: int, seed: int, out: Path, stay: bool = False) -> int:
     began, status = time.monotonic(), StatusLine()
     out.mkdir(parents=True, exist_ok=True)
     status.say("starting the service ...")
-    with own_server(say=status.say) as url:
+    with own_server(say=status.say, complete=stay) as url:
         with robots(url) as several:
             campaigns, pictures = list[Campaign](), list[Future[None]]()
             for name in case_names():

@@ -25,13 +25,15 @@ def own_server(
     say: Callable[[str], object] = lambda text: None,
     data: Path | None = None,
     key: str | None = None,
+    complete: bool = True,
 ) -> Iterator[str]:
     """Starts `specshield serve` on a free port, its data in `data`, else in a temporary folder; yields its
     address.
 
     worker: whether it makes policies too. say: is told how far the server is while it starts. key: one that
-    it takes beside those that `data` holds. Raises ServerError with the server's log where it does not come
-    up.
+    it takes beside those that `data` holds. complete: whether it compiles, once ready, what only some rules
+    and robots need, which slows all else for a while. Raises ServerError with the server's log where it does
+    not come up.
     """
     with tempfile.TemporaryDirectory(prefix="specshield-") as folder:
         log = Path(folder) / "server.log"
@@ -40,7 +42,7 @@ def own_server(
         with open(log, "wb") as output:
             server = subprocess.Popen(
                 [sys.executable, "-m", "specshield.cli", "serve", "--port", url.rpartition(":")[2]],
-                env=_environment(data or Path(folder) / "data", worker, key),
+                env=_environment(data or Path(folder) / "data", worker, key, complete),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
@@ -64,7 +66,7 @@ def follow_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
-def _environment(data: Path, worker: bool, key: str | None) -> dict[str, str]:
+def _environment(data: Path, worker: bool, key: str | None, complete: bool) -> dict[str, str]:
     """This process's, without what would join the server to another's store or lock it."""
     shipped = ("SPECSHIELD_MAPS_DIR", "SPECSHIELD_MODELS_DIR")
     kept = {
@@ -72,8 +74,9 @@ def _environment(data: Path, worker: bool, key: str | None) -> dict[str, str]:
         for name, value in os.environ.items()
         if name in shipped or (not name.startswith("SPECSHIELD_") and name != "REDIS_URL")
     }
-    own = {"SPECSHIELD_DATA_DIR": str(data), "SPECSHIELD_WORKER": "true" if worker else "false"}
-    return {**kept, **own, **({} if key is None else {"SPECSHIELD_API_KEY": key})}
+    given = {"API_KEY": key} if key is not None else {}
+    own = {"DATA_DIR": data, "WORKER": worker, "COMPLETE": complete, **given}
+    return kept | {f"SPECSHIELD_{name}": str(value) for name, value in own.items()}
 
 
 def _wait_until_ready(
