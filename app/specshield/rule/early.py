@@ -20,18 +20,7 @@ from specshield.rule.values import places
 from specshield.rule.view import View, view_of
 from specshield.stl import SATISFIED_ABOVE, Always, Eventually, Formula, conjuncts
 from specshield.stl.conjunction import flat, is_predicate
-from specshield.stl.tree import (
-    ALWAYS,
-    EVENTUALLY,
-    UNTIL,
-    Tree,
-    apply,
-    bounds_at,
-    compile_tree,
-    slide,
-    sought_leaves,
-    until,
-)
+from specshield.stl.tree import ALWAYS, EVENTUALLY, UNTIL, Tree, apply, bounds_at, compile_tree, slide, until
 from specshield.task import Task, kept_with_task
 
 OTHER = -1  # beside a tree's operators
@@ -69,8 +58,8 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts
     above = tuple(flat(part) if isinstance(part, Always) else part for part in above)
     whole, slots = joined(above), places(task)
     tree = compile_tree(whole, slots, True)
-    rows, kept, owner, size = list[tuple[int, ...]](), list[bool](), list[int](), 0
-    seeker = [k if sought else -1 for k, part in enumerate(above) for sought in sought_leaves(part)]
+    rows, kept, size = list[tuple[int, ...]](), list[bool](), 0
+    owner, seeker = list[int](), list[int]()
     for k, part in enumerate(above):
         each, row = compile_tree(part, slots, True), (OTHER, size, 0, 0, part.horizon, 0)
         seeks = np.where(each.op == ALWAYS, each.turned, (each.op > ALWAYS) & ~each.turned)
@@ -84,6 +73,7 @@ def conjunction_of(task: Task, formula: Formula) -> tuple[View | None, Conjuncts
         rows.append((*row, max(half.max(initial=0), lead[:rest].max(initial=0))))
         kept += [True] * rest + [False] * (len(each.op) - rest + (k > 0))  # without the `and`
         owner += np.where(np.maximum(half, lead) > 0, k, -1)[:rest].tolist()
+        seeker += np.where(each.sought, k, -1).tolist()
         size += each.size
     below = tree._replace(**{name: getattr(tree, name)[kept] for name in tree._fields[:8]})  # of its nodes
     columns, plain = np.array(rows, np.int64).T.copy(), np.array([*map(_is_plain, above)], np.bool_)
@@ -111,8 +101,7 @@ def find_open(
     low, high = known.copy(), known.copy()
     bounds_at(parts.below, t, low, high)
     for k in range(settled.shape[0]):
-        had = _value(parts, k, parts.a[k], parts.b[k], high) > margin
-        settled[k] = margin if had else SATISFIED_ABOVE
+        settled[k] = margin if _value(parts, k, parts.a[k], parts.b[k], high) > margin else SATISFIED_ABOVE
     copy_row(known, low)
     if not _settle(parts, t, settled, low):  # then nothing is settled by less
         settled[:] = SATISFIED_ABOVE

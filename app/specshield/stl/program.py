@@ -93,10 +93,7 @@ def _code(node: Node, slots: Mapping[str, int]) -> Iterator[tuple[int, float]]:
                 yield from _code(child, slots)
                 yield MINIMUM if isinstance(node, And) else MAXIMUM, 0
         case Implies(left, right):
-            yield from _code(left, slots)
-            yield NEGATE, 0
-            yield from _code(right, slots)
-            yield MAXIMUM, 0
+            yield from _code(Or((Not(left), right)), slots)
         case _:
             expected = "a boolean combination of predicates"
             problem = f"'{node}' has a temporal operator; expected {expected}"

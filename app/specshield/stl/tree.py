@@ -31,8 +31,9 @@ class Tree(NamedTuple):
     [n]: how many values it has, written from `at` on. a, b [n]: its window, in steps. start [n]: the step of
     its first value. turned [n]: whether an odd number of `not` stands above it.
     leaf_at, leaf_start, leaf_stop [l]: where a leaf's values begin in the buffer, and from which step up to
-    which (excluded) they are. low, high [l]: bounds on a leaf's value at a step whose samples are to come.
-    size: of the buffer.
+    which (excluded) they are. sought [l]: 1 where an F or U seeks a leaf to be true, below no odd number of
+    `not`, else 0. low, high [l]: bounds on a leaf's value at a step whose samples are to come. size: of the
+    buffer.
     """
 
     op: Ints
@@ -46,6 +47,7 @@ class Tree(NamedTuple):
     leaf_at: Ints
     leaf_start: Ints
     leaf_stop: Ints
+    sought: Ints
     low: Floats
     high: Floats
     programs: Programs
@@ -61,17 +63,10 @@ def compile_tree(formula: Formula, slots: Mapping[str, int], ahead: bool = False
     builder = _Builder(ahead)
     builder.add(formula, 0, 1, False)
     *nodes, turned = np.array(builder.nodes, np.int64).reshape(-1, 8).T.copy()
-    *leaves, _ = np.array(builder.leaves, np.int64).T.copy()
+    leaves = np.array(builder.leaves, np.int64).T.copy()
     bounds = np.array([unseen_bounds(each) for each in builder.predicates]).T.copy()
     programs = compile_predicates(builder.predicates, slots)
     return Tree._make((*nodes, turned.astype(np.bool_), *leaves, *bounds, programs, builder.size))
-
-
-def sought_leaves(formula: Formula) -> list[int]:
-    """1 for each leaf that an F or U seeks to be true, below no odd number of `not`, and 0 for any other."""
-    builder = _Builder(False)
-    builder.add(formula, 0, 1, False)
-    return [sought for *_, sought in builder.leaves]
 
 
 def is_far(formula: Always | Eventually, turned: bool) -> bool:
