@@ -56,12 +56,6 @@ def room_around(body: Body, u: float, v: float) -> float:
     return float(body.clearance[row, col] - math.hypot(u - (col + 0.5) * h, v - (row + 0.5) * h))
 
 
-@inlined
-def _is_clear(body: Body, u: float, v: float, distance: float) -> bool:
-    """Whether the clearance field alone shows no obstacle within `distance` [m] of a point (grid metres)."""
-    return room_around(body, u, v) >= distance
-
-
 @leaf
 def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     """Exact distance [m] from a point (grid metres) to the nearest occupied square, at most `limit`."""
@@ -69,7 +63,7 @@ def free_distance(body: Body, u: float, v: float, limit: float) -> float:
     row, col = _cell(body, u, v)
     if _is_occupied(body, row, col):
         return 0.0
-    if _is_clear(body, u, v, limit):
+    if room_around(body, u, v) >= limit:
         return limit
     best = limit * limit
     first, last = _span(body, u - limit, u + limit, body.occupied.shape[1])
@@ -148,7 +142,7 @@ def _first_contact(body: Body, u: float, v: float, du: float, dv: float, length:
     """How far [m] a disc of radius r moves from (u, v) along a unit vector until it overlaps; inf: never."""
     h = body.resolution
     mu, mv = u + 0.5 * length * du, v + 0.5 * length * dv
-    if _is_clear(body, mu, mv, r + 0.5 * length):
+    if room_around(body, mu, mv) >= r + 0.5 * length:
         return np.inf
     eu, ev = u + length * du, v + length * dv
     left, right = _span(body, min(u, eu) - r, max(u, eu) + r, body.occupied.shape[1])
@@ -178,7 +172,7 @@ def way_ahead(body: Body, x: float, y: float, theta: float, distance: float) -> 
     length = abs(distance)
     cx, cy = sign * math.cos(theta), sign * math.sin(theta)
     du, dv = body.cos_yaw * cx + body.sin_yaw * cy, body.cos_yaw * cy - body.sin_yaw * cx
-    if _is_clear(body, u, v, body.radius + length):
+    if room_around(body, u, v) >= body.radius + length:
         return distance
     gap = free_distance(body, u, v, body.radius)
     if gap == 0.0:
@@ -214,7 +208,7 @@ def _arc_contact(body: Body, ou: float, ov: float, u: float, v: float, angle: fl
     h, reach, start = body.resolution, math.hypot(u - ou, v - ov), math.atan2(v - ov, u - ou)
     mu, mv = ou + reach * math.cos(start + 0.5 * angle), ov + reach * math.sin(start + 0.5 * angle)
     around = r + reach * min(0.5 * abs(angle), 2.0)  # of the middle of the arc, all that the disc can touch
-    if _is_clear(body, mu, mv, around):
+    if room_around(body, mu, mv) >= around:
         return False
     left, right = _span(body, mu - around, mu + around, body.occupied.shape[1])
     for j in range(*_span(body, mv - around, mv + around, body.occupied.shape[0])):
@@ -236,44 +230,21 @@ def _arc_nears(
     The distance to a square is smooth outside of it. So along the arc it is least at an end, or where the
     arc is square to the way there: towards a corner, or along an axis. Or the arc crosses an edge.
     """
-    if _nears_at(ou, ov, reach, start, angle, start + angle, u0, v0, h, r, True):
+    end = start + angle
+    if _to_square(ou + reach * math.cos(end), ov + reach * math.sin(end), u0, v0, h) < r:
         return True
     for k in range(4):
         cu, cv = u0 + h * (k % 2) - ou, v0 + h * (k // 2) - ov
-        if _nears_at(ou, ov, reach, start, angle, math.atan2(cv, cu), u0, v0, h, r, False):
-            return True
-        if _nears_at(ou, ov, reach, start, angle, 0.5 * math.pi * k, u0, v0, h, r, False):
-            return True
         # The lines along the edges: u = u0, u = u0 + h, v = v0, v = v0 + h.
         line, along = (cu, 0.0) if k < 2 else (v0 + h * (k - 2) - ov, 0.5 * math.pi)
-        if abs(line) < reach:
-            off = math.acos(line / reach)
-            for to in (along - off, along + off):
-                if _nears_at(ou, ov, reach, start, angle, to, u0, v0, h, r, False):
-                    return True
+        off = math.acos(line / reach) if abs(line) < reach else math.nan  # NaN: it is crossed nowhere
+        for at in (math.atan2(cv, cu), 0.5 * math.pi * k, along - off, along + off):
+            turned = (at - start) % (2.0 * math.pi)
+            passed = turned if angle > 0.0 else (2.0 * math.pi - turned) % (2.0 * math.pi)
+            u, v = ou + reach * math.cos(at), ov + reach * math.sin(at)
+            if passed <= abs(angle) and _to_square(u, v, u0, v0, h) < r:  # the arc has that point
+                return True
     return False
-
-
-@leaf
-def _nears_at(
-    ou: float,
-    ov: float,
-    reach: float,
-    start: float,
-    angle: float,
-    at: float,
-    u0: float,
-    v0: float,
-    h: float,
-    r: float,
-    is_end: bool,
-) -> bool:
-    """Whether the arc's point in the direction `at`, if the arc has it, is nearer than r to a square."""
-    turned = (at - start) % (2.0 * math.pi)
-    passed = turned if angle > 0.0 else (2.0 * math.pi - turned) % (2.0 * math.pi)
-    if not is_end and passed > abs(angle):
-        return False
-    return _to_square(ou + reach * math.cos(at), ov + reach * math.sin(at), u0, v0, h) < r
 
 
 @inlined
@@ -286,7 +257,7 @@ def can_turn(body: Body, x: float, y: float, theta: float, angle: float) -> bool
     if body.offset_x == 0.0 and body.offset_y == 0.0:
         return True
     u, v = centre(body, x, y, theta)
-    if _is_clear(body, u, v, body.radius + 2.0 * math.hypot(body.offset_x, body.offset_y)):
+    if room_around(body, u, v) >= body.radius + 2.0 * math.hypot(body.offset_x, body.offset_y):
         return True
     gap = free_distance(body, u, v, body.radius)
     if gap > 0.0:
